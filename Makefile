@@ -1,0 +1,46 @@
+# make demo   play the example bag through the live graph
+# make test   run all tests
+# make lint   check style and types
+#
+# Each sets up .venv the first time, over ROS 2 Jazzy as wheels from PyPI. Needs Python 3.10 to 3.13
+# with venv and headers, a C and C++ compiler, and make; nothing of ROS.
+
+PYTHON ?= python3
+VENV := .venv
+READY := $(VENV)/.ready
+RUN := $(VENV)/bin
+DEMO := output/demo
+MESSAGES := $(wildcard msg_defs/*.* msg_defs/*/*)
+
+.PHONY: demo test lint colcon clean help
+
+demo: $(READY)
+	@rm -rf $(DEMO)
+	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
+
+test: $(READY)
+	$(RUN)/python -m pytest --numprocesses=2
+
+lint: $(READY)
+	$(RUN)/ruff check .
+	$(RUN)/ruff format --check .
+	$(RUN)/mypy
+
+# Both packages by colcon, over the wheels in .venv, into install/.
+colcon: $(READY)
+	COLCON_DEFAULTS_FILE=colcon_defaults.yaml PATH="$(CURDIR)/$(RUN):$$PATH" $(RUN)/colcon build
+
+help:
+	@sed -n 's/^# \(make .*\)/\1/p' Makefile
+
+clean:
+	rm -rf $(VENV) build install log output
+
+$(READY): pyproject.toml constraints.txt $(MESSAGES)
+	@echo "Setting up $(VENV): ROS 2 Jazzy and the other packages, then building the messages (2 to 4 minutes)"
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if (3, 10) <= v < (3, 14) else f"Python {v[0]}.{v[1]} found, 3.10 to 3.13 needed; name one by: make PYTHON=python3.12")'
+	@command -v c++ >/dev/null || { echo "no C++ compiler found; on Debian or Ubuntu: apt install build-essential python3-dev" >&2; exit 1; }
+	@rm -rf $(VENV)
+	$(PYTHON) -m venv $(VENV)
+	PIP_CONSTRAINT=constraints.txt $(RUN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,dev,colcon]'
+	@touch $@

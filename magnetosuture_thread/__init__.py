@@ -1,0 +1,1 @@
+"""Suture thread prediction for the MagnetoSuture robot."""

@@ -1,0 +1,25 @@
+"""Build of the ament_python package, used by colcon; pip reads pyproject.toml instead."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = "magnetosuture_thread"
+
+
+def files(pattern: str) -> list[str]:
+    """Return the files of the source tree that match a pattern, as setuptools wants them."""
+    return sorted(str(path) for path in Path().glob(pattern))
+
+
+setup(
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", files("config/*.yaml")),
+        (f"share/{PACKAGE}/launch", files("launch/*.launch.py")),
+    ],
+    zip_safe=True,
+)
