@@ -1,0 +1,259 @@
+"""Configuration: frozen dataclasses whose fields know their unit, bounds and meaning.
+
+A configuration class is written once, with `quantity` for each field. From it come the validation of
+YAML files, the parameters that a node declares and their descriptions. Values are checked when the
+object is made, so an object that exists is valid.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, cast, get_type_hints
+
+import yaml
+
+from magnetosuture_thread.errors import ConfigurationError
+
+C = TypeVar("C", bound="Configuration")
+
+# Parameters that every node has, whatever it does.
+OF_ROS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a configuration field may hold.
+
+    Attributes:
+        description: one sentence for a person.
+        unit: SI unit, empty for text and switches.
+        minimum: least value accepted, also of each entry of a list.
+        maximum: greatest value accepted, also of each entry of a list.
+        choices: the words accepted, empty for any.
+        multiple: a list's length must be a multiple of this.
+    """
+
+    description: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+    multiple: int = 1
+
+    def expectation(self, kind: type) -> str:
+        """Say in words what is accepted."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        words = {float: "a number", int: "a whole number", bool: "true or false", str: "text", tuple: "a list"}[kind]
+        if kind is tuple and self.multiple > 1:
+            words += f" of a multiple of {self.multiple} numbers"
+        if self.minimum is not None and self.maximum is not None:
+            words += f" from {self.minimum:g} to {self.maximum:g}"
+        elif self.minimum is not None:
+            words += f" of at least {self.minimum:g}"
+        elif self.maximum is not None:
+            words += f" of at most {self.maximum:g}"
+        return f"{words} {self.unit}".rstrip()
+
+
+def quantity(
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: Sequence[str] = (),
+    multiple: int = 1,
+) -> Any:
+    """Make a dataclass field that carries a `Quantity`."""
+    about = Quantity(description, unit, minimum, maximum, tuple(choices), multiple)
+    return field(default=default, metadata={"quantity": about})
+
+
+class Configuration:
+    """Base of the configuration dataclasses: checks every field when an object is made.
+
+    A subclass is a frozen dataclass with a `GROUP`, the name of its section in a set-up file, and all
+    of whose fields are made by `quantity`. It checks what concerns several fields in `check`.
+    """
+
+    GROUP: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        """Check every field by its quantity, then the fields together."""
+        for about in described(type(self)):
+            object.__setattr__(self, about.name, about.checked(getattr(self, about.name)))
+        self.check()
+
+    def check(self) -> None:
+        """Raise `ConfigurationError` where fields that are valid apart don't fit together."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """One field of a configuration class: its name, type, default and quantity."""
+
+    group: str
+    name: str
+    kind: type
+    default: Any
+    quantity: Quantity
+
+    def checked(self, value: Any, source: str = "") -> Any:
+        """Return the value in the field's type, or raise `ConfigurationError`."""
+        about = self.quantity
+
+        def refuse() -> ConfigurationError:
+            return ConfigurationError(f"{self.group}.{self.name}", value, about.expectation(self.kind), source)
+
+        if self.kind is tuple:
+            if isinstance(value, str) or not isinstance(value, Sequence) or len(value) % about.multiple:
+                raise refuse()
+            if not all(_is_number(entry) and self._within(entry) for entry in value):
+                raise refuse()
+            return tuple(float(entry) for entry in value)
+        if self.kind is float:
+            if not _is_number(value) or not self._within(value):
+                raise refuse()
+            return float(value)
+        kind: Any = self.kind
+        if not isinstance(value, kind) or (kind is int and (isinstance(value, bool) or not self._within(value))):
+            raise refuse()
+        if about.choices and value not in about.choices:
+            raise refuse()
+        return value
+
+    def _within(self, number: float) -> bool:
+        low, high = self.quantity.minimum, self.quantity.maximum
+        try:
+            value = float(number)
+        except OverflowError:  # a whole number beyond any float
+            return False
+        return math.isfinite(value) and (low is None or value >= low) and (high is None or value <= high)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def described(cls: type[Configuration]) -> tuple[Described, ...]:
+    """Return the fields of a configuration class."""
+    hints = get_type_hints(cls)
+    result = []
+    for entry in fields(cast(Any, cls)):
+        kind = getattr(hints[entry.name], "__origin__", hints[entry.name])
+        assert entry.default is not MISSING, f"{cls.__name__}.{entry.name} has no default"
+        result.append(Described(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"]))
+    return tuple(result)
+
+
+def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C:
+    """Make a configuration object from a mapping, refusing keys that it does not know.
+
+    Args:
+        cls: a configuration class.
+        values: values by field name; fields that are missing keep their default.
+        source: the file that the values came from, named in errors.
+
+    Raises:
+        ConfigurationError: a key is unknown, or a value is of the wrong type or out of its bounds.
+    """
+    about = {entry.name: entry for entry in described(cls)}
+    checked = {}
+    for name, value in values.items():
+        if name not in about:
+            raise ConfigurationError(f"{cls.GROUP}.{name}", value, _known_names(name, list(about)), source)
+        checked[name] = about[name].checked(value, source)
+    try:
+        return cls(**checked)
+    except ConfigurationError as error:
+        raise ConfigurationError(error.name, error.value, error.expectation, source) from None
+
+
+def to_mapping(settings: Configuration) -> dict[str, Any]:
+    """Return a configuration object's values by field name, tuples as lists."""
+    values = {about.name: getattr(settings, about.name) for about in described(type(settings))}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+
+class _RosLoader(yaml.SafeLoader):
+    """Reads a parameter file as ROS does, and refuses a key that is given twice.
+
+    1e-5 is a number, as in YAML 1.2, and nothing is a date.
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return a mapping, or raise where a key stands twice."""
+        keys = [key.value for key, _ in node.value]
+        twice = next((key for index, key in enumerate(keys) if key in keys[:index]), None)
+        if twice is not None:
+            raise yaml.constructor.ConstructorError(None, None, f"{twice} is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+_RosLoader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in entries if not tag.endswith((":float", ":timestamp"))]
+    for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_RosLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"),
+    list("-+0123456789."),
+)
+
+
+def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, Any]:
+    """Read a set-up: a ROS 2 parameter file with one section for each node.
+
+    Args:
+        path: the YAML file.
+        classes: the nodes' configuration classes; the `GROUP` of each is its section's name.
+
+    Returns:
+        A configuration object for each class, by its `GROUP`; a missing section gives the defaults.
+
+    Raises:
+        ConfigurationError: the file cannot be read, is no parameter file, or holds anything invalid.
+    """
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), _RosLoader)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not text"
+        raise ConfigurationError("set-up file", reason, "a readable YAML file", str(path)) from None
+    except yaml.YAMLError as error:
+        problem = str(getattr(error, "problem", error))
+        mark = getattr(error, "problem_mark", None)
+        line = f" in line {mark.line + 1}" if mark else ""
+        raise ConfigurationError("set-up file", problem + line, "valid YAML", str(path)) from None
+    known = {cls.GROUP: cls for cls in classes}
+    if not isinstance(content, Mapping):
+        raise ConfigurationError("set-up file", content, "sections " + ", ".join(known), str(path))
+    result: dict[str, Any] = {group: cls() for group, cls in known.items()}
+    for group, section in content.items():
+        if group not in known:
+            raise ConfigurationError(str(group), "…", _known_names(str(group), list(known)), str(path))
+        if not isinstance(section, Mapping) or list(section) != ["ros__parameters"]:
+            raise ConfigurationError(group, section, "one key, ros__parameters", str(path))
+        values = section["ros__parameters"]
+        if not isinstance(values, Mapping):
+            raise ConfigurationError(f"{group}.ros__parameters", values, "parameters by name", str(path))
+        own = {str(name): value for name, value in values.items() if name not in OF_ROS}
+        for name, value in own.items():
+            if isinstance(value, list) and len({type(entry) for entry in value}) > 1:
+                raise ConfigurationError(f"{group}.{name}", value, "entries of one kind: 0.0, not 0", str(path))
+            if value == []:  # which ROS takes for no value at all
+                raise ConfigurationError(f"{group}.{name}", value, "entries, or no such line for none", str(path))
+        result[group] = from_mapping(known[group], own, str(path))
+    return result
+
+
+def _known_names(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    return f"one of {', '.join(known)}{hint}"

@@ -1,0 +1,80 @@
+"""Errors that carry their evidence: what was given, where, and what was expected."""
+
+from __future__ import annotations
+
+
+class MagnetosutureError(Exception):
+    """Base of every error that this package raises on purpose; its text is one line for a person."""
+
+
+class ConfigurationError(MagnetosutureError):
+    """A configuration value that cannot be used.
+
+    Args:
+        name: the parameter, with the node or group it belongs to, for example `thread_model.length`.
+        value: the value that was given.
+        expectation: what would have been accepted, with its unit.
+        source: the file that the value came from, if there is one.
+    """
+
+    def __init__(self, name: str, value: object, expectation: str, source: str = "") -> None:
+        self.name = name
+        self.value = value
+        self.expectation = expectation
+        self.source = source
+        where = f"{source}: " if source else ""
+        super().__init__(f"{where}{name}: got {value!r}, expected {expectation}")
+
+
+class BagError(MagnetosutureError):
+    """A bag or a reference file that cannot be read or written.
+
+    Args:
+        path: the file.
+        problem: what is wrong with it and what was expected.
+    """
+
+    def __init__(self, path: object, problem: str) -> None:
+        self.path = str(path)
+        self.problem = problem
+        super().__init__(f"{path}: {problem}")
+
+
+class InvalidInputError(MagnetosutureError):
+    """A message or sample that must not be used.
+
+    Args:
+        field: what is wrong, for example `needle/measured_cp.pose.position`.
+        value: the value that was given.
+        expectation: what would have been accepted, with its unit.
+    """
+
+    def __init__(self, field: str, value: object, expectation: str) -> None:
+        self.field = field
+        self.value = value
+        self.expectation = expectation
+        super().__init__(f"{field}: got {value}, expected {expectation}")
+
+
+class SolverError(MagnetosutureError):
+    """A program whose solution did not pass its own residual check.
+
+    Args:
+        solver: the solver's name.
+        status: the solver's own word.
+        residual: the largest scaled residual.
+        tolerance: the largest residual that would have been accepted.
+    """
+
+    def __init__(self, solver: str, status: str, residual: float, tolerance: float) -> None:
+        self.solver = solver
+        self.status = status
+        self.residual = residual
+        self.tolerance = tolerance
+        super().__init__(
+            f"{solver} ended with status {status!r} and residual {residual:.1e}, expected at most {tolerance:.1e}"
+        )
+
+
+class GraphError(MagnetosutureError):
+    """A node or a part of the running graph that failed."""

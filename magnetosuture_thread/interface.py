@@ -1,0 +1,54 @@
+"""The graph's interface in words: nodes, frame, and each topic's name and type, written down once.
+
+Nothing of ROS is needed here: bags are read and written by the same names on machines without it.
+
+Names follow the Collaborative Robotics Toolkit (CRTK) where it has one: `measured_cp` is a measured
+Cartesian position, `servo_cv` a velocity to follow now, `setpoint_cv` the velocity that is really asked
+of the actuators.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+NODES = ("vision_tracker", "thread_model", "coil_bridge")
+DISH_FRAME = "dish"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic in words.
+
+    Attributes:
+        name: without a leading slash, so that a namespace can come before it.
+        type_name: for example `nav_msgs/msg/Path`.
+    """
+
+    name: str
+    type_name: str
+
+    @property
+    def recorded(self) -> str:
+        """Return the name as bags have it: with a leading slash."""
+        return f"/{self.name}"
+
+
+IMAGE = Channel("camera/image_raw", "sensor_msgs/msg/Image")
+COMPRESSED_IMAGE = Channel("camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo")
+NEEDLE_POSE = Channel("needle/measured_cp", "geometry_msgs/msg/PoseStamped")
+NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
+NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
+SEEN_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
+PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
+MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
+THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
+OBSTACLE_MARKERS = Channel("thread/obstacles", "visualization_msgs/msg/MarkerArray")
+CURRENTS = Channel("coils/currents", "magnetosuture_msgs/msg/CoilCurrents")
+DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+
+# Only in bags, where a simulation knows it; never an input of the graph.
+TRUE_NEEDLE = Channel("truth/needle", "geometry_msgs/msg/PoseStamped")
+TRUE_THREAD = Channel("truth/thread", "nav_msgs/msg/Path")
+
+CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport

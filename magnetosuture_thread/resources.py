@@ -1,0 +1,54 @@
+"""Finds the files that ship with the packages: set-ups, message definitions."""
+
+from __future__ import annotations
+
+import os
+import sysconfig
+from pathlib import Path
+
+from magnetosuture_thread.errors import ConfigurationError
+
+_CHECKOUT = Path(__file__).resolve().parent.parent
+_IN_CHECKOUT = {"magnetosuture_thread": _CHECKOUT, "magnetosuture_msgs": _CHECKOUT / "msg_defs"}
+
+
+def share(package: str) -> Path:
+    """Return the folder that holds a package's shared files.
+
+    In a source checkout that is the checkout itself; otherwise `share/` below a prefix that ROS names
+    in AMENT_PREFIX_PATH, or below a place that pip installs into.
+
+    Raises:
+        FileNotFoundError: the package is not installed.
+    """
+    candidates = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+    candidates += [
+        Path(sysconfig.get_path("data", scheme))
+        for scheme in sysconfig.get_scheme_names()
+        if scheme.startswith("posix")
+    ]
+    folders = [_IN_CHECKOUT[package], *(prefix / "share" / package for prefix in candidates)]
+    for folder in folders:
+        if (folder / "package.xml").is_file():
+            return folder
+    raise FileNotFoundError(f"{package} is not installed: no package.xml in any of {[str(f) for f in folders]}")
+
+
+def setup_file(name: str) -> Path:
+    """Return the file of a set-up, given as a path or as the name of one that ships with the package.
+
+    Raises:
+        ConfigurationError: there is no such file.
+    """
+    if Path(name).suffix in (".yaml", ".yml") or os.sep in name:
+        path = Path(name)
+    else:
+        path = share("magnetosuture_thread") / "config" / f"{name}.yaml"
+    try:
+        exists = path.is_file()
+    except (OSError, ValueError):  # no name that a file could have
+        exists = False
+    if not exists:
+        known = ", ".join(sorted(p.stem for p in (share("magnetosuture_thread") / "config").glob("*.yaml")))
+        raise ConfigurationError("set-up", name, f"a YAML file, or one of {known}")
+    return path

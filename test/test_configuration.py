@@ -1,0 +1,117 @@
+"""Configuration: what is refused, and in which words."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError, dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from magnetosuture_thread.configuration import Configuration, described, from_mapping, load_setup, quantity, to_mapping
+from magnetosuture_thread.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class Oven(Configuration):
+    """An example."""
+
+    GROUP: ClassVar[str] = "oven"
+
+    temperature: float = quantity(400.0, "how hot", unit="K", minimum=273.0, maximum=800.0)
+    shelves: int = quantity(2, "how many", minimum=1, maximum=5)
+    kind: str = quantity("gas", "what burns", choices=("gas", "wood"))
+    lit: bool = quantity(False, "whether it burns")
+    corners: tuple[float, ...] = quantity((), "x and y in turn", unit="m", minimum=-1.0, maximum=1.0, multiple=2)
+
+    def check(self) -> None:
+        """Refuse a fire without heat."""
+        if self.lit and self.temperature < 300.0:
+            raise ConfigurationError("oven.temperature", self.temperature, "at least 300 K when lit")
+
+
+def test_values_are_kept_in_the_fields_type():
+    oven = from_mapping(Oven, {"temperature": 500, "corners": [0, 1, 0.5, -1]})
+    assert isinstance(oven.temperature, float)
+    assert oven.corners == (0.0, 1.0, 0.5, -1.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"temperature": 5000.0}, "oven.temperature: got 5000.0, expected a number from 273 to 800 K"),
+        ({"temperature": float("nan")}, "oven.temperature: got nan, expected a number from 273 to 800 K"),
+        ({"temperature": True}, "oven.temperature: got True, expected a number from 273 to 800 K"),
+        ({"temperature": "400 K"}, "oven.temperature: got '400 K', expected a number from 273 to 800 K"),
+        ({"shelves": 2.5}, "oven.shelves: got 2.5, expected a whole number from 1 to 5"),
+        ({"shelves": True}, "oven.shelves: got True, expected a whole number from 1 to 5"),
+        ({"shelves": 9}, "oven.shelves: got 9, expected a whole number from 1 to 5"),
+        ({"kind": "coal"}, "oven.kind: got 'coal', expected one of gas, wood"),
+        ({"lit": 1}, "oven.lit: got 1, expected true or false"),
+        ({"corners": [0.0]}, "oven.corners: got [0.0], expected a list of a multiple of 2 numbers from -1 to 1 m"),
+        ({"corners": [0.0, 7.0]}, "oven.corners: got [0.0, 7.0], expected a list of a multiple of 2 numbers"),
+        ({"corners": "0, 1"}, "oven.corners: got '0, 1', expected a list"),
+        ({"temprature": 400.0}, "oven.temprature: got 400.0, expected one of temperature, shelves, kind, lit, corners"),
+        ({"temprature": 400.0}, "did you mean temperature?"),
+        ({"lit": True, "temperature": 280.0}, "oven.temperature: got 280.0, expected at least 300 K when lit"),
+    ],
+)
+def test_an_invalid_value_is_refused_in_one_line(values, words):
+    with pytest.raises(ConfigurationError) as caught:
+        from_mapping(Oven, values, "oven.yaml")
+    assert words in str(caught.value)
+    assert str(caught.value).startswith("oven.yaml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_object_made_directly_is_checked_too():
+    with pytest.raises(ConfigurationError):
+        Oven(shelves=0)
+    with pytest.raises(FrozenInstanceError):
+        Oven().shelves = 3  # type: ignore[misc]
+
+
+def test_mapping_goes_there_and_back():
+    oven = Oven(temperature=500.0, corners=(0.0, 1.0))
+    assert from_mapping(Oven, to_mapping(oven)) == oven
+    assert {about.name for about in described(Oven)} == set(to_mapping(oven))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("oven: [", "valid YAML"),
+        ("- oven", "sections oven"),
+        ("oven: {temperature: 400.0}", "one key, ros__parameters"),
+        ("oven: {ros__parameters: 3}", "parameters by name"),
+        ("ofen: {ros__parameters: {}}", "one of oven (did you mean oven?)"),
+        ("oven: {ros__parameters: {temperature: 4.0}}", "oven.temperature: got 4.0"),
+        ("oven: {ros__parameters: {1: 4.0}}", "oven.1: got 4.0"),
+        ("oven: {ros__parameters: {temperature: 2026-13-45}}", "oven.temperature: got '2026-13-45'"),
+        ("oven: {ros__parameters: {temperature: 1" + 400 * "0" + "}}", "expected a number from 273 to 800 K"),
+        ("oven: {ros__parameters: {shelves: 1, shelves: 2}}", "shelves is given twice"),
+        ("oven: {ros__parameters: {corners: [0.0, 1]}}", "entries of one kind"),
+        ("oven: {ros__parameters: {corners: []}}", "no such line for none"),
+    ],
+)
+def test_a_broken_setup_file_is_refused_and_named(tmp_path: Path, text: str, words: str):
+    path = tmp_path / "oven.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        load_setup(path, [Oven])
+    assert str(caught.value).startswith(str(path))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_setup_file_is_read_as_ros_reads_it(tmp_path: Path):
+    path = tmp_path / "oven.yaml"
+    path.write_text("oven: {ros__parameters: {temperature: 4e2, use_sim_time: true, qos_overrides: {a: 1}}}")
+    assert load_setup(path, [Oven])["oven"].temperature == 400.0
+
+
+def test_an_unreadable_setup_file_is_refused(tmp_path: Path):
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
+    for path in (tmp_path / "missing.yaml", tmp_path / "binary.yaml", tmp_path):
+        with pytest.raises(ConfigurationError, match="a readable YAML file"):
+            load_setup(path, [Oven])
