@@ -1,0 +1,1 @@
+"""Geometry: polylines, obstacles, the camera's view. No other room is needed here."""

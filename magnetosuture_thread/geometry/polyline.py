@@ -1,0 +1,76 @@
+"""Polylines: open chains of vertices, an array of shape (m, d)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float64]
+
+
+def arc_lengths(points: Points) -> NDArray[np.float64]:
+    """Return the arc length of each vertex from the first, shape (m,).
+
+    >>> arc_lengths(np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 6.0]]))
+    array([0., 5., 7.])
+    """
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def points_at(points: Points, lengths: NDArray[np.float64]) -> Points:
+    """Return the points at given arc lengths, shape (len(lengths), d).
+
+    A length past either end gives that end: the polyline is never extrapolated.
+
+    >>> points_at(np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([0.5, 9.0]))
+    array([[0.5, 0. ],
+           [2. , 0. ]])
+    """
+    at = arc_lengths(points)
+    return np.column_stack([np.interp(lengths, at, points[:, axis]) for axis in range(points.shape[1])])
+
+
+def chain_along(points: Points, segments: int, segment_length: float) -> Points:
+    """Lay a chain of equal segments along a polyline, starting at its first vertex.
+
+    Every segment has exactly the given length, measured as a chord: each vertex is the first crossing
+    of the polyline with a circle around the vertex before. Past the polyline's end the chain goes on
+    along its last direction, so a thread that is seen only in part gets its full length.
+
+    Args:
+        points: polyline, shape (m, d), with at least two vertices that differ [m]; one that repeats the
+            vertex before it is passed over.
+        segments: number of segments n.
+        segment_length: length of each [m].
+
+    Returns:
+        Vertices, shape (n + 1, d) [m].
+    """
+    moved = np.linalg.norm(np.diff(points, axis=0), axis=1) > 0.0
+    points = points[np.concatenate([[True], moved])]
+    last = points[-1] - points[-2]
+    last = last / np.linalg.norm(last)
+    # One segment more than the chain can need, so that every crossing exists.
+    path = np.vstack([points, points[-1] + last * segment_length * (segments + 1)])
+    chain = np.empty((segments + 1, points.shape[1]))
+    chain[0] = path[0]
+    edge, on_edge = 0, -1
+    for index in range(1, segments + 1):
+        centre = chain[index - 1]
+        while float(np.linalg.norm(path[edge + 1] - centre)) < segment_length:
+            edge += 1
+        start = centre if edge == on_edge else path[edge]
+        chain[index] = _leave_ball(start, path[edge + 1], centre, segment_length)
+        on_edge = edge
+    return chain
+
+
+def _leave_ball(inside: Points, outside: Points, centre: Points, radius: float) -> Points:
+    """Return where the line from a point inside of a ball to one outside leaves it."""
+    along = outside - inside
+    offset = inside - centre
+    a = float(along @ along)
+    b = float(along @ offset)
+    c = float(offset @ offset) - radius * radius
+    return np.asarray(inside + along * ((-b + np.sqrt(max(b * b - a * c, 0.0))) / a))
