@@ -1,0 +1,1 @@
+"""Model: predicts the thread behind the needle."""

@@ -1,0 +1,137 @@
+"""The predictor: stamps, starts and bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+
+THREAD = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
+
+
+def pose(stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> NeedlePose:
+    """Return a needle pose."""
+    return NeedlePose(stamp, np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]))
+
+
+def started(discs: tuple[Disc, ...] = ()) -> ThreadPredictor:
+    """Return a predictor of a thread that lies straight behind the needle."""
+    predictor = ThreadPredictor(THREAD, discs)
+    predictor.start(pose(0.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
+    return predictor
+
+
+def test_the_thread_starts_on_the_centreline_with_full_length(thread_arc):
+    seen = thread_arc(np.zeros(2), 3.0, 60.0, length=0.015)
+    prediction = ThreadPredictor(THREAD).start(pose(1.0), seen)
+    np.testing.assert_allclose(prediction.stretch, 0.0, atol=1e-9)
+    assert prediction.vertices.shape == (26, 2)
+    assert np.linalg.norm(seen - prediction.vertices[10], axis=1).min() < 1e-4
+    assert prediction.interval == 0.0
+
+
+def test_steps_are_bounded_whatever_the_interval():
+    predictor = started()
+    assert predictor.step(pose(1.0 / 66.0)).substeps == 1
+    assert predictor.step(pose(1.0 / 66.0 + 1.0 / 30.0, 1e-4)).substeps == 3
+    late = predictor.step(pose(100.0, 2e-3))
+    assert late.substeps == 200
+    assert late.interval == pytest.approx(100.0 - 1.0 / 66.0 - 1.0 / 30.0)
+    assert np.abs(late.stretch).max() < 1e-3
+
+
+def test_the_same_motion_in_other_samples_gives_the_same_thread():
+    fine, coarse = started(), started()
+    for k in range(1, 61):
+        prediction = fine.step(pose(k / 60.0, 5e-3 * k / 60.0, 2e-3 * (k / 60.0)))
+    for k in range(1, 16):
+        other = coarse.step(pose(k / 15.0, 5e-3 * k / 15.0, 2e-3 * (k / 15.0)))
+    difference = np.linalg.norm(prediction.vertices - other.vertices, axis=1).mean()
+    assert difference / THREAD.length < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (pose(float("nan")), "a finite time"),
+        (pose(1.0, float("nan")), "finite coordinates"),
+        (pose(1.0, 0.0, float("inf")), "finite coordinates"),
+        (pose(1.0, 1e20), "at most 10 m from 0"),
+        (pose(1.0, 0.0, -1e160), "at most 10 m from 0"),
+        (NeedlePose(1.0, np.zeros(2), np.array([2.0, 0.0])), "a unit vector"),
+        (NeedlePose(1.0, np.zeros(2), np.array([np.nan, 0.0])), "a unit vector"),
+        (pose(0.0), "later than"),
+        (pose(-1.0), "later than"),
+    ],
+)
+def test_a_bad_pose_is_refused_and_changes_nothing(bad: NeedlePose, words: str):
+    predictor, untouched = started(), started()
+    with pytest.raises(InvalidInputError, match=words):
+        predictor.step(bad)
+    after, expected = predictor.step(pose(0.1, 1e-4)), untouched.step(pose(0.1, 1e-4))
+    np.testing.assert_array_equal(after.vertices, expected.vertices)
+
+
+def test_a_start_needs_a_centreline():
+    predictor = ThreadPredictor(THREAD)
+    with pytest.raises(InvalidInputError, match="a centreline first"):
+        predictor.step(pose(0.0))
+    for centreline in (
+        np.zeros((1, 2)),
+        np.array([[0.0, 0.0], [np.nan, 0.0]]),
+        np.array([[0.0, 0.0], [1e-5, 0.0]]),
+        np.zeros((3, 2)),
+        np.array([[0.005, 0.0], [0.02, 0.0]]),  # far from the needle's tail
+    ):
+        with pytest.raises(InvalidInputError, match="centreline"):
+            predictor.start(pose(0.0), centreline)
+    assert not predictor.started
+
+
+def test_a_centreline_with_repeated_points_is_taken():
+    seen = np.array([[0.0, 0.0], [0.0, 0.0], [-0.01, 0.0], [-0.015, 0.0], [-0.015, 0.0]])
+    prediction = ThreadPredictor(THREAD).start(pose(0.0), seen)
+    np.testing.assert_allclose(prediction.vertices[:, 0], -THREAD.segment_length * np.arange(26), atol=1e-12)
+
+
+def test_a_needle_that_leaps_onto_a_node_is_followed():
+    """Its first segment has no length then, and so no direction."""
+    predictor = started()
+    unit = THREAD.segment_length
+    for k in range(1, 30):
+        prediction = predictor.step(pose(k / 30.0, -unit))
+    assert np.all(np.isfinite(prediction.vertices))
+    assert np.abs(prediction.stretch).max() < 1e-2
+
+
+def test_a_reset_forgets():
+    predictor = started()
+    predictor.reset()
+    assert not predictor.started
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    turns=st.lists(st.floats(-0.6, 0.6), min_size=5, max_size=25),
+    speed=st.floats(0.0, 0.02),
+    disc=st.tuples(st.floats(-0.02, 0.02), st.floats(0.004, 0.012), st.floats(5e-4, 3e-3)),
+)
+def test_any_motion_keeps_the_promises(turns: list[float], speed: float, disc: tuple[float, float, float]):
+    """No NaN, no segment stretched by more than a percent, no node in the obstacle."""
+    predictor = started((Disc((disc[0], disc[1]), disc[2]),))
+    where, angle = np.zeros(2), 0.0
+    for k, turn in enumerate(turns, start=1):
+        angle += turn
+        ahead = where + speed / 30.0 * np.array([np.cos(angle), np.sin(angle)])
+        if np.linalg.norm(ahead - disc[:2]) > disc[2] + 1e-4:  # the needle itself must not enter
+            where = ahead
+        prediction = predictor.step(pose(k / 30.0, where[0], where[1], angle))
+        assert np.all(np.isfinite(prediction.vertices))
+        assert np.abs(prediction.stretch).max() < 1e-2
+        assert prediction.margins[2].clearance.min() > -2e-6
