@@ -1,0 +1,1 @@
+"""Rig: the simulated camera."""
