@@ -1,0 +1,1 @@
+"""Vision: from camera frames to the needle and the thread."""
