@@ -1,0 +1,29 @@
+"""The driver without hardware."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.drivers import RecordingDriver, make_driver
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+
+
+def test_it_keeps_what_it_was_told_and_ends_with_zeros():
+    driver = make_driver(CoilBridgeSettings())
+    assert isinstance(driver, RecordingDriver)
+    driver.open()
+    currents = np.array([1.0, 0.0, 0.5, 0.0])
+    driver.apply(currents)
+    currents[0] = 9.0
+    driver.close()
+    assert [applied.tolist() for applied in driver.applied] == [[1.0, 0.0, 0.5, 0.0], [0.0] * 4]
+
+
+def test_it_refuses_what_a_real_driver_would():
+    driver = RecordingDriver(4)
+    with pytest.raises(RuntimeError, match="not open"):
+        driver.apply(np.zeros(4))
+    driver.open()
+    with pytest.raises(ValueError, match="4 currents"):
+        driver.apply(np.zeros(3))
