@@ -1,0 +1,1 @@
+"""Bags: the only room that knows mcap and rosbags."""

@@ -1,0 +1,214 @@
+"""Bags there and back, and damage that is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import Reader
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError
+
+COUNT = 300
+HEADER = "std_msgs/msg/Header"
+
+
+def header(index: int):
+    """Return a small message that knows its index."""
+    types = typestore().types
+    return types[HEADER](types["builtin_interfaces/msg/Time"](index, 0), f"frame {index}")
+
+
+def write(folder: Path) -> Path:
+    """Write a bag of COUNT messages on two topics and return its mcap file."""
+    with BagWriter(folder, {"setup": "example"}) as bag:
+        bag.add_topic("/one", HEADER)
+        bag.add_topic("/two", HEADER)
+        for index in range(COUNT):
+            bag.write_message("/one" if index % 3 else "/two", 10**9 + index * 10**7, header(index))
+    return folder / f"{folder.name}_0.mcap"
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the mcap file of a good bag."""
+    return write(tmp_path_factory.mktemp("bags") / "good")
+
+
+def test_what_is_written_is_read(good: Path):
+    for path in (good, good.parent):
+        bag = Bag(path)
+        bag.check()
+        assert bag.topics == {"/one": HEADER, "/two": HEADER}
+        assert bag.counts == {"/one": 200, "/two": 100}
+        assert bag.start == 10**9
+        assert bag.duration == pytest.approx(2.99)
+        assert bag.notes == {"setup": "example"}
+        assert [record.decode().frame_id for record in bag.records()] == [f"frame {k}" for k in range(COUNT)]
+        assert {record.topic for record in bag.records({"/two"})} == {"/two"}
+
+
+def test_another_tool_reads_it_whole(good: Path):
+    with Reader(good.parent) as reader:
+        assert reader.message_count == COUNT
+        assert reader.duration == 2_990_000_001
+        connection = reader.connections[0]
+        assert connection.digest == typestore().hash_rihs01(HEADER)
+        assert connection.msgdef is not None
+        assert sum(1 for _ in reader.messages()) == COUNT
+
+
+def test_metadata_names_types_and_counts(good: Path):
+    information = yaml.safe_load((good.parent / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert information["storage_identifier"] == "mcap"
+    assert information["message_count"] == COUNT
+    assert information["relative_file_paths"] == [good.name]
+    assert [entry["message_count"] for entry in information["topics_with_message_count"]] == [200, 100]
+
+
+def test_own_messages_are_known(tmp_path: Path):
+    with BagWriter(tmp_path / "own") as bag:
+        for name in ("PredictedThread", "SafetyMargins", "CoilCurrents", "BarrierMargin"):
+            bag.add_topic(f"/{name}", f"magnetosuture_msgs/msg/{name}")
+        types = typestore().types
+        bag.write_message("/BarrierMargin", 5, types["magnetosuture_msgs/msg/BarrierMargin"](2, 7, 1, 0.5, 0.25))
+    record = next(Bag(tmp_path / "own").records())
+    assert record.type_name == "magnetosuture_msgs/msg/BarrierMargin"
+    assert (record.decode().node, record.decode().clearance) == (7, 0.25)
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data())
+def test_a_flipped_bit_is_found_or_harmless(good: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject):
+    whole = bytearray(good.read_bytes())
+    place = data.draw(st.integers(0, len(whole) - 1))
+    whole[place] ^= 1 << data.draw(st.integers(0, 7))
+    path = tmp_path_factory.mktemp("flip") / "flipped.mcap"
+    path.write_bytes(whole)
+    try:
+        bag = Bag(path)
+        bag.check()
+    except BagError:
+        return
+    whole_bag = Bag(good)
+    assert [record.decode().frame_id for record in bag.records()] == [f"frame {k}" for k in range(COUNT)]
+    assert (bag.topics, bag.counts, bag.start) == (whole_bag.topics, whole_bag.counts, whole_bag.start)
+    assert bag.duration == whole_bag.duration
+
+
+def test_every_flip_in_the_summary_is_found_or_harmless(good: Path, tmp_path: Path):
+    """The summary has no checksum that the library checks: it is held against the messages."""
+    whole, path, known = good.read_bytes(), tmp_path / "flipped.mcap", Bag(good)
+    for place in range(len(whole) - 1500, len(whole)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        try:
+            bag = Bag(path)
+            bag.check()
+        except BagError:
+            continue
+        assert (bag.topics, bag.counts, bag.start) == (known.topics, known.counts, known.start)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+def test_bags_of_other_writers_are_read_and_their_damage_is_found(tmp_path: Path, compression: CompressionType):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=compression, chunk_size=2000)
+        writer.start("ros2")
+        schema = writer.register_schema(HEADER, "ros2msg", b"builtin_interfaces/Time stamp\nstring frame_id")
+        # Two channels on one topic, as in bags that were merged.
+        channels = [writer.register_channel("/one", "cdr", schema) for _ in range(2)]
+        for index in range(100):
+            data = bytes(typestore().serialize_cdr(header(index), HEADER))
+            writer.add_message(channels[index % 2], index, data, index)
+        writer.finish()
+    bag = Bag(path)
+    bag.check()
+    assert bag.counts == {"/one": 100}
+    whole = path.read_bytes()
+    refused = 0
+    for place in range(60, len(whole), 37):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        try:
+            Bag(path).check()
+        except BagError:
+            refused += 1
+    assert refused > 20
+
+
+def test_a_topic_with_two_types_is_refused(tmp_path: Path):
+    path = tmp_path / "two.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        for name in (HEADER, "std_msgs/msg/String"):
+            channel = writer.register_channel("/one", "cdr", writer.register_schema(name, "ros2msg", b""))
+            writer.add_message(channel, 0, b"\0\1\0\0", 0)
+        writer.finish()
+    with pytest.raises(BagError, match="topic /one has two types, std_msgs/msg/Header and std_msgs/msg/String"):
+        Bag(path)
+
+
+@settings(max_examples=60, deadline=None)
+@given(share=st.floats(0.0, 0.9999))
+def test_a_cut_bag_is_refused(good: Path, tmp_path_factory: pytest.TempPathFactory, share: float):
+    path = tmp_path_factory.mktemp("cut") / "cut.mcap"
+    whole = good.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(BagError, match=r"cut off|no mcap|empty"):
+        Bag(path)
+
+
+def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
+    (tmp_path / "text.mcap").write_text("not a bag, but long enough to be one")
+    (tmp_path / "folder").mkdir()
+    with BagWriter(tmp_path / "hollow") as bag:
+        bag.add_topic("/one", HEADER)
+    for name, words in (
+        ("missing", "does not exist; expected an mcap file"),
+        ("text.mcap", "is no mcap file"),
+        ("folder", "holds no .mcap file"),
+        ("hollow", "holds no messages"),
+    ):
+        with pytest.raises(BagError) as caught:
+            Bag(tmp_path / name)
+        assert words in str(caught.value)
+        assert name in str(caught.value)
+
+
+def test_a_missing_topic_and_a_wrong_type_are_named(good: Path):
+    bag = Bag(good)
+    bag.require("/one", HEADER)
+    with pytest.raises(BagError, match=r"no messages on /camera .*; its topics: /one, /two"):
+        bag.require("/camera", HEADER)
+    with pytest.raises(BagError, match="topic /one is of type std_msgs/msg/Header, expected sensor_msgs/msg/Image"):
+        bag.require("/one", "sensor_msgs/msg/Image")
+
+
+def test_an_existing_folder_is_not_written_over(good: Path, tmp_path: Path):
+    before = good.read_bytes()
+    with pytest.raises(BagError, match="is not empty"):
+        BagWriter(good.parent)
+    assert good.read_bytes() == before
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BagError, match="cannot be written"):
+        BagWriter(tmp_path / "file" / "bag")
+
+
+def test_a_bag_is_readable_whatever_interrupts_it(tmp_path: Path):
+    def interrupted() -> None:
+        with BagWriter(tmp_path / "short") as bag:
+            bag.add_topic("/one", HEADER)
+            bag.write_message("/one", 1, header(0))
+            raise ValueError("stop")
+
+    with pytest.raises(ValueError, match="stop"):
+        interrupted()
+    assert Bag(tmp_path / "short").counts == {"/one": 1}
