@@ -1,0 +1,62 @@
+"""Every set-up that ships is valid; what is not is refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.resources import setup_file, share
+from magnetosuture_thread.setups import read_setup
+
+SHIPPED = sorted(path.stem for path in (share("magnetosuture_thread") / "config").glob("*.yaml"))
+
+
+def test_there_are_setups():
+    assert "petri_35mm_polyamide" in SHIPPED
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_setup_that_ships_loads(name: str):
+    setup = read_setup(name)
+    assert setup.name == name
+    assert setup.vision.thread_length == setup.model.length
+    assert setup.model.thread().segment_length > setup.model.thread().diameter
+
+
+def test_a_setup_is_found_by_path(tmp_path: Path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("thread_model: {ros__parameters: {segments: 30}}\n")
+    assert read_setup(str(path)).model.segments == 30
+
+
+def test_a_dish_in_millimetres_is_refused(tmp_path: Path):
+    path = tmp_path / "millimetres.yaml"
+    path.write_text("vision_tracker: {ros__parameters: {dish_diameter: 35.0}}\n")
+    with pytest.raises(ConfigurationError) as caught:
+        read_setup(str(path))
+    assert str(caught.value) == (
+        f"{path}: vision_tracker.dish_diameter: got 35.0, expected a number from 0.005 to 0.5 m"
+    )
+
+
+def test_an_unknown_setup_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigurationError, match="petri_150mm_silk"):
+        setup_file("petri_36mm")
+    with pytest.raises(ConfigurationError, match=r"nowhere\.yaml"):
+        setup_file("nowhere.yaml")
+
+
+def test_thread_and_obstacle_must_make_sense(tmp_path: Path):
+    for text, words in (
+        ("segments: 2000, length: 0.019", "so that a segment is longer than thick"),
+        ("disc_obstacles: [0.0, 0.0, -0.001]", "half of a segment"),
+        ("disc_obstacles: [0.0, 0.0, 0.0003]", "half of a segment"),
+        ("viscosity: 1000.0", "from 0.0001 to 100 Pa s"),
+        ("length: 0.03", "vision_tracker.thread_length: got 0.019, expected 0.03 m"),
+    ):
+        path = tmp_path / "odd.yaml"
+        path.write_text(f"thread_model: {{ros__parameters: {{{text}}}}}\n")
+        with pytest.raises(ConfigurationError, match=words):
+            read_setup(str(path))
