@@ -1,0 +1,1 @@
+"""Study: reference trajectories, scores, tables and pictures."""

@@ -1,0 +1,55 @@
+"""The table of a replayed bag, for a terminal."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from magnetosuture_thread.study.replayed import Spread, Summary
+
+
+def summary_table(summary: Summary) -> Table:
+    """Return the figures of a replayed bag as a table."""
+    table = Table(title=f"{summary.bag}, set-up {summary.setup}", title_justify="left", title_style="bold")
+    table.add_column("", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("remark", style="dim")
+    table.add_row("camera frames", str(summary.frames), "simulated" if summary.simulated else "")
+    table.add_row("  tracked", str(summary.tracked), _share(summary.tracked, summary.frames))
+    table.add_row("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames))
+    table.add_row("velocity commands", str(summary.commands), "simulated" if summary.simulated else "")
+    table.add_row("  reached the coils", str(summary.driven), _share(summary.driven, summary.commands))
+    table.add_section()
+    table.add_row("latency, median", "", "99th percentile, greatest")
+    for stage, spread in summary.latency.items():
+        table.add_row(f"  {stage}", _milliseconds(spread), _tail(spread))
+    table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
+    table.add_section()
+    table.add_row("least margin", "", "safe at 0 or more")
+    for margin in summary.least_margins:
+        where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
+        table.add_row(f"  {margin.kind}", f"{margin.clearance * 1e6:+.3f} µm", f"{where}, at {margin.time:.2f} s")
+    table.add_row("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted))
+    table.add_row("greatest stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment")
+    table.add_row("greatest residual", f"{summary.residual:.1e}", "scaled; not the solver's own word")
+    table.add_section()
+    table.add_row("thread seen, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")
+    table.add_row("prediction error, mean", "", "greatest; % of the length")
+    for name, figures in (("seen centreline", summary.error_seen), ("simulated truth", summary.error_truth)):
+        if figures is None and name == "seen centreline":
+            table.add_row(f"  against the {name}", "none", "no frame could be scored")
+        elif figures is not None:
+            scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
+            table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
+    return table
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{100.0 * part / whole:.1f} %" if whole else ""
+
+
+def _milliseconds(spread: Spread | None) -> str:
+    return f"{1e3 * spread.median:.1f} ms" if spread else "no pairs"
+
+
+def _tail(spread: Spread | None) -> str:
+    return f"{1e3 * spread.p99:.1f}, {1e3 * spread.maximum:.1f} ms" if spread else ""

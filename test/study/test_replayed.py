@@ -1,0 +1,142 @@
+"""Putting outputs side by side."""
+
+from __future__ import annotations
+
+import io
+from types import SimpleNamespace as Message
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from magnetosuture_thread.study.replayed import Collector, Spread, Summary, error_figures, stage_latencies
+from magnetosuture_thread.study.table import summary_table
+
+
+def header(nanoseconds: int) -> Message:
+    """Return a header."""
+    return Message(stamp=Message(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9))
+
+
+def path(nanoseconds: int, points: np.ndarray) -> Message:
+    """Return a path."""
+    return Message(
+        header=header(nanoseconds), poses=[Message(pose=Message(position=Message(x=x, y=y))) for x, y in points]
+    )
+
+
+def prediction(nanoseconds: int, points: np.ndarray) -> Message:
+    """Return a predicted thread."""
+    return Message(
+        header=header(nanoseconds),
+        vertices=[Message(x=x, y=y) for x, y in points],
+        stretch=[0.0, -0.002, 0.001, 0.0],
+        residual=1e-8,
+        step_time=0.004,
+    )
+
+
+def margins(nanoseconds: int, clearance: float, valid: bool = True) -> Message:
+    """Return margins of one obstacle row for node 3 and one connectivity row for node 1."""
+    segment = Message(kind=0, node=1, obstacle=-1, clearance=1e-9)
+    post = Message(kind=2, node=3, obstacle=0, clearance=clearance)
+    return Message(
+        header=header(nanoseconds),
+        valid=valid,
+        kind=[0, 2],
+        node=[1, 3],
+        clearance=[1e-9, clearance],
+        least=[segment, post],
+        contact_nodes=[3] if clearance <= 0.0 else [],
+    )
+
+
+STRAIGHT = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])
+
+
+def test_messages_of_one_stamp_are_put_together():
+    collector = Collector(length=1.0)
+    for k, clearance in ((1, 0.5), (2, -0.1), (3, 0.2)):
+        collector.take("/thread/predicted", prediction(k * 10**9, STRAIGHT))
+        collector.take("/thread/measured", path(k * 10**9, STRAIGHT + np.array([0.0, 0.01])))
+        collector.take("/thread/margins", margins(k * 10**9, clearance))
+    collector.take("/truth/thread", path(2 * 10**9, STRAIGHT + np.array([0.0, 0.02])))
+    collector.take("/thread/measured", path(9 * 10**9, STRAIGHT))  # without a prediction
+    collector.take("/thread/margins", margins(9 * 10**9, -7.0, valid=False))
+    instants = collector.instants()
+    assert [instant.stamp for instant in instants] == [10**9, 2 * 10**9, 3 * 10**9]
+    assert [instant.error_seen for instant in instants] == pytest.approx([1.0] * 3)
+    assert instants[1].error_truth == pytest.approx(2.0)
+    assert np.isnan(instants[0].error_truth)
+    assert instants[0].stretch == pytest.approx(0.002)
+    assert instants[0].clearance.tolist() == [np.inf, np.inf, np.inf, 0.5]
+    assert collector.contact_frames == 1
+    least = collector.least_margins(start=10**9)
+    assert [(m.kind, m.clearance, m.node, m.obstacle, m.time) for m in least] == [
+        ("connectivity", 1e-9, 1, -1, 0.0),
+        ("obstacle", -0.1, 3, 0, 1.0),
+    ]
+
+
+def test_a_command_counts_as_driven_only_if_it_was_followed():
+    collector = Collector(length=1.0)
+    collector.take("/coils/currents", Message(header=header(5), stop=""))
+    collector.take("/coils/currents", Message(header=header(6), stop="no command for 0.2 s"))
+    assert collector.driven == {5}
+
+
+def test_the_last_word_of_every_node_is_kept():
+    collector = Collector(length=1.0)
+    for text in ("starting", "lost"):
+        status = Message(name="vision_tracker: state", message=text)
+        collector.take("/diagnostics", Message(header=header(1), status=[status]))
+    assert collector.health == {"vision_tracker": "lost"}
+
+
+def test_latencies_pair_stamps():
+    published = {"camera/image_raw/compressed": {1: 0.0, 2: 1.0}, "needle/servo_cv": {1: 0.5}}
+    arrived = {"needle/measured_cp": {1: 0.01, 2: 1.03}, "thread/predicted": {2: 1.04}, "coils/currents": {7: 0.1}}
+    found = stage_latencies(published, arrived, driven={1})
+    pose, step = found["frame to needle pose"], found["pose to prediction"]
+    assert pose is not None
+    assert step is not None
+    assert pose.median == pytest.approx(0.02)
+    assert pose.maximum == pytest.approx(0.03)
+    assert step.median == pytest.approx(0.01)
+    assert found["command to currents"] is None
+
+
+def test_figures_of_nothing_are_none():
+    assert error_figures([]) is None
+    assert error_figures([float("nan")]) is None
+    assert Spread.of([]) is None
+
+
+def test_the_table_says_what_is_simulated_and_fits_a_terminal():
+    spread = Spread(0.012, 0.02, 0.03)
+    summary = Summary(
+        bag="bag",
+        setup="petri",
+        simulated="all of it",
+        frames=10,
+        tracked=9,
+        predicted=8,
+        commands=0,
+        driven=0,
+        latency={"frame to needle pose": spread, "command to currents": None},
+        step_time=spread,
+        least_margins=[],
+        contact_frames=2,
+        stretch=1e-6,
+        residual=1e-9,
+        seen_share=0.9,
+        error_seen={"count": 8, "mean": 0.5, "median": 0.4, "p99": 0.9, "maximum": 1.0},
+        error_truth=None,
+    )
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(summary_table(summary))
+    text = console.export_text()
+    for words in ("simulated", "90.0 %", "12.0 ms", "no pairs", "0.500 %", "8 frames scored", "90.0 %"):
+        assert words in text
+    assert "truth" not in text
+    assert max(len(line) for line in text.splitlines()) <= 80
