@@ -1,0 +1,1 @@
+"""Nodes: the graph. The only room that knows ROS."""

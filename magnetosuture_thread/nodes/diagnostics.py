@@ -1,0 +1,76 @@
+"""What a node says of itself on /diagnostics."""
+
+from __future__ import annotations
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from magnetosuture_thread.nodes.topics import DIAGNOSTICS
+
+PERIOD = 1.0  # s
+
+
+class Health:
+    """Publishes a node's state once a second, and at once when it changes.
+
+    A change is not published more often than `quiet` seconds apart, so that a flood of bad messages
+    does not become a flood of reports; the count of refusals goes on all the same.
+
+    Args:
+        node: whose health it is.
+    """
+
+    quiet = 0.05
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._publisher = DIAGNOSTICS.publisher(node)
+        self._level, self._text = DiagnosticStatus.OK, "starting"
+        self._refused = 0
+        self._last_refusal = ""
+        self._values: dict[str, object] = {}
+        self._sent = -1.0
+        node.create_timer(PERIOD, self.publish, clock=self._clock)
+
+    def ok(self, text: str, **values: object) -> None:
+        """Say that all is well."""
+        self._set(DiagnosticStatus.OK, text, values)
+
+    def warn(self, text: str, **values: object) -> None:
+        """Say that the node goes on but cannot do all of its work."""
+        self._set(DiagnosticStatus.WARN, text, values)
+
+    def error(self, text: str, **values: object) -> None:
+        """Say that the node cannot do its work."""
+        self._set(DiagnosticStatus.ERROR, text, values)
+
+    def refuse(self, problem: Exception, **values: object) -> None:
+        """Say that an input was refused; the node itself goes on."""
+        self._refused += 1
+        self._last_refusal = str(problem)
+        self._set(DiagnosticStatus.WARN, f"refused: {problem}", values)
+
+    def publish(self) -> None:
+        """Publish the state now."""
+        values = {**self._values, "refused": self._refused, "last refusal": self._last_refusal or "none"}
+        status = DiagnosticStatus(
+            level=self._level,
+            name=f"{self._node.get_fully_qualified_name().lstrip('/')}: state",
+            message=self._text,
+            hardware_id="magnetosuture",
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        stamp = self._node.get_clock().now().to_msg()
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = stamp
+        self._publisher.publish(message)
+        self._sent = self._clock.now().nanoseconds * 1e-9
+
+    def _set(self, level: bytes, text: str, values: dict[str, object]) -> None:
+        changed = (level, text) != (self._level, self._text)
+        self._level, self._text = level, text
+        self._values.update(values)
+        if changed and self._clock.now().nanoseconds * 1e-9 - self._sent > self.quiet:
+            self.publish()

@@ -1,0 +1,168 @@
+"""The graph's nodes as processes of their own, on a ROS domain of their own."""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+from magnetosuture_thread.errors import GraphError
+
+# Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
+LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
+GRACE = 5.0  # s to end by itself, then it is killed
+
+# What could lead a graph out of this machine or to another graph.
+LEADS_ELSEWHERE = (
+    "CYCLONEDDS_URI",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "ROS_DISCOVERY_SERVER",
+    "ROS_NAMESPACE",
+    "ROS_STATIC_PEERS",
+    "ROS_SUPER_CLIENT",
+)
+_PARTICIPANTS = 4  # of a domain, whose discovery ports are looked at
+_PR_SET_PDEATHSIG = 1
+
+
+def graph_environment(domain: int) -> dict[str, str]:
+    """Return the environment for a graph of its own on this machine alone."""
+    environment = {key: value for key, value in os.environ.items() if key not in LEADS_ELSEWHERE}
+    environment["ROS_DOMAIN_ID"] = str(domain)
+    environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    environment.setdefault("FASTDDS_BUILTIN_TRANSPORTS", LARGE_DATA)
+    return environment
+
+
+@contextmanager
+def environment_of(environment: dict[str, str]) -> Iterator[None]:
+    """Give this process an environment, and its own back at the end."""
+    before = dict(os.environ)
+    os.environ.clear()
+    os.environ.update(environment)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
+
+
+@contextmanager
+def reserved_domain() -> Iterator[int]:
+    """Give a ROS domain that nobody on this machine uses.
+
+    A bag that is replayed must never reach a robot's coils, so it gets a domain of its own: one whose
+    first discovery ports nobody has bound, and that no other call, in any process, holds at the time.
+
+    Raises:
+        GraphError: all are in use.
+    """
+    first = os.getpid() % 100
+    for offset in range(100):
+        domain = 1 + (first + offset) % 100
+        lock = Path(tempfile.gettempdir()) / f"magnetosuture_domain_{domain}_{os.getuid()}.lock"
+        with lock.open("w") as held:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            if all(_is_free(7400 + 250 * domain + 10 + 2 * k) for k in range(_PARTICIPANTS)):
+                yield domain
+                return
+    raise GraphError("no free ROS domain from 1 to 100")
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
+class NodeProcesses:
+    """Starts nodes of this package as processes, and ends them.
+
+    They end with this process, however it ends: nobody would stop their coils otherwise.
+
+    Args:
+        names: of the nodes.
+        arguments: for each, after `--ros-args`.
+        environment: for each.
+        logs: folder that gets a log file of each.
+    """
+
+    def __init__(self, names: Sequence[str], arguments: Sequence[str], environment: dict[str, str], logs: Path) -> None:
+        self._names = names
+        self._arguments = arguments
+        self._environment = environment
+        self._logs = logs
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> NodeProcesses:
+        """Start the nodes."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        try:
+            for name in self._names:
+                self._start(name)
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the nodes, politely first."""
+        self._end()
+
+    def check(self) -> None:
+        """Raise `GraphError`, with its last words, if a node has ended."""
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                lines = (self._logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
+                last = lines[-1] if lines else "it said nothing"
+                raise GraphError(f"{name} ended with exit code {process.returncode}: {last}")
+
+    def _start(self, name: str) -> None:
+        command = [sys.executable, "-m", f"magnetosuture_thread.nodes.{name}", "--ros-args", *self._arguments]
+        with (self._logs / f"{name}.log").open("wb") as log:
+            self._processes[name] = subprocess.Popen(
+                command,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C is ours to pass on
+                preexec_fn=_end_with_parent,
+            )
+
+    def _end(self) -> None:
+        for process in self._processes.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for process in self._processes.values():
+            try:
+                process.wait(GRACE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+_LIBC = ctypes.CDLL(None)
+
+
+def _end_with_parent() -> None:
+    """Ask Linux to interrupt this process when its parent dies."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)

@@ -1,0 +1,57 @@
+"""Runs a node as a program: one-line errors, a clean end, exit codes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+from magnetosuture_thread.errors import MagnetosutureError
+
+
+def run(make: Callable[[], Node], arguments: Sequence[str] | None = None) -> int:
+    """Run a node until it is interrupted.
+
+    Args:
+        make: makes the node.
+        arguments: of the command line; those of the process if None.
+
+    Returns:
+        0 when it was asked to end, 1 when it could not start.
+    """
+    try:
+        rclpy.init(args=list(arguments) if arguments is not None else None)
+    except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
+        print(f"error: {_one_line(error)}", file=sys.stderr)
+        return 1
+    node = None
+    try:
+        node = make()
+        # The multi-threaded executor loses messages in the wheels of Jazzy.
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (MagnetosutureError, ParameterException) as error:
+        print(f"error: {_one_line(error)}", file=sys.stderr)
+        return 1
+    except ValueError as error:
+        if node is not None:
+            raise
+        # rclpy's own word for a parameter that has no value, as an empty list.
+        print(f"error: a parameter cannot be declared: {_one_line(error)}", file=sys.stderr)
+        return 1
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

@@ -1,0 +1,95 @@
+"""The graph's topics in ROS: message classes and qualities of service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from magnetosuture_thread import interface
+from magnetosuture_thread.interface import Channel
+
+SENSOR = qos_profile_sensor_data
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic: its name and type, and its quality of service."""
+
+    channel: Channel
+    qos: QoSProfile
+    absolute: bool = False
+
+    @property
+    def name(self) -> str:
+        """Return the name that nodes give to ROS."""
+        return self.channel.recorded if self.absolute else self.channel.name
+
+    @property
+    def message(self) -> Any:
+        """Return the message class."""
+        package, _, name = self.channel.type_name.split("/")
+        return getattr(import_module(f"{package}.msg"), name)
+
+    def publisher(self, node: Node) -> Publisher:
+        """Return a publisher whose reliability and depth can be overridden by parameters, as usual in ROS."""
+        options = QoSOverridingOptions.with_default_policies()
+        return node.create_publisher(self.message, self.name, self.qos, qos_overriding_options=options)
+
+    def subscribe(self, node: Node, callback: Callable[[Any], None]) -> Subscription:
+        """Subscribe; reliability and depth can be overridden by parameters."""
+        options = QoSOverridingOptions.with_default_policies()
+        return node.create_subscription(self.message, self.name, callback, self.qos, qos_overriding_options=options)
+
+
+IMAGE = Topic(interface.IMAGE, SENSOR)
+COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, SENSOR)
+CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR)
+NEEDLE_POSE = Topic(interface.NEEDLE_POSE, SENSOR)
+NEEDLE_COMMAND = Topic(interface.NEEDLE_COMMAND, RELIABLE)
+NEEDLE_SETPOINT = Topic(interface.NEEDLE_SETPOINT, RELIABLE)
+SEEN_THREAD = Topic(interface.SEEN_THREAD, RELIABLE)
+PREDICTED_THREAD = Topic(interface.PREDICTED_THREAD, RELIABLE)
+MARGINS = Topic(interface.MARGINS, RELIABLE)
+THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE)
+OBSTACLE_MARKERS = Topic(interface.OBSTACLE_MARKERS, LATCHED)
+CURRENTS = Topic(interface.CURRENTS, RELIABLE)
+DIAGNOSTICS = Topic(interface.DIAGNOSTICS, RELIABLE, absolute=True)
+
+INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND)
+OUTPUTS = (
+    NEEDLE_POSE,
+    SEEN_THREAD,
+    PREDICTED_THREAD,
+    MARGINS,
+    THREAD_MARKERS,
+    OBSTACLE_MARKERS,
+    NEEDLE_SETPOINT,
+    CURRENTS,
+    DIAGNOSTICS,
+)
+
+
+def lossless(depth: int) -> dict[str, object]:
+    """Return parameters for all nodes under which nothing is dropped while fewer than `depth` messages wait.
+
+    A live graph drops what it cannot take in time, so that it never falls behind; a replayed bag is
+    judged by every frame.
+    """
+    overrides = {
+        f"/{topic.channel.name}": {
+            role: {"reliability": "reliable", "depth": depth} for role in ("publisher", "subscription")
+        }
+        for topic in (*INPUTS, *OUTPUTS)
+        if topic.qos is not LATCHED
+    }
+    return {"/**": {"ros__parameters": {"qos_overrides": overrides}}}

@@ -1,0 +1,120 @@
+"""A graph for one test: its own context and domain, an executor in a thread, waits on conditions."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from magnetosuture_thread.nodes.processes import reserved_domain
+from magnetosuture_thread.nodes.topics import Topic
+
+
+class Graph:
+    """Nodes of one test and a probe that speaks and listens to them."""
+
+    def __init__(self, domain: int) -> None:
+        self.domain = domain
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=self.domain, args=[])
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.nodes: list[Node] = []
+        self.probe = rclpy.create_node("probe", context=self.context)
+        self.nodes.append(self.probe)
+        self.executor.add_node(self.probe)
+        self._subscriptions: dict[str, Any] = {}
+        self._publishers: dict[str, Any] = {}
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def add(self, make: Callable[..., Any], **parameters: Any) -> Any:
+        """Make a node of the package with parameters and add it to the graph."""
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = make(context=self.context, parameter_overrides=overrides)
+        self.nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def remove(self, node: Node) -> None:
+        """Take a node out of the graph and destroy it."""
+        self.executor.remove_node(node)
+        self.nodes.remove(node)
+        node.destroy_node()
+
+    def listen(self, topic: Topic) -> list[Any]:
+        """Return the list that grows with every message on a topic, once somebody publishes it."""
+        messages = self.listen_later(topic)
+        self.wait(lambda: self.matched(topic), f"a publisher of {topic.name}")
+        return messages
+
+    def listen_later(self, topic: Topic) -> list[Any]:
+        """Return the list that grows with every message on a topic."""
+        messages: list[Any] = []
+        subscription = self.probe.create_subscription(topic.message, topic.name, messages.append, topic.qos)
+        self._subscriptions[topic.name] = subscription
+        return messages
+
+    def matched(self, topic: Topic) -> bool:
+        """Return whether a publisher of a topic that we listen to has been found."""
+        return bool(self._subscriptions[topic.name].get_publisher_count())
+
+    def publish(self, topic: Topic, message: Any) -> None:
+        """Publish, once somebody listens."""
+        if topic.name not in self._publishers:
+            self._publishers[topic.name] = self.probe.create_publisher(topic.message, topic.name, topic.qos)
+        publisher = self._publishers[topic.name]
+        self.wait(lambda: publisher.get_subscription_count() > 0, f"a subscriber of {topic.name}")
+        others = [s for node in self.nodes for s in node.subscriptions if s.topic_name == publisher.topic_name]
+        self.wait(lambda: all(s.get_publisher_count() > 0 for s in others), f"{topic.name} to be found")
+        publisher.publish(message)
+
+    def wait(self, condition: Callable[[], bool], what: str, timeout: float = 10.0) -> None:
+        """Wait until a condition holds."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if self._failure is not None:
+                raise self._failure
+            assert time.monotonic() < deadline, f"waited {timeout:g} s for {what}"
+            time.sleep(0.002)
+
+    def now(self) -> Any:
+        """Return the time as a stamp."""
+        return self.probe.get_clock().now().to_msg()
+
+    def close(self) -> None:
+        """End everything, and raise what a callback raised."""
+        self.executor.shutdown()
+        self.context.try_shutdown()
+        self._thread.join(10.0)
+        for node in self.nodes:
+            node.destroy_node()
+        if self._failure is not None:
+            raise self._failure
+
+    def _spin(self) -> None:
+        try:
+            while self.context.ok():
+                self.executor.spin_once(timeout_sec=0.05)
+        except rclpy.executors.ExternalShutdownException:
+            pass
+        except BaseException as error:
+            if self.context.ok():
+                self._failure = error
+
+
+@pytest.fixture
+def graph() -> Iterator[Graph]:
+    """A graph, closed at the end of the test."""
+    with reserved_domain() as domain:
+        made = Graph(domain)
+        yield made
+        made.close()

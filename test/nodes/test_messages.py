@@ -1,0 +1,70 @@
+"""Conversions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Quaternion
+from hypothesis import given
+from hypothesis import strategies as st
+from magnetosuture_msgs.msg import BarrierMargin
+
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.model.barriers import BarrierKind
+from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.resources import share
+from magnetosuture_thread.study.replayed import KINDS
+
+STAMP = Time(sec=3, nanosec=500_000_000)
+
+
+@given(angle=st.floats(-math.pi, math.pi), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))
+def test_a_pose_goes_there_and_back(angle: float, x: float, y: float):
+    heading = np.array([math.cos(angle), math.sin(angle)])
+    found = messages.needle_pose(messages.pose_message(STAMP, np.array([x, y]), heading))
+    assert found.stamp == 3.5
+    np.testing.assert_allclose(found.tail, [x, y])
+    np.testing.assert_allclose(found.heading, heading, atol=1e-12)
+
+
+def test_a_needle_that_stands_upright_has_no_heading():
+    message = messages.pose_message(STAMP, np.zeros(2), np.array([1.0, 0.0]))
+    message.pose.orientation = Quaternion(y=math.sqrt(0.5), w=math.sqrt(0.5))
+    with pytest.raises(InvalidInputError, match="an x axis in the dish plane"):
+        messages.needle_pose(message)
+
+
+def test_paths_and_velocities_go_there_and_back():
+    points = np.random.default_rng(0).normal(size=(5, 2))
+    np.testing.assert_array_equal(messages.path_points(messages.path_message(STAMP, points)), points)
+    assert messages.path_points(messages.path_message(STAMP, np.empty((0, 2)))).shape == (0, 2)
+    np.testing.assert_array_equal(
+        messages.command_velocity(messages.twist_message(STAMP, np.array([1.0, -2.0]))), [1.0, -2.0]
+    )
+
+
+@pytest.mark.parametrize("topic", [*topics.INPUTS, *topics.OUTPUTS], ids=lambda topic: topic.name)
+def test_every_topic_has_a_type_that_bags_know(topic: topics.Topic):
+    assert topic.channel.type_name in typestore().fielddefs
+
+
+def test_the_bags_and_the_graph_have_the_same_own_messages():
+    """The same bytes mean the same in both: a type that was rebuilt in one place only would differ."""
+    for topic in (topics.PREDICTED_THREAD, topics.MARGINS, topics.CURRENTS):
+        fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
+        assert fields == list(topic.message().get_fields_and_field_types())
+
+
+def test_the_kinds_of_barrier_have_the_same_numbers_everywhere():
+    constants = {
+        name.removeprefix("KIND_").lower(): getattr(BarrierMargin, name)
+        for name in ("KIND_CONNECTIVITY", "KIND_COMPRESSION", "KIND_OBSTACLE")
+    }
+    assert constants == {kind.name.lower(): int(kind) for kind in BarrierKind}
+    assert constants == {name: number for number, name in enumerate(KINDS)}
+    text = (share("magnetosuture_msgs") / "msg" / "BarrierMargin.msg").read_text()
+    assert text.count("uint8 KIND_") == len(BarrierKind)

@@ -1,0 +1,163 @@
+"""The thread model in a graph."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
+from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
+from nav_msgs.msg import Path
+from visualization_msgs.msg import Marker
+
+from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+
+
+def stamp(seconds: float) -> Time:
+    """Return a stamp."""
+    return Time(sec=int(seconds), nanosec=round((seconds % 1.0) * 1e9))
+
+
+def pose(seconds: float, x: float = 0.0, y: float = 0.0) -> PoseStamped:
+    """Return a needle that points east."""
+    return messages.pose_message(stamp(seconds), np.array([x, y]), np.array([1.0, 0.0]))
+
+
+def seen(seconds: float) -> Path:
+    """Return a thread that lies straight behind a needle at the origin."""
+    return messages.path_message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
+
+
+def test_the_thread_starts_where_it_is_seen_and_follows(graph):
+    graph.add(ThreadModelNode)
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+    markers = graph.listen(topics.THREAD_MARKERS)
+    graph.publish(topics.SEEN_THREAD, seen(1.0))
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: len(predicted) == 1, "the start")
+    for k in range(1, 11):
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, k * 1e-4))
+        graph.wait(lambda k=k: len(predicted) == k + 1, "a prediction")
+    last = predicted[-1]
+    assert last.header.frame_id == "dish"
+    assert last.header.stamp == pose(1.0 + 10 / 30.0).header.stamp
+    assert (last.formulation, last.material, last.solver) == ("rod", "polyamide_7_0", "osqp")
+    assert len(last.vertices) == 26
+    assert len(last.stretch) == 25
+    assert last.vertices[0].x == pytest.approx(1e-3)
+    assert last.vertices[25].x == pytest.approx(1e-3 - 0.019, abs=1e-6)
+    assert max(abs(value) for value in last.stretch) < 1e-5
+    assert 0.0 < last.residual < 1e-5
+    assert last.substeps == 3
+    assert last.interval == pytest.approx(1 / 30.0, abs=1e-6)
+    assert 0.0 < last.step_time < 1.0
+    graph.wait(lambda: len(margins) >= 11 and len(markers) >= 11, "margins and markers")
+    assert margins[-1].valid
+    assert margins[-1].contact_state == SafetyMargins.CONTACT_FREE
+    assert len(margins[-1].value) == 50
+    assert [least.kind for least in margins[-1].least] == [
+        BarrierMargin.KIND_CONNECTIVITY,
+        BarrierMargin.KIND_COMPRESSION,
+    ]
+    assert markers[-1].markers[0].type == Marker.LINE_STRIP
+    assert len(markers[-1].markers[0].points) == len(markers[-1].markers[0].colors) == 26
+
+
+def test_the_order_of_pose_and_centreline_does_not_matter(graph):
+    graph.add(ThreadModelNode)
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: bool(margins), "margins")
+    assert not margins[0].valid
+    assert margins[0].reason == "waiting for the thread to be seen"
+    assert not margins[0].value
+    graph.publish(topics.SEEN_THREAD, seen(1.0))
+    graph.wait(lambda: bool(predicted), "the start")
+
+
+def test_poses_that_come_before_the_centreline_of_their_frame_are_not_lost(graph):
+    graph.add(ThreadModelNode)
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+    for k in range(4):
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + 0.1 * k, 1e-4 * k))
+    graph.wait(lambda: len(margins) == 4, "four poses")
+    graph.publish(topics.SEEN_THREAD, seen(1.1))  # the first frame's centreline was lost
+    graph.wait(lambda: len(predicted) == 3, "three predictions")
+    assert [p.header.stamp for p in predicted] == [pose(1.0 + 0.1 * k).header.stamp for k in (1, 2, 3)]
+
+
+def test_it_can_start_straight_without_a_camera(graph):
+    graph.add(ThreadModelNode, initial_shape="straight")
+    predicted = graph.listen(topics.PREDICTED_THREAD)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.003, 0.001))
+    graph.wait(lambda: bool(predicted), "the start")
+    assert predicted[0].vertices[25].x == pytest.approx(0.003 - 0.019)
+
+
+def test_obstacles_give_margins_contact_and_a_latched_marker(graph):
+    # A disc that node 12 rests against.
+    graph.add(ThreadModelNode, disc_obstacles=[-12 * 0.00076, 0.002 + 30e-6 + 1e-6, 0.002], initial_shape="straight")
+    margins, obstacles = graph.listen(topics.MARGINS), graph.listen(topics.OBSTACLE_MARKERS)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: bool(margins and obstacles), "margins and obstacles")
+    assert margins[0].contact_state == SafetyMargins.CONTACT_TOUCHING
+    assert list(margins[0].contact_nodes) == [12]
+    least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_OBSTACLE)
+    assert least.obstacle == 0
+    assert least.node == 12
+    assert least.clearance == pytest.approx(1e-6, abs=1e-9)
+    assert obstacles[0].markers[0].scale.x == pytest.approx(0.004)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda p: setattr(p.pose.position, "x", math.nan), "finite coordinates"),
+        (lambda p: setattr(p.pose.position, "y", math.inf), "finite coordinates"),
+        (lambda p: setattr(p.pose.orientation, "w", math.nan), "a unit quaternion"),
+        (lambda p: setattr(p.pose.orientation, "w", 7.0), "a unit quaternion"),
+        (lambda p: setattr(p.header, "frame_id", "map"), "'dish'"),
+        (lambda p: setattr(p.header, "stamp", stamp(0.9)), "later than"),
+    ],
+)
+def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):
+    graph.add(ThreadModelNode, initial_shape="straight")
+    predicted, diagnostics = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: len(predicted) == 1, "the start")
+    bad = pose(1.1)
+    spoil(bad)
+    graph.publish(topics.NEEDLE_POSE, bad)
+    graph.wait(lambda: any(words in d.status[0].message for d in diagnostics), "a refusal")
+    graph.publish(topics.NEEDLE_POSE, pose(1.2))
+    graph.wait(lambda: len(predicted) == 2, "the next prediction")
+    assert np.isfinite([v.x for v in predicted[1].vertices]).all()
+    assert predicted[1].interval == pytest.approx(0.2)
+
+
+def test_time_set_back_starts_anew(graph):
+    graph.add(ThreadModelNode, initial_shape="straight")
+    predicted = graph.listen(topics.PREDICTED_THREAD)
+    graph.publish(topics.NEEDLE_POSE, pose(100.0))
+    graph.wait(lambda: len(predicted) == 1, "the start")
+    graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.002))
+    graph.wait(lambda: len(predicted) == 2, "the new start")
+    assert predicted[1].solver_status == "started"
+
+
+def test_an_unproven_solution_gives_no_margin(graph):
+    graph.add(ThreadModelNode, initial_shape="straight", residual_tolerance=1e-12)
+    margins, predicted = graph.listen(topics.MARGINS), graph.listen(topics.PREDICTED_THREAD)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: len(predicted) == 1, "the start")
+    # A leap of half of the dish in a thousandth of a second, onto nothing that can be solved to 1e-12.
+    graph.publish(topics.NEEDLE_POSE, pose(1.001, 0.017, 0.013))
+    graph.wait(lambda: any(not m.valid for m in margins), "invalid margins")
+    invalid = next(m for m in margins if not m.valid)
+    assert "residual" in invalid.reason
+    assert invalid.contact_state == SafetyMargins.CONTACT_UNKNOWN
+    assert not invalid.least
+    assert len(predicted) == 1

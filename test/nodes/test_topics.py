@@ -1,0 +1,49 @@
+"""Topics: what a subscriber with ROS's defaults gets, and what a replay changes."""
+
+from __future__ import annotations
+
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from magnetosuture_thread.interface import CAMERA
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+
+
+def test_only_camera_and_pose_are_sensor_data():
+    sensors = {topic.channel.name for topic in (*topics.INPUTS, *topics.OUTPUTS) if topic.qos is topics.SENSOR}
+    cameras = {channel.name for channel in CAMERA.values()}
+    assert sensors == {*cameras, "camera/camera_info", "needle/measured_cp"}
+
+
+def test_what_is_constant_is_latched(graph):
+    graph.add(ThreadModelNode, disc_obstacles=[0.0, 0.0, 0.002])
+    late = graph.listen(topics.OBSTACLE_MARKERS)
+    graph.wait(lambda: bool(late), "the obstacles, published before anybody listened")
+
+
+@pytest.mark.parametrize("depth", [5, 300])
+def test_a_replay_makes_every_queue_reliable_and_deep(depth: int):
+    overrides = topics.lossless(depth)["/**"]["ros__parameters"]["qos_overrides"]  # type: ignore[index]
+    for topic in (*topics.INPUTS, *topics.OUTPUTS):
+        if topic.qos is topics.LATCHED:
+            assert topic.channel.recorded not in overrides
+        else:
+            for role in ("publisher", "subscription"):
+                assert overrides[topic.channel.recorded][role] == {"reliability": "reliable", "depth": depth}
+
+
+def test_the_overrides_take_effect(graph):
+    overrides = topics.lossless(123)["/**"]["ros__parameters"]["qos_overrides"]  # type: ignore[index]
+    parameters = {
+        f"qos_overrides.{name}.{role}.{policy}": value
+        for name, roles in overrides.items()
+        for role, policies in roles.items()
+        for policy, value in policies.items()
+    }
+    node = graph.add(ThreadModelNode, **parameters)
+    infos = node.get_subscriptions_info_by_topic("/needle/measured_cp")
+    assert infos[0].qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    assert QoSProfile(depth=1).durability == DurabilityPolicy.VOLATILE
+    own = next(s for s in node.subscriptions if s.topic_name == "/needle/measured_cp")
+    assert own.qos_profile.depth == 123
