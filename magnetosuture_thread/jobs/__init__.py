@@ -1,0 +1,1 @@
+"""Jobs: what each sub-command does, a file for each."""

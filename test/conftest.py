@@ -1,0 +1,71 @@
+"""What all tests share: a rendered scene, and a graph on this machine alone."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.rig.camera import DishCamera, Scene
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.reference import ReferenceTrajectory
+
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+VIEW = DishView((322.0, 238.0), 8e-5)
+POST = Disc((0.006, -0.004), 0.0015)
+
+
+def arc(tail: np.ndarray, angle: float, curvature: float, length: float = 0.019, points: int = 101) -> np.ndarray:
+    """Return a circular arc of a thread that leaves a tail at an angle, shape (points, 2)."""
+    s = np.linspace(0.0, length, points)
+    turned = angle + curvature * s
+    steps = np.diff(s)[:, None] * np.column_stack([np.cos(turned), np.sin(turned)])[:-1]
+    return np.vstack([tail, tail + np.cumsum(steps, axis=0)])
+
+
+@pytest.fixture
+def view() -> DishView:
+    """Where the rendered dish is."""
+    return VIEW
+
+
+@pytest.fixture(scope="session")
+def camera() -> DishCamera:
+    """A camera over an empty dish."""
+    return DishCamera(Scene(), VIEW, seed=5)
+
+
+@pytest.fixture(scope="session")
+def camera_with_post() -> DishCamera:
+    """A camera over a dish with a post."""
+    return DishCamera(Scene(posts=[POST]), VIEW, seed=6)
+
+
+@pytest.fixture
+def thread_arc():
+    """Return the function that makes a thread's centreline."""
+    return arc
+
+
+@pytest.fixture(scope="session")
+def straight_pull() -> ReferenceTrajectory:
+    """Return a needle that pulls a straight thread east for two seconds."""
+    times = np.linspace(0.0, 2.0, 133)
+    tails = np.column_stack([0.003 + 0.003 * times, np.full(133, 0.002)])
+    along = np.linspace(0.0, 0.019, 101)
+    threads = np.stack([tails[:, None, 0] - along, tails[:, None, 1] + 0.0 * along], axis=2)
+    return ReferenceTrajectory("straight_pull", times, tails, np.zeros(133), threads, (), {})
+
+
+@pytest.fixture(scope="session")
+def short_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceTrajectory) -> Path:
+    """Return a bag of one second."""
+    path = tmp_path_factory.mktemp("short") / "pull"
+    record(straight_pull, read_setup("petri_35mm_polyamide"), path, duration=1.0)
+    return path

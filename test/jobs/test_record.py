@@ -1,0 +1,95 @@
+"""Recording simulated bags."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.reference import ReferenceTrajectory
+from magnetosuture_thread.vision.tracker import decode_image
+
+
+def test_the_bag_holds_frames_commands_and_truth_and_says_that_it_is_simulated(short_bag: Path):
+    bag = Bag(short_bag)
+    bag.check()
+    assert bag.counts == {
+        "/camera/image_raw/compressed": 30,
+        "/camera/camera_info": 30,
+        "/needle/servo_cv": 30,
+        "/truth/needle": 30,
+        "/truth/thread": 30,
+    }
+    assert bag.notes["setup"] == "petri_35mm_polyamide"
+    assert "straight_pull" in bag.notes["simulated"]
+    messages = {record.topic: record.decode() for record in bag.records()}
+    assert decode_image(messages["/camera/image_raw/compressed"].data).shape == (480, 640, 3)
+    assert messages["/needle/servo_cv"].twist.linear.x == pytest.approx(0.003, rel=1e-6)
+    assert messages["/truth/needle"].pose.position.x == pytest.approx(0.003 + 0.003 * 29 / 30)
+    assert len(messages["/truth/thread"].poses) == 51
+    info = messages["/camera/camera_info"]
+    # A point 5 mm east of the dish's centre, 0.3 m below the camera, is seen 62.5 px right of it.
+    assert info.k[0] * 0.005 / 0.3 == pytest.approx(0.005 / (0.035 / (0.9115 * 480)))
+
+
+def test_every_command_is_the_trajectorys_velocity(short_bag: Path):
+    commands = [record.decode() for record in Bag(short_bag).records({"/needle/servo_cv"})]
+    assert [command.twist.linear.x for command in commands] == pytest.approx([0.003] * 30, rel=1e-6)
+
+
+def test_what_exists_is_not_touched(tmp_path: Path, straight_pull: ReferenceTrajectory):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "mine").write_text("precious")
+    with pytest.raises(BagError, match="exists already"):
+        record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.2)
+    assert (tmp_path / "bag" / "mine").read_text() == "precious"
+
+
+def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: ReferenceTrajectory):
+    setup = read_setup("petri_35mm_polyamide")
+    assert record(straight_pull, setup, tmp_path / "three", start=0.9, duration=0.1) == 3
+    with pytest.raises(BagError, match="hold no frame"):
+        record(straight_pull, setup, tmp_path / "none", duration=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "discs", "words"),
+    [
+        ({"material": {"L_m": 0.15}}, (), r"thread_model\.length: got 0\.019, expected 0\.15"),
+        ({"boundary": "pinned"}, (), r"thread_model\.attachment: got 'glued', expected pinned"),
+        ({}, (Disc((0.0, 0.0), 0.002),), r"thread_model\.disc_obstacles: got \(\), expected .*radius=0\.002"),
+    ],
+)
+def test_a_setup_for_another_thread_is_refused(
+    tmp_path: Path, straight_pull: ReferenceTrajectory, metadata: dict, discs: tuple[Disc, ...], words: str
+):
+    other = replace(straight_pull, metadata=metadata, discs=discs)
+    with pytest.raises(ConfigurationError, match=words):
+        record(other, read_setup("petri_35mm_polyamide"), tmp_path / "bag")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_times_that_are_not_there_are_refused_and_nothing_is_left(tmp_path: Path):
+    times = np.linspace(0.0, 1.0, 5)
+    reference = ReferenceTrajectory("short", times, np.zeros((5, 2)), np.zeros(5), np.zeros((5, 3, 2)), (), {})
+    for start, duration in ((0.5, 2.0), (3.0, None), (-1.0, 0.5)):
+        with pytest.raises(BagError, match="has the times 0 to 1 s"):
+            record(reference, read_setup("petri_35mm_polyamide"), tmp_path / "bag", start=start, duration=duration)
+    assert not (tmp_path / "bag").exists()
+
+
+def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, straight_pull: ReferenceTrajectory):
+
+    def stop(share: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.5, progress=stop)
+    assert list(tmp_path.iterdir()) == []

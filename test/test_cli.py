@@ -1,0 +1,92 @@
+"""The command: help, exit codes, errors in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread import cli
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command as a user does."""
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_help_names_every_command_and_the_exit_codes():
+    shown = run("--help")
+    assert shown.returncode == 0
+    for words in ("replay", "record", "no medical device", "0 done, 1 the job failed, 2 wrong use"):
+        assert words in shown.stdout
+
+
+@pytest.mark.parametrize("name", ["replay", "record"])
+def test_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([name, "--help"])
+    assert ended.value.code == 0
+    assert "--output" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["dance"],
+        ["replay"],
+        ["replay", "bag"],
+        ["replay", "bag", "--output", "out", "--rate", "fast"],
+        ["replay", "bag", "--output", "out", "--rate", "nan"],
+        ["record", "r.npz", "--output", "out"],
+        ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--seed", "-1"],
+        ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--quality", "0"],
+    ],
+)
+def test_wrong_use_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["replay", "nowhere"], 1, "error: nowhere: does not exist"),
+        (["replay", "x" * 300], 1, "error: " + "x" * 300 + ": cannot be read"),
+        (["record", "no.npz", "--setup", "petri_35mm_polyamide"], 1, "error: no.npz: does not exist"),
+        (["record", "no.npz", "--setup", "petri_35cm"], 2, "error: set-up: got 'petri_35cm'"),
+        (["record", "no.npz", "--setup", "x" * 300], 2, "error: set-up: got 'xxx"),
+    ],
+)
+def test_a_failed_job_is_one_line(tmp_path: Path, monkeypatch, capsys, arguments: list[str], code: int, words: str):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*arguments, "--output", "out"]) == code
+    errors = capsys.readouterr().err
+    assert errors.startswith(words)
+    assert errors.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_brackets_in_an_error_are_shown_as_they_are(monkeypatch, capsys, tmp_path: Path):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a[red]b", "x[/y]"):
+        assert cli.main(["replay", name, "--output", "out"]) == 1
+        captured = capsys.readouterr()
+        assert f"checking {name}" in captured.out
+        assert f"{name}: does not exist" in captured.err
+
+
+def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path, short_bag: Path):
+    for name in [name for name in sys.modules if name.startswith("magnetosuture_thread.nodes")]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in [name for name in sys.modules if name.split(".")[0] == "rclpy"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    assert cli.main(["replay", str(short_bag), "--output", str(tmp_path / "out")]) == 1
+    assert "the live graph needs ROS 2 Jazzy" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
