@@ -1,0 +1,60 @@
+"""Starts every node from colcon's install folder, as `ros2 run` would, and ends it.
+
+A node passes when it says on /diagnostics that it is there, and ends with exit code 0 when interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+NODES = ("vision_tracker", "thread_model", "coil_bridge")
+TIMEOUT = 20.0  # s
+
+LISTEN = """
+import sys, time, rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+rclpy.init()
+node = rclpy.create_node("listener")
+names = []
+node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: names.append(m.status[0].name), 10)
+heard = lambda: any(name.startswith(sys.argv[1] + ":") for name in names)
+deadline = time.monotonic() + float(sys.argv[2])
+while time.monotonic() < deadline and not heard():
+    rclpy.spin_once(node, timeout_sec=0.1)
+sys.exit(0 if heard() else 1)
+"""
+
+
+def main(install: Path) -> int:
+    """Start every node from an install folder; return 0 if all of them work."""
+    setup = install.resolve() / "setup.sh"
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": "101",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+    }
+    for name in NODES:
+        program = f'. "{setup}" && exec "{install.resolve()}/magnetosuture_thread/lib/magnetosuture_thread/{name}"'
+        process = subprocess.Popen(["sh", "-c", program], env=environment, cwd="/")
+        try:
+            heard = subprocess.run([sys.executable, "-c", LISTEN, name, str(TIMEOUT)], env=environment, check=False)
+            process.send_signal(signal.SIGINT)
+            code = process.wait(TIMEOUT)
+        finally:
+            process.kill()
+        if heard.returncode or code:
+            print(f"{name} from {install}: heard {heard.returncode == 0}, exit code {code}", file=sys.stderr)
+            return 1
+        print(f"{name} from {install}: runs and ends")
+        time.sleep(0.2)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

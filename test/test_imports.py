@@ -1,0 +1,112 @@
+"""Imports run one way through the house, and every package outside has one room that knows it."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import magnetosuture_thread
+
+HOUSE = Path(magnetosuture_thread.__file__).parent
+
+# What each room may import of the house, itself aside.
+BASE = {"errors", "configuration", "resources"}
+ALLOWED = {
+    "errors": set(),
+    "configuration": {"errors"},
+    "resources": {"errors"},
+    "interface": set(),
+    "geometry": {"errors"},
+    "model": {*BASE, "geometry"},
+    "vision": {*BASE, "geometry"},
+    "coils": {*BASE, "geometry"},
+    "rig": {*BASE, "geometry"},
+    "bags": BASE,
+    "study": {"errors", "geometry", "interface"},
+    "nodes": {*BASE, "interface", "geometry", "model", "vision", "coils"},
+    "setups": {*BASE, "model", "vision", "coils"},
+    "jobs": {*BASE, "interface", "geometry", "model", "vision", "coils", "rig", "bags", "study", "nodes", "setups"},
+    "cli": {"errors", "setups", "jobs", "study"},
+}
+
+# Packages that only some rooms may know.
+OWNERS = {
+    "cv2": {"vision", "rig"},
+    "mcap": {"bags"},
+    "rosbags": {"bags"},
+    "zstandard": {"bags"},
+    "osqp": {"model"},
+    "matplotlib": {"study"},
+    "rich": {"cli", "study"},
+    "rclpy": {"nodes"},
+    "rcl_interfaces": {"nodes"},
+    "builtin_interfaces": {"nodes"},
+    "diagnostic_msgs": {"nodes"},
+    "geometry_msgs": {"nodes"},
+    "magnetosuture_msgs": {"nodes"},
+    "nav_msgs": {"nodes"},
+    "rosgraph_msgs": {"nodes"},
+    "sensor_msgs": {"nodes"},
+    "std_msgs": {"nodes"},
+    "visualization_msgs": {"nodes"},
+}
+
+MODULES = sorted(HOUSE.rglob("*.py"))
+
+
+def imported(path: Path) -> set[str]:
+    """Return the full names of all modules that a file imports, wherever in the file."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            assert node.module is not None
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return names
+
+
+def room(path: Path) -> str:
+    """Return the room that a file is in: its folder, or its own name at the top."""
+    return path.relative_to(HOUSE).parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(HOUSE)))
+def test_imports_run_one_way(path: Path):
+    here = room(path)
+    if here == "__init__":
+        assert imported(path) == set()
+        return
+    rooms = {name.split(".")[1] for name in imported(path) if name.startswith("magnetosuture_thread.")} - {here}
+    assert rooms <= ALLOWED[here], f"{here} may not import {rooms - ALLOWED[here]}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(HOUSE)))
+def test_packages_outside_are_known_in_their_rooms_only(path: Path):
+    here = room(path)
+    strangers = {
+        package
+        for package in (name.split(".")[0] for name in imported(path))
+        if here not in OWNERS.get(package, {here})
+    }
+    assert not strangers, f"{here} may not know {strangers}"
+
+
+def test_no_room_is_missing_from_the_rules():
+    assert {room(path) for path in MODULES} - {"__init__"} == set(ALLOWED)
+
+
+def test_modules_stay_small():
+    sizes = {str(path.relative_to(HOUSE)): len(path.read_text().splitlines()) for path in MODULES}
+    assert not {name: size for name, size in sizes.items() if size > 300}
+    nodes = {
+        name: size
+        for name, size in sizes.items()
+        if name in {f"nodes/{n}.py" for n in ("vision_tracker", "thread_model", "coil_bridge")}
+    }
+    assert len(nodes) == 3
+    assert not {name: size for name, size in nodes.items() if size > 150}

@@ -1,0 +1,79 @@
+"""The files that the three builds read say the same."""
+
+from __future__ import annotations
+
+import ast
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread.resources import share
+
+ROOT = Path(__file__).parent.parent
+PYPROJECT = (ROOT / "pyproject.toml").read_text()
+
+
+def package_xml(path: Path) -> ElementTree.Element:
+    """Return the root element of a package.xml."""
+    return ElementTree.parse(path).getroot()
+
+
+def test_the_version_is_the_same_everywhere():
+    version = re.search(r'^version = "(.+)"$', PYPROJECT, re.MULTILINE)
+    assert version is not None
+    for path in (ROOT / "package.xml", ROOT / "msg_defs" / "package.xml"):
+        assert package_xml(path).findtext("version") == version[1]
+    assert f"## {version[1]}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_every_message_is_built():
+    listed = set(re.findall(r'"msg/(\w+)\.msg"', (ROOT / "msg_defs" / "CMakeLists.txt").read_text()))
+    assert listed == {path.stem for path in (ROOT / "msg_defs" / "msg").glob("*.msg")}
+
+
+def test_every_message_package_that_the_nodes_import_is_declared():
+    declared = {entry.text for entry in package_xml(ROOT / "package.xml").findall("depend")}
+    used = set()
+    for path in (ROOT / "magnetosuture_thread" / "nodes").glob("*.py"):
+        used |= set(re.findall(r"^from (\w+)\.msg import", path.read_text(), re.MULTILINE))
+    interface = (ROOT / "magnetosuture_thread" / "interface.py").read_text()
+    used |= set(re.findall(r'"(\w+)/msg/\w+"', interface))
+    assert used <= declared
+
+
+@pytest.mark.parametrize("name", ["vision_tracker", "thread_model", "coil_bridge"])
+def test_every_node_is_an_executable_and_launched(name: str):
+    assert f'{name} = "magnetosuture_thread.nodes.{name}:main"' in PYPROJECT
+    launch = ast.parse((ROOT / "launch" / "magnetosuture.launch.py").read_text())
+    words = {node.value for node in ast.walk(launch) if isinstance(node, ast.Constant)}
+    assert name in words
+
+
+def listed(name: str) -> set[str]:
+    """Return the entries of a list in pyproject.toml."""
+    found = re.search(rf"^{name} = \[\n(.*?)^\]", PYPROJECT, re.MULTILINE | re.DOTALL)
+    assert found is not None
+    return set(re.findall(r'^  "(.+?)",', found[1], re.MULTILINE))
+
+
+def test_colcon_builds_with_what_pip_builds_with():
+    assert {entry for entry in listed("requires") if not entry.startswith("scikit-build-core")} <= listed("colcon")
+
+
+def test_every_direct_dependency_is_pinned():
+    pinned = {line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
+    asked = {entry for name in ("requires", "dependencies", "ros", "dev", "colcon") for entry in listed(name)}
+    names = {re.split(r"[<>=\[]", entry)[0].lower().replace("_", "-") for entry in asked}
+    assert names <= pinned, names - pinned
+
+
+def test_requires_python_is_left_out():
+    """It breaks colcon with setuptools 68, which Ubuntu 24.04 has."""
+    assert not re.search(r"^requires-python", PYPROJECT, re.MULTILINE)
+
+
+def test_shared_files_are_found():
+    assert (share("magnetosuture_thread") / "config").is_dir()
+    assert (share("magnetosuture_msgs") / "msg" / "SafetyMargins.msg").is_file()
