@@ -22,6 +22,12 @@ def test_an_offset_is_its_share_of_the_length_and_the_tail_does_not_count():
     assert prediction_error_percent(moved, curve, 1.0) == pytest.approx(2.0)
 
 
+def test_the_error_does_not_depend_on_the_unit():
+    curve = np.column_stack([np.linspace(0.0, 1.0, 101), np.zeros(101)])
+    moved = NODES + np.array([0.0, 0.02])
+    assert prediction_error_percent(0.019 * moved, 0.019 * curve, 0.019) == pytest.approx(2.0)
+
+
 def test_nodes_past_what_was_seen_are_left_out():
     moved = NODES.copy()
     moved[8:] += 5.0
