@@ -1,6 +1,8 @@
 # make demo   play the example bag through the live graph
 # make test   run all tests
 # make lint   check style and types
+# make colcon build both packages by colcon, into install/
+# make clean  remove all that make made
 #
 # Each sets up .venv the first time, over ROS 2 Jazzy as wheels from PyPI. Needs Python 3.10 to 3.13
 # with venv and headers, a C and C++ compiler, and make; nothing of ROS.

@@ -64,6 +64,9 @@ def replay(
     bag = Bag(bag_path)
     if not (setup_name or bag.notes.get("setup")):
         say(f"the bag names no set-up; taking {DEFAULT_SETUP}")
+    named = bag.notes.get("setup")
+    if setup_name and named and setup_name != named:
+        say(f"the bag names the set-up {named}; taking {setup_name}")
     setup = read_setup(setup_name or bag.notes.get("setup") or DEFAULT_SETUP)
     camera = CAMERA[setup.vision.image_transport]
     bag.require(camera.recorded, camera.type_name)
@@ -72,6 +75,8 @@ def replay(
     bag.check()
     if rate < 1.0:
         say("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
+    if rate > 1.0:
+        say("played faster than recorded: latencies count what waits in the queues")
     with whole_folder(output) as folder:
         published, arrived = _play(folder, bag, setup, camera, rate, say, progress)
         say("judging what came out")

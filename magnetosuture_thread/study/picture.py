@@ -76,7 +76,7 @@ def draw_summary(
         _tidy(axes)
     plots[2].set_xlim(times[0], times[-1])
     plots[2].set_xlabel("time since the bag's start [s]", color=INK)
-    figure.text(0.015, 0.945, _title(summary), fontsize=12, color=INK, linespacing=1.4)
+    figure.text(0.015, 0.938, _title(summary), fontsize=12, color=INK, linespacing=1.4)
     figure.savefig(path)
 
 
@@ -158,7 +158,8 @@ def _draw_close_up(
     for side in inset.spines.values():
         side.set_color(INK)
         side.set_linewidth(0.8)
-    scene.indicate_inset_zoom(inset, edgecolor=INK, alpha=0.7, linewidth=0.7)
+    box = (centre[0] - half, centre[1] - half, 2.0 * half, 2.0 * half)
+    scene.indicate_inset(box, inset, edgecolor=INK, alpha=0.7, linewidth=0.7)
 
 
 def _draw_colours(figure: Figure, line: LineCollection) -> None:

@@ -24,10 +24,10 @@ def summary_table(summary: Summary) -> Table:
         table.add_row(f"  {stage}", _milliseconds(spread), _tail(spread))
     table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
     table.add_section()
-    table.add_row("least margin", "", "safe at 0 or more")
+    table.add_row("least margin", "", "safe at 0 or more, to 1e-9 m")
     for margin in summary.least_margins:
         where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
-        table.add_row(f"  {margin.kind}", f"{margin.clearance * 1e6:+.3f} µm", f"{where}, at {margin.time:.2f} s")
+        table.add_row(f"  {margin.kind}", f"{_micrometres(margin.clearance)} µm", f"{where}, at {margin.time:.2f} s")
     table.add_row("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted))
     table.add_row("greatest stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment")
     table.add_row("greatest residual", f"{summary.residual:.1e}", "scaled; not the solver's own word")
@@ -41,6 +41,11 @@ def summary_table(summary: Summary) -> Table:
             scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
             table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
     return table
+
+
+def _micrometres(metres: float) -> str:
+    """Return a margin in micrometres; what is 0 within the solvers' tolerance is written so."""
+    return f"{metres * 1e6:+.3f}" if abs(metres) > 1e-9 else "0.000"
 
 
 def _share(part: int, whole: int) -> str:

@@ -11,6 +11,7 @@ import pytest
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
@@ -50,6 +51,34 @@ def test_what_exists_is_not_touched(tmp_path: Path, straight_pull: ReferenceTraj
     with pytest.raises(BagError, match="exists already"):
         record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.2)
     assert (tmp_path / "bag" / "mine").read_text() == "precious"
+
+
+@pytest.mark.parametrize("where", [".", "/", "..", ""])
+def test_folders_that_cannot_be_made_are_refused(straight_pull: ReferenceTrajectory, where: str):
+    with pytest.raises(BagError, match="exists already"):
+        record(straight_pull, read_setup("petri_35mm_polyamide"), Path(where), duration=0.2)
+
+
+def test_two_runs_to_one_output_do_not_harm_each_other(tmp_path: Path):
+    with whole_folder(tmp_path / "out") as first:
+        (first / "mine").write_text("first")
+        with whole_folder(tmp_path / "other" / "out") as second, whole_folder(tmp_path / "out2") as third:
+            assert len({first, second, third}) == 3
+        assert (first / "mine").read_text() == "first"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "out", "out2"]
+    assert (tmp_path / "out" / "mine").read_text() == "first"
+
+
+def test_the_later_of_two_runs_to_one_output_is_refused(tmp_path: Path):
+    def later() -> None:
+        with whole_folder(tmp_path / "out") as second, whole_folder(tmp_path / "out") as first:
+            (first / "mine").write_text("first")
+            (second / "mine").write_text("second")
+
+    with pytest.raises(BagError, match="cannot be written"):
+        later()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert (tmp_path / "out" / "mine").read_text() == "first"
 
 
 def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: ReferenceTrajectory):
