@@ -71,12 +71,16 @@ def _fail(problem: str, code: int) -> int:
 
 @contextmanager
 def _interrupted_by(*signals: signal.Signals) -> Iterator[None]:
-    """Treat these signals as Ctrl-C, so that whatever ends us, the nodes end too and nothing half-made stays."""
+    """Treat these signals as Ctrl-C, so that whatever ends us, the nodes end too and nothing half-made stays.
+
+    One that is ignored, as under nohup, stays ignored.
+    """
 
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
-    before = [(which, signal.signal(which, interrupt)) for which in signals]
+    heeded = [which for which in signals if signal.getsignal(which) is not signal.SIG_IGN]
+    before = [(which, signal.signal(which, interrupt)) for which in heeded]
     try:
         yield
     finally:

@@ -158,7 +158,15 @@ def test_a_bag_in_which_nothing_is_seen_fails_and_leaves_nothing(short_bag: Path
 def test_an_interrupted_replay_ends_its_nodes_and_leaves_nothing(tmp_path: Path, end: signal.Signals):
     example = Path(__file__).parents[2] / "examples" / "post_wrap"
     command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(example), "--output", "out"]
-    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A test run in a shell's background inherits an ignored SIGINT; a user's terminal does not.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     assert process.stdout is not None
     for line in process.stdout:
         if line.startswith("playing"):
