@@ -79,7 +79,7 @@ OUTPUTS = (
 )
 
 
-def lossless(depth: int) -> dict[str, object]:
+def lossless(depth: int) -> dict[str, Any]:
     """Return parameters for all nodes under which nothing is dropped while fewer than `depth` messages wait.
 
     A live graph drops what it cannot take in time, so that it never falls behind; a replayed bag is

@@ -24,7 +24,7 @@ def test_what_is_constant_is_latched(graph):
 
 @pytest.mark.parametrize("depth", [5, 300])
 def test_a_replay_makes_every_queue_reliable_and_deep(depth: int):
-    overrides = topics.lossless(depth)["/**"]["ros__parameters"]["qos_overrides"]  # type: ignore[index]
+    overrides = topics.lossless(depth)["/**"]["ros__parameters"]["qos_overrides"]
     for topic in (*topics.INPUTS, *topics.OUTPUTS):
         if topic.qos is topics.LATCHED:
             assert topic.channel.recorded not in overrides
@@ -34,7 +34,7 @@ def test_a_replay_makes_every_queue_reliable_and_deep(depth: int):
 
 
 def test_the_overrides_take_effect(graph):
-    overrides = topics.lossless(123)["/**"]["ros__parameters"]["qos_overrides"]  # type: ignore[index]
+    overrides = topics.lossless(123)["/**"]["ros__parameters"]["qos_overrides"]
     parameters = {
         f"qos_overrides.{name}.{role}.{policy}": value
         for name, roles in overrides.items()
