@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
@@ -109,10 +110,25 @@ def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
         ("attachment", setup.model.attachment, attachment.value if attachment else None),
         ("disc_obstacles", setup.model.discs(), reference.discs),
     ):
-        if expected is not None and given != expected:
+        if expected is not None and not _same(given, expected):
             raise ConfigurationError(
                 f"thread_model.{name}", given, f"{expected}, as in {reference.name}", str(setup.path)
             )
+
+
+def _same(given: object, expected: object) -> bool:
+    """Return whether two settings are the same; lengths that differ by less than a nanometre are."""
+    if isinstance(given, str) or isinstance(expected, str):
+        return given == expected
+    return _numbers(given).shape == _numbers(expected).shape and np.allclose(
+        _numbers(given), _numbers(expected), rtol=0.0, atol=1e-9
+    )
+
+
+def _numbers(value: Any) -> NDArray[np.float64]:
+    if isinstance(value, tuple):
+        return np.array([(*disc.centre, disc.radius) for disc in value], dtype=np.float64)
+    return np.asarray(value, dtype=np.float64)
 
 
 class _Topics:

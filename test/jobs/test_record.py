@@ -53,6 +53,12 @@ def test_what_exists_is_not_touched(tmp_path: Path, straight_pull: ReferenceTraj
     assert (tmp_path / "bag" / "mine").read_text() == "precious"
 
 
+def test_a_setup_that_differs_by_rounding_alone_is_taken(tmp_path: Path, straight_pull: ReferenceTrajectory):
+    disc = Disc((0.0077, 0.0039000000000000003), 0.0015)  # as a reference trajectory has it
+    other = replace(straight_pull, metadata={"boundary": "pinned", "material": {"L_m": 0.019}}, discs=(disc,))
+    assert record(other, read_setup("petri_35mm_polyamide_post"), tmp_path / "bag", duration=0.1) == 3
+
+
 @pytest.mark.parametrize("where", [".", "/", "..", ""])
 def test_folders_that_cannot_be_made_are_refused(straight_pull: ReferenceTrajectory, where: str):
     with pytest.raises(BagError, match="exists already"):
