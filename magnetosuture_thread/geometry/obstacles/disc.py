@@ -1,4 +1,4 @@
-"""Obstacles: shapes with a signed distance."""
+"""Discs and balls: the obstacles with a closed formula."""
 
 from __future__ import annotations
 

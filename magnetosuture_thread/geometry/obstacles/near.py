@@ -1,0 +1,201 @@
+"""The compiled query: contacts of points with all obstacles around."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles.search import Nearest, put, search_edges, search_faces
+from magnetosuture_thread.geometry.polyline import Points
+
+BALL, EDGES, FACES = range(3)
+"""Kinds of obstacles."""
+
+
+class SurroundingsData(NamedTuple):
+    """All obstacles, packed into few arrays: each costs time when compiled code is entered. Not to be written to.
+
+    Row 0 of `frames` and `tables` is the grid over all obstacles; row o + 1 belongs to obstacle o.
+
+    Attributes:
+        reach: greatest distance of a contact [m].
+        frames: shape (o + 1, 6): low corner of the grid (3) [m], 1 / cell size [1/m], growth [m], 0; of a
+            ball its centre (3) [m], 0, 0, its radius [m].
+        tables: shape (o + 1, 8): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
+            features, where they begin in `numbers`, where their marks begin in `entries`.
+        spokes: shape (o + 1,): where the spokes of a mesh begin in `numbers`.
+        numbers: features and spokes, flat.
+        entries: cells, their entries and marks, flat. A cell is two integers: where its entries begin (they end
+            where those of the next cell begin), and whether it is inside where no feature is near.
+    """
+
+    reach: float
+    frames: NDArray[np.float64]
+    tables: NDArray[np.int64]
+    spokes: NDArray[np.int64]
+    numbers: NDArray[np.float64]
+    entries: NDArray[np.int32]
+
+
+@compiled
+def cell_of(x: float, y: float, z: float, row: int, data: SurroundingsData) -> int:
+    """Return where the cell of a point is in `entries`, or -1 when it is outside of the grid, or not a number."""
+    frame, table = data.frames[row], data.tables[row]
+    i, j, k = (x - frame[0]) * frame[3], (y - frame[1]) * frame[3], (z - frame[2]) * frame[3]
+    if not (0.0 <= i < table[1] and 0.0 <= j < table[2] and 0.0 <= k < table[3]):
+        return -1
+    return int(table[4] + 2 * (int(i) + table[1] * (int(j) + table[2] * int(k))))
+
+
+@compiled
+def nearest_of(
+    x: float,
+    y: float,
+    z: float,
+    reach: float,
+    obstacle: int,
+    first: int,
+    last: int,
+    data: SurroundingsData,
+    count: int,
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> Nearest:
+    """Return the nearest boundary point of a polygon or mesh; see `search_edges` for the arguments."""
+    table = data.tables[obstacle + 1]
+    if table[0] == EDGES:
+        return search_edges(x, y, reach, data.numbers, table[6], data.entries, first, last, count, distance, outward)
+    return search_faces(
+        x,
+        y,
+        z,
+        reach,
+        data.numbers,
+        table[6],
+        data.entries,
+        table[7],
+        data.spokes[obstacle + 1],
+        first,
+        last,
+        count,
+        distance,
+        outward,
+    )
+
+
+@compiled
+def _ball(
+    x: float,
+    y: float,
+    z: float,
+    obstacle: int,
+    data: SurroundingsData,
+    count: int,
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> int:
+    """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
+    frame = data.frames[obstacle + 1]
+    rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
+    length = math.sqrt(rx * rx + ry * ry + rz * rz)
+    if length - frame[5] > data.reach:
+        return count
+    if length > 0.0:
+        rx, ry, rz = rx / length, ry / length, rz / length
+    else:
+        rx = 1.0
+    return put(count, count, length - frame[5], rx, ry, rz, distance, outward)
+
+
+@compiled
+def _contacts(
+    x: float,
+    y: float,
+    z: float,
+    obstacle: int,
+    data: SurroundingsData,
+    count: int,
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> int:
+    """Write the rows of a polygon or mesh at one point; return the new count, -1 when they are too many."""
+    cell = cell_of(x, y, z, obstacle + 1, data)
+    if cell < 0:
+        return count
+    first, last, inside = data.entries[cell], data.entries[cell + 2], data.entries[cell + 1]
+    if first == last and inside == 0:
+        return count
+    start = count
+    found = nearest_of(x, y, z, data.reach, obstacle, first, last, data, count, distance, outward)
+    if math.sqrt(found.square) > data.frames[obstacle + 1, 4]:
+        # Nothing of the boundary within the growth, so none within the cell: all of it is on one side.
+        if inside == 0:
+            return count
+        features = int(data.tables[obstacle + 1, 5])
+        found = nearest_of(x, y, z, -1.0, obstacle, -1, features, data, count, distance, outward)
+        return put(start, start, -math.sqrt(found.square), found.x, found.y, found.z, distance, outward)
+    if found.signed < 0.0:
+        return put(start, start, found.signed, found.x, found.y, found.z, distance, outward)
+    if found.rows < 0 or found.signed > data.reach:
+        return found.rows
+    least = np.inf
+    for row in range(start, found.rows):
+        least = min(least, distance[row])
+    if least > found.signed * (1.0 + 1e-9) + 1e-12:
+        # Between two features that rounding gave to neither.
+        return put(start, found.rows, found.signed, found.x, found.y, found.z, distance, outward)
+    return found.rows
+
+
+@compiled
+def find_near(
+    points: Points,
+    data: SurroundingsData,
+    node: NDArray[np.int64],
+    obstacle: NDArray[np.int64],
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+    nearest: NDArray[np.bool_],
+) -> int:
+    """Write the contacts of points into the caller's arrays; see `Surroundings.near` for what they are.
+
+    Args:
+        points: shape (m, d) [m].
+        data: `Surroundings.data`.
+        node: index of the point, shape (c,), c rows of room.
+        obstacle: index of the obstacle, shape (c,).
+        distance: signed distance, shape (c,) [m].
+        outward: gradient of the signed distance, shape (c, d).
+        nearest: whether the row is the nearest of its point and obstacle, shape (c,).
+
+    Returns:
+        The number of contacts, or -1 when there are more than the arrays have room for.
+    """
+    count = 0
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        z = points[i, 2] if points.shape[1] == 3 else 0.0
+        cell = cell_of(x, y, z, 0, data)
+        if cell < 0:
+            continue
+        for slot in range(data.entries[cell], data.entries[cell + 2]):
+            o = int(data.entries[slot])
+            start = count
+            if data.tables[o + 1, 0] == BALL:
+                count = _ball(x, y, z, o, data, count, distance, outward)
+            else:
+                count = _contacts(x, y, z, o, data, count, distance, outward)
+            if count < 0:
+                return -1
+            best = start
+            for row in range(start, count):
+                node[row], obstacle[row], nearest[row] = i, o, False
+                if distance[row] < distance[best]:
+                    best = row
+            if count > start:
+                nearest[best] = True
+    return count

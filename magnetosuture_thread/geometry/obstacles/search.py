@@ -1,0 +1,260 @@
+"""The compiled search for the boundary features near a point."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles.closest import (
+    EDGE_AB,
+    EDGE_CA,
+    FACE,
+    VERTEX_A,
+    closest_in_space,
+)
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_MARKS, FACE_WIDTH
+
+TOUCHING = 1e-12
+"""Closer to a vertex or an edge than this, the direction away from it is lost in rounding [m]."""
+_SAME = 1e-7  # two rows of one obstacle that differ by less are one point of its boundary
+
+
+class Nearest(NamedTuple):
+    """The nearest boundary point of an obstacle, and where in the rows the next one goes.
+
+    Attributes:
+        rows: number of rows so far; -1 when they were too many for the arrays.
+        square: square of the distance; infinity when no feature was searched [m^2].
+        signed: signed distance [m].
+        x: outward direction there.
+        y: outward direction there.
+        z: outward direction there.
+    """
+
+    rows: int
+    square: float
+    signed: float
+    x: float
+    y: float
+    z: float
+
+
+@compiled
+def put(
+    start: int,
+    count: int,
+    length: float,
+    x: float,
+    y: float,
+    z: float,
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> int:
+    """Write a row unless it is the same boundary point as a row since `start`; return the new count.
+
+    Where neighbouring edges are in line, rounding may give the point between them to both.
+    """
+    if count < 0:
+        return count
+    dimension = outward.shape[1]
+    for row in range(start, count):
+        if (
+            abs(distance[row] - length) <= _SAME * length + TOUCHING
+            and abs(outward[row, 0] - x) <= _SAME
+            and abs(outward[row, 1] - y) <= _SAME
+            and (dimension == 2 or abs(outward[row, 2] - z) <= _SAME)
+        ):
+            return count
+    if count >= len(distance):
+        return -1
+    distance[count] = length
+    outward[count, 0] = x
+    outward[count, 1] = y
+    if dimension == 3:
+        outward[count, 2] = z
+    return count + 1
+
+
+@compiled
+def search_edges(
+    x: float,
+    y: float,
+    reach: float,
+    numbers: NDArray[np.float64],
+    base: int,
+    index: NDArray[np.int32],
+    first: int,
+    last: int,
+    count: int,
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> Nearest:
+    """Return the nearest of some edges, and write a row for each local minimum of the distance outside.
+
+    An edge gives a row when the projection falls inside of it and the point is on its outer side; a vertex
+    when the projections onto both its edges clamp to it.
+
+    Args:
+        x: coordinate of the point [m].
+        y: coordinate of the point [m].
+        reach: greatest distance of a row; negative for no rows [m].
+        numbers: the table of features.
+        base: where the edges of this obstacle begin in it.
+        index: entries of cells.
+        first: the first entry in `index`; with `first` negative, all edges 0 ... last - 1 are searched.
+        last: the one after the last entry.
+        count: number of rows so far.
+        distance: rows' signed distance, written from `count` on [m].
+        outward: rows' outward direction.
+    """
+    start = count
+    limit = reach * reach if reach >= 0.0 else -1.0
+    best = np.inf
+    # Of the best: whether a vertex; the vector from it to the point; its normal or pseudo-normal.
+    corner, bx, by, nx, ny = False, 0.0, 0.0, 0.0, 0.0
+    for slot in range(max(first, 0), last):
+        k = base + EDGE_WIDTH * (index[slot] if first >= 0 else slot)
+        rx, ry = x - numbers[k], y - numbers[k + 1]
+        dx, dy = numbers[k + 4], numbers[k + 5]
+        along = rx * dx + ry * dy
+        if along <= 0.0:
+            square = rx * rx + ry * ry
+            if square < best:
+                best, corner, bx, by, nx, ny = square, True, rx, ry, numbers[k + 9], numbers[k + 10]
+            if (
+                square <= limit
+                and rx * numbers[k + 7] + ry * numbers[k + 8] >= 0.0
+                and rx * numbers[k + 9] + ry * numbers[k + 10] >= 0.0
+            ):
+                length = math.sqrt(square)
+                if length > TOUCHING:
+                    count = put(start, count, length, rx / length, ry / length, 0.0, distance, outward)
+                else:
+                    count = put(start, count, length, numbers[k + 9], numbers[k + 10], 0.0, distance, outward)
+        elif along >= numbers[k + 6]:
+            rx, ry = x - numbers[k + 2], y - numbers[k + 3]
+            square = rx * rx + ry * ry
+            if square < best:
+                best, corner, bx, by, nx, ny = square, True, rx, ry, numbers[k + 11], numbers[k + 12]
+        else:
+            side = rx * dy - ry * dx
+            square = side * side
+            if square < best:
+                best, corner, bx, by, nx, ny = square, False, rx, ry, dy, -dx
+            if side >= 0.0 and square <= limit:
+                count = put(start, count, side, dy, -dx, 0.0, distance, outward)
+    if best == np.inf:
+        return Nearest(count, best, best, 0.0, 0.0, 0.0)
+    length = math.sqrt(best)
+    sign = 1.0 if bx * nx + by * ny >= 0.0 else -1.0
+    if corner and length > TOUCHING:
+        nx, ny = sign * bx / length, sign * by / length
+    return Nearest(count, best, sign * length, nx, ny, 0.0)
+
+
+@compiled
+def search_faces(
+    x: float,
+    y: float,
+    z: float,
+    reach: float,
+    numbers: NDArray[np.float64],
+    base: int,
+    index: NDArray[np.int32],
+    marks: int,
+    spokes: int,
+    first: int,
+    last: int,
+    count: int,
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> Nearest:
+    """Return the nearest of some faces, and write a row for each local minimum of the distance outside.
+
+    A face gives a row when the projection falls inside of it and the point is on its outer side; an edge or
+    a vertex when the closest point of all its faces is on it. Arguments as for `search_edges`, and:
+
+    Args:
+        x: coordinate of the point [m].
+        y: coordinate of the point [m].
+        z: coordinate of the point [m].
+        reach: greatest distance of a row; negative for no rows [m].
+        numbers: the table of features.
+        base: where the faces of this obstacle begin in it.
+        index: entries of cells, and marks of faces.
+        marks: where the marks of this obstacle begin in `index`.
+        spokes: where the spokes of this obstacle begin in `numbers`.
+        first: the first entry in `index`; with `first` negative, all faces 0 ... last - 1 are searched.
+        last: the one after the last entry.
+        count: number of rows so far.
+        distance: rows' signed distance, written from `count` on [m].
+        outward: rows' outward direction.
+    """
+    start = count
+    limit = reach * reach if reach >= 0.0 else -1.0
+    best, bx, by, bz, normal, blunt = np.inf, 0.0, 0.0, 0.0, 0, False
+    for slot in range(max(first, 0), last):
+        face = index[slot] if first >= 0 else slot
+        k = base + FACE_WIDTH * face
+        qx, qy, qz, region = closest_in_space(
+            x,
+            y,
+            z,
+            numbers[k],
+            numbers[k + 1],
+            numbers[k + 2],
+            numbers[k + 3],
+            numbers[k + 4],
+            numbers[k + 5],
+            numbers[k + 6],
+            numbers[k + 7],
+            numbers[k + 8],
+        )
+        # Where the normal of the region is in the row of numbers.
+        if region == FACE:
+            at = k + 9
+            rx, ry, rz = x - numbers[k], y - numbers[k + 1], z - numbers[k + 2]
+            side = rx * numbers[at] + ry * numbers[at + 1] + rz * numbers[at + 2]
+            square = side * side
+        else:
+            at = k + 21 + 3 * (region - EDGE_AB) if region <= EDGE_CA else k + 30 + 3 * (region - VERTEX_A)
+            rx, ry, rz = x - qx, y - qy, z - qz
+            side = rx * numbers[at] + ry * numbers[at + 1] + rz * numbers[at + 2]
+            square = rx * rx + ry * ry + rz * rz
+        if square < best:
+            best, bx, by, bz, normal, blunt = square, rx, ry, rz, at, region == FACE
+        if side < 0.0 or square > limit:
+            continue
+        mark = marks + FACE_MARKS * face
+        if EDGE_AB <= region <= EDGE_CA:
+            m = k + 12 + 3 * (region - EDGE_AB)
+            if index[mark + region - EDGE_AB] == 0 or rx * numbers[m] + ry * numbers[m + 1] + rz * numbers[m + 2] > 0.0:
+                continue
+        elif region >= VERTEX_A:
+            spoke = index[mark + 3 + region - VERTEX_A]
+            if spoke < 0:
+                continue
+            while spoke < index[mark + 6 + region - VERTEX_A]:
+                s = spokes + 3 * spoke
+                if rx * numbers[s] + ry * numbers[s + 1] + rz * numbers[s + 2] > 0.0:
+                    break
+                spoke += 1
+            if spoke < index[mark + 6 + region - VERTEX_A]:
+                continue
+        length = math.sqrt(square)
+        if region == FACE or length <= TOUCHING:
+            count = put(start, count, length, numbers[at], numbers[at + 1], numbers[at + 2], distance, outward)
+        else:
+            count = put(start, count, length, rx / length, ry / length, rz / length, distance, outward)
+    if best == np.inf:
+        return Nearest(count, best, best, 0.0, 0.0, 0.0)
+    length = math.sqrt(best)
+    nx, ny, nz = numbers[normal], numbers[normal + 1], numbers[normal + 2]
+    sign = 1.0 if bx * nx + by * ny + bz * nz >= 0.0 else -1.0
+    if not blunt and length > TOUCHING:
+        nx, ny, nz = sign * bx / length, sign * by / length, sign * bz / length
+    return Nearest(count, best, sign * length, nx, ny, nz)

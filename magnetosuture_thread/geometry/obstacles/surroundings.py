@@ -1,0 +1,121 @@
+"""Surroundings: all obstacles around a thread, ready to be asked for what is near."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles.disc import Disc
+from magnetosuture_thread.geometry.obstacles.mesh import Mesh
+from magnetosuture_thread.geometry.obstacles.near import find_near
+from magnetosuture_thread.geometry.obstacles.pack import Obstacle, pack
+from magnetosuture_thread.geometry.obstacles.polygon import Polygon
+from magnetosuture_thread.geometry.polyline import Points
+
+_ROOM = 256  # contacts that `near` has room for at first
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Where points are near obstacles: k rows, in the order of nodes, then obstacles.
+
+    Attributes:
+        node: index of the point, shape (k,).
+        obstacle: index of the obstacle, shape (k,).
+        distance: signed distance, negative inside, shape (k,) [m].
+        outward: gradient of the signed distance, unit vectors, shape (k, d).
+        nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
+    """
+
+    node: NDArray[np.int64]
+    obstacle: NDArray[np.int64]
+    distance: NDArray[np.float64]
+    outward: Points
+    nearest: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.node)
+
+
+class Surroundings:
+    """Obstacles that do not move, and what of them is near.
+
+    Args:
+        shapes: the obstacles: discs, polygons (in the plane only) and meshes (in space only).
+        reach: greatest distance at which a boundary is near, not negative [m].
+        dimension: 2 or 3.
+
+    Attributes:
+        shapes: the obstacles.
+        reach: greatest distance at which a boundary is near [m].
+        dimension: 2 or 3.
+        data: the same for compiled code, see `find_near`.
+
+    Raises:
+        ConfigurationError: when a shape is not of this dimension, or a number is not in its bounds.
+    """
+
+    def __init__(self, shapes: Sequence[Obstacle], reach: float, dimension: int = 2) -> None:
+        if dimension not in (2, 3):
+            raise ConfigurationError("surroundings.dimension", dimension, "2 or 3")
+        if not (math.isfinite(reach) and reach >= 0.0):
+            raise ConfigurationError("surroundings.reach", reach, "a number of at least 0 m")
+        self.shapes = tuple(shapes)
+        self.reach = float(reach)
+        self.dimension = dimension
+        for i, shape in enumerate(self.shapes):
+            _check(f"surroundings.shapes[{i}]", shape, dimension)
+        self.data = pack(self.shapes, self.reach, dimension)
+        self._room = _ROOM
+
+    def near(self, points: Points) -> Contacts:
+        """Return the contacts of points: every local minimum of the distance to an obstacle's boundary.
+
+            outward = grad sd(x),    closest point = x - sd(x) outward
+
+        A point outside has a row for every boundary point that is closer to it than the boundary around,
+        within reach: one at a straight wall of many edges, two in a corner that reaches around it. A point
+        inside has one row, the nearest, however deep it is. Exactly on the boundary the distance is 0 and
+        the direction the normal. A point that is not a number has no row.
+
+        Args:
+            points: shape (m, d) [m].
+
+        Raises:
+            ValueError: when points are not of this dimension.
+
+        Source: J. A. Baerentzen, H. Aanaes 2005, sign by pseudo-normals.
+        """
+        points = np.array(points, dtype=np.float64, order="C")
+        if points.ndim != 2 or points.shape[1] != self.dimension:
+            raise ValueError(f"points of shape {points.shape}, expected (m, {self.dimension})")
+        while True:
+            node, obstacle = np.empty(self._room, np.int64), np.empty(self._room, np.int64)
+            distance, outward = np.empty(self._room), np.empty((self._room, self.dimension))
+            nearest = np.empty(self._room, np.bool_)
+            count = find_near(points, self.data, node, obstacle, distance, outward, nearest)
+            if count >= 0:
+                break
+            self._room *= 2
+        found = [array[:count].copy() for array in (node, obstacle, distance, outward, nearest)]
+        for array in found:
+            array.setflags(write=False)
+        return Contacts(*found)
+
+
+def _check(name: str, shape: Obstacle, dimension: int) -> None:
+    if isinstance(shape, Disc):
+        if len(shape.centre) != dimension or not np.isfinite(shape.centre).all():
+            raise ConfigurationError(f"{name}.centre", shape.centre, f"{dimension} finite coordinates [m]")
+        if not (math.isfinite(shape.radius) and shape.radius >= 0.0):
+            raise ConfigurationError(f"{name}.radius", shape.radius, "a number of at least 0 m")
+    elif isinstance(shape, Polygon) and dimension != 2:
+        raise ConfigurationError(name, "a polygon", "a disc or a mesh in space")
+    elif isinstance(shape, Mesh) and dimension != 3:
+        raise ConfigurationError(name, "a mesh", "a disc or a polygon in the plane")

@@ -1,0 +1,214 @@
+"""Contacts in the plane, against shapely and against the definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely  # type: ignore[import-untyped]
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle, Polygon, Surroundings, find_near
+
+SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
+# An L: its only reflex corner is (0.01, 0.01).
+CORNER = Polygon(((0.0, 0.0), (0.03, 0.0), (0.03, 0.01), (0.01, 0.01), (0.01, 0.03), (0.0, 0.03)))
+RING = Polygon(
+    ((-0.02, -0.02), (0.02, -0.02), (0.02, 0.02), (-0.02, 0.02)),
+    (((-0.01, -0.01), (0.01, -0.01), (0.01, 0.01), (-0.01, 0.01)),),
+)
+
+
+def star(seed: int, vertices: int, hole: bool) -> Polygon:
+    random = np.random.default_rng(seed)
+    angle = 2.0 * np.pi * (np.arange(vertices) + random.uniform(-0.4, 0.4, vertices)) / vertices
+    way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    centre = np.array([0.01, -0.02])
+    outline = centre + random.uniform(0.02, 0.05, vertices)[:, None] * way
+    inner = centre + random.uniform(0.002, 0.005, vertices)[:, None] * way
+    holes = (tuple(map(tuple, inner.tolist())),) if hole else ()
+    return Polygon(tuple(map(tuple, outline.tolist())), holes)
+
+
+def signed(polygon: Polygon, points: np.ndarray) -> np.ndarray:
+    """Return shapely's signed distance."""
+    shape = shapely.Polygon(polygon.outline, polygon.holes)
+    places = shapely.points(points)
+    distance = shapely.distance(shape.boundary, places)
+    return np.where(shapely.contains(shape, places), -distance, distance)
+
+
+def minima(polygon: Polygon, point: np.ndarray, reach: float) -> list[float]:
+    """Return the distances of all local minima at a point outside, by their definition, edge by edge."""
+    found = []
+    for ring in polygon.rings:
+        for before, a, b in zip(np.roll(ring, 1, axis=0), ring, np.roll(ring, -1, axis=0), strict=True):
+            d = b - a
+            t = (point - a) @ d / (d @ d)
+            side = ((point - a)[0] * d[1] - (point - a)[1] * d[0]) / np.linalg.norm(d)
+            if 0.0 < t < 1.0 and side >= 0.0:
+                found.append(float(side))
+            e = a - before
+            convex = e[0] * d[1] - e[1] * d[0] > 0.0
+            if convex and t <= 0.0 and (point - before) @ e / (e @ e) >= 1.0:
+                found.append(float(np.linalg.norm(point - a)))
+    return sorted(value for value in found if value <= reach)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 10_000), st.integers(5, 40), st.booleans(), st.sampled_from([0.0, 1e-4, 0.004, 0.03, 0.5]))
+def test_contacts_of_random_stars(seed: int, vertices: int, hole: bool, reach: float):
+    polygon = star(seed, vertices, hole)
+    points = np.random.default_rng(seed + 1).uniform([-0.06, -0.09], [0.08, 0.05], (120, 2))
+    points = np.vstack([points, np.random.default_rng(seed + 2).uniform([0.0, -0.03], [0.02, -0.01], (30, 2))])
+    contacts = Surroundings([polygon], reach).near(points)
+    true = signed(polygon, points)
+    assert set(contacts.node.tolist()) == set(np.flatnonzero(true <= reach).tolist())
+    nearest = contacts.nearest
+    np.testing.assert_allclose(contacts.distance[nearest], true[contacts.node[nearest]], atol=1e-12)
+    assert len(set(contacts.node[nearest].tolist())) == nearest.sum()
+    for i in set(contacts.node.tolist()):
+        rows = np.sort(contacts.distance[contacts.node == i])
+        if true[i] < 0.0:
+            assert len(rows) == 1
+        else:
+            np.testing.assert_allclose(rows, minima(polygon, points[i], reach), atol=1e-12)
+    # x - sd n is on the boundary.
+    foot = points[contacts.node] - contacts.distance[:, None] * contacts.outward
+    boundary = shapely.Polygon(polygon.outline, polygon.holes).boundary
+    assert shapely.distance(boundary, shapely.points(foot)).max(initial=0.0) < 1e-12
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10_000), st.booleans())
+def test_outward_is_the_gradient(seed: int, hole: bool):
+    polygon = star(seed, 12, hole)
+    points = np.random.default_rng(seed).uniform([-0.06, -0.09], [0.08, 0.05], (60, 2))
+    contacts = Surroundings([polygon], 0.2).near(points)
+    outward = contacts.outward[contacts.nearest]
+    step = 1e-7
+    slopes = [(signed(polygon, points + e) - signed(polygon, points - e)) / (2.0 * step) for e in step * np.eye(2)]
+    slope = np.stack(slopes, axis=1)
+    smooth = np.abs(np.linalg.norm(slope, axis=1) - 1.0) < 1e-4  # else on the medial axis
+    assert smooth.mean() > 0.9
+    np.testing.assert_allclose(outward[smooth], slope[smooth], atol=1e-3)
+
+
+def test_a_wall_of_many_edges_is_one_contact():
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    x = np.linspace(0.0, 0.05, 101)
+    outline = np.vstack([np.stack([x, 0.0 * x], 1), np.stack([x[::-1], 0.0 * x + 0.002], 1)]) @ turn.T + 0.03
+    wall = Surroundings([Polygon(tuple(map(tuple, outline.tolist())))], 0.01)
+    along = np.concatenate([x[1:-1], np.random.default_rng(0).uniform(0.001, 0.049, 500)])
+    for above in (0.0, 1e-9, 0.003, 0.009):
+        points = np.stack([along, 0.002 + above + 0.0 * along], 1) @ turn.T + 0.03
+        contacts = wall.near(points)
+        outside = contacts.distance >= 0.0  # on the wall itself, rounding decides
+        assert contacts.node.tolist() == list(range(len(points)))
+        assert outside.all() or above == 0.0
+        np.testing.assert_allclose(contacts.distance, above, atol=1e-15)
+        np.testing.assert_allclose(contacts.outward, np.tile(turn[:, 1], (len(points), 1)), atol=1e-9)
+
+
+def test_a_concave_corner_is_two_contacts():
+    contacts = Surroundings([CORNER], 0.005).near(np.array([[0.013, 0.012], [0.012, 0.02], [0.01, 0.01]]))
+    assert contacts.node.tolist()[:3] == [0, 0, 1]
+    assert sorted(np.round(contacts.distance[:2], 12).tolist()) == [0.002, 0.003]
+    assert contacts.nearest[:2].sum() == 1
+    assert contacts.distance[:2][contacts.nearest[:2]][0] == pytest.approx(0.002)
+    # In the corner itself: one row, out of it.
+    assert contacts.distance[contacts.node == 2].tolist() == [0.0]
+    np.testing.assert_allclose(contacts.outward[contacts.node == 2], [[np.sqrt(0.5), np.sqrt(0.5)]])
+
+
+@pytest.mark.parametrize("reach", [0.0, 1e-4, 0.004, 1.0])
+def test_a_hole_is_outside_and_the_deep_inside_is_never_free(reach: float):
+    ring = Surroundings([RING], reach)
+    contacts = ring.near(np.array([[0.0, 0.001], [0.015, 0.001], [0.0099, 0.0], [0.03, 0.0], [1.5, 0.0]]))
+    assert (contacts.distance[contacts.node == 1]).tolist() == pytest.approx([-0.005])
+    assert len(contacts.distance[contacts.node == 0]) == (4 if reach == 1.0 else 0)
+    assert (contacts.distance[contacts.node != 1] >= 0.0).all()
+    assert not (contacts.node == 4).any()
+
+
+def test_on_the_boundary_the_direction_is_the_normal():
+    points = np.array([[0.005, 0.0], [0.01, 0.01], [0.01, 0.005]])
+    contacts = Surroundings([SQUARE], 0.0).near(points)
+    assert contacts.node.tolist() == [0, 1, 2]
+    assert contacts.distance.tolist() == [0.0, 0.0, 0.0]
+    np.testing.assert_allclose(contacts.outward, [[0.0, -1.0], [np.sqrt(0.5), np.sqrt(0.5)], [1.0, 0.0]])
+
+
+def test_a_needle_and_a_notch_keep_their_signs():
+    # The tip of a needle at the right; the notch in it is as sharp.
+    tip, depth = 1e-9, 0.01
+    needle = Polygon(((0.0, -tip), (0.05, 0.0), (0.0, tip)))
+    notched = Polygon(((0.0, -0.01), (0.02, -0.01), (0.02, -tip), (depth, 0.0), (0.02, tip), (0.02, 0.01), (0.0, 0.01)))
+    points = np.array([[0.051, 0.0], [0.051, 0.001], [0.025, 1e-4], [0.025, -1e-4]])
+    assert Surroundings([needle], 0.01).near(points).distance.min() > 0.0
+    inside = Surroundings([notched], 0.02).near(np.array([[0.008, 0.0], [0.0099, 0.001], [0.015, -0.001]]))
+    np.testing.assert_allclose(inside.distance, [-0.002, -np.hypot(1e-4, 1e-3), -0.001], rtol=1e-6)
+
+
+def test_discs_polygons_and_order():
+    shapes: list[Obstacle] = [
+        SQUARE,
+        Disc((0.015, 0.005), 0.002),
+        Polygon(((0.02, 0.0), (0.03, 0.0), (0.03, 0.01), (0.02, 0.01))),
+    ]
+    points = np.array([[0.0125, 0.005], [np.nan, 0.005], [0.015, 0.005], [0.5, 0.5], [0.018, 0.005]])
+    contacts = Surroundings(shapes, 0.003).near(points)
+    assert contacts.node.tolist() == [0, 0, 2, 4, 4]
+    assert contacts.obstacle.tolist() == [0, 1, 1, 1, 2]
+    np.testing.assert_allclose(contacts.distance, [0.0025, 0.0005, -0.002, 0.001, 0.002])
+    np.testing.assert_allclose(contacts.outward, [[1, 0], [-1, 0], [1, 0], [1, 0], [-1, 0]], atol=1e-15)
+    assert contacts.nearest.all()
+    for array in (contacts.node, contacts.obstacle, contacts.distance, contacts.outward, contacts.nearest):
+        assert not array.flags.writeable
+
+
+def test_far_obstacles_of_any_scale_change_nothing():
+    near = star(3, 30, True)
+    far = [Polygon(tuple((x + 0.5 + 0.1 * i, y - 9.0) for x, y in SQUARE.outline)) for i in range(40)]
+    points = np.random.default_rng(4).uniform([-0.06, -0.09], [0.08, 0.05], (300, 2))
+    alone, among = Surroundings([near], 0.004).near(points), Surroundings([near, *far], 0.004).near(points)
+    assert alone.node.tolist() == among.node.tolist()
+    np.testing.assert_array_equal(alone.distance, among.distance)
+
+
+def test_too_small_arrays_are_told():
+    ring = Surroundings([RING], 1.0)
+    points = np.zeros((200, 2))
+    room = (np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9), np.empty((9, 2)), np.empty(9, np.bool_))
+    assert find_near(points, ring.data, *room) == -1
+    assert find_near(points[:2], ring.data, *room) == 8
+    assert len(ring.near(points)) == 800
+
+
+def test_nothing_is_near_nothing():
+    assert len(Surroundings([], 0.01).near(np.zeros((3, 2)))) == 0
+    assert len(Surroundings([SQUARE], 0.01).near(np.zeros((0, 2)))) == 0
+
+
+@pytest.mark.parametrize(
+    ("shapes", "reach", "dimension", "reason"),
+    [
+        ([SQUARE], 0.1, 4, "2 or 3"),
+        ([SQUARE], -0.1, 2, "reach"),
+        ([SQUARE], np.nan, 2, "reach"),
+        ([SQUARE], 0.1, 3, "a disc or a mesh"),
+        ([Disc((0.0, 0.0, 0.0), 1.0)], 0.1, 2, "2 finite"),
+        ([Disc((0.0, 0.0), -1.0)], 0.1, 2, "radius"),
+        ([Mesh(np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))], 0.1, 2,
+         "a disc or a polygon"),
+    ],
+)  # fmt: skip
+def test_shapes_must_fit(shapes, reach: float, dimension: int, reason: str):
+    with pytest.raises(ConfigurationError, match=reason):
+        Surroundings(shapes, reach, dimension)
+
+
+def test_points_must_fit():
+    with pytest.raises(ValueError, match="expected"):
+        Surroundings([SQUARE], 0.1).near(np.zeros((1, 3)))
