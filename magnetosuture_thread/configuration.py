@@ -104,20 +104,26 @@ class Described:
     kind: type
     default: Any
     quantity: Quantity
+    entry: type = float  # of each entry of a list
 
     def checked(self, value: Any, source: str = "") -> Any:
         """Return the value in the field's type, or raise `ConfigurationError`."""
-        about = self.quantity
+        about, whole = self.quantity, self.kind is tuple and self.entry is int
 
         def refuse() -> ConfigurationError:
-            return ConfigurationError(f"{self.group}.{self.name}", value, about.expectation(self.kind), source)
+            expectation = about.expectation(self.kind).replace(
+                "a list", "a list of whole numbers" if whole else "a list"
+            )
+            return ConfigurationError(f"{self.group}.{self.name}", value, expectation, source)
 
         if self.kind is tuple:
             if isinstance(value, str) or not isinstance(value, Sequence) or len(value) % about.multiple:
                 raise refuse()
             if not all(_is_number(entry) and self._within(entry) for entry in value):
                 raise refuse()
-            return tuple(float(entry) for entry in value)
+            if self.entry is int and not all(isinstance(entry, int) for entry in value):
+                raise refuse()
+            return tuple(self.entry(entry) for entry in value)
         if self.kind is float:
             if not _is_number(value) or not self._within(value):
                 raise refuse()
@@ -147,9 +153,10 @@ def described(cls: type[Configuration]) -> tuple[Described, ...]:
     hints = get_type_hints(cls)
     result = []
     for entry in fields(cast(Any, cls)):
-        kind = getattr(hints[entry.name], "__origin__", hints[entry.name])
+        hint = hints[entry.name]
+        kind, entries = getattr(hint, "__origin__", hint), getattr(hint, "__args__", (float,))[0]
         assert entry.default is not MISSING, f"{cls.__name__}.{entry.name} has no default"
-        result.append(Described(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"]))
+        result.append(Described(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"], entries))
     return tuple(result)
 
 

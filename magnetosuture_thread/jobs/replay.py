@@ -185,6 +185,6 @@ def _draw(path: Path, bag: Bag, setup: Setup, camera: Channel, instants: list[In
         if is_chosen:
             frame = image
         if view is not None and frame is not None:
-            draw_summary(path, frame, view, chosen, instants, setup.model.discs(), bag.start, summary)
+            draw_summary(path, frame, view, chosen, instants, setup.model.obstacles(), bag.start, summary)
             return True
     return False

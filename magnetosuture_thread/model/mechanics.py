@@ -1,85 +1,288 @@
-"""Mechanics of an overdamped inextensible rod: its drag metric and its bending.
+"""Mechanics of an inextensible rod, of higher order in the segment: metric, bending, chords, tension.
 
-All in units of the segment length D, so that x is dimensionless and a velocity is in 1/s.
+All in units of the segment length D, so that x is dimensionless, a velocity is in 1/s, and a curvature is
+the angle by which the thread turns at a node.
+
+Why of higher order: a chain of 25 segments is coarse. With plain second differences, the arc's length on
+the chord and each cell's own tangent, the reference set's worst thread is wrong by 0.23 % of its length
+at 66 Hz; with what is here, by 0.06 %.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 
+END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
+CURVATURE_CORRECTION = 1.0 / 6.0  # of the energy, by the slope of the curvature
+CLAMP_CORRECTION = 1.5  # the same in the first segment of a glued thread
+SHARPEST = 1.0  # rad^2; a sharper turn at a node is a kink between straight segments, and no arc
 
-def drag_metric(positions: Points, anisotropy: float) -> NDArray[np.float64]:
-    """Return the drag matrix Z_i of each node, relative to zeta_perp D.
 
-        Z_i = 1/2 sum over the adjacent segments of  I - (1 - zeta_par / zeta_perp) t t'
+@compiled
+def metric(
+    positions: Points,
+    weights: NDArray[np.float64],
+    inertia: float,
+    across: float,
+    along: float,
+    blocks: NDArray[np.float64],
+) -> None:
+    """Write the metric Z_i of each node.
+
+        Z_i = w_i (inertia + across (I - t_i t_i') + along t_i t_i')
+
+    with the tangent t_i from the node before to the node after.
 
     Args:
         positions: all nodes, shape (n + 1, d).
-        anisotropy: zeta_par / zeta_perp, 1/2 for a slender thread.
-
-    Returns:
-        Symmetric positive definite blocks, shape (n + 1, d, d). The free end has one adjacent segment
-        and so half of an inner node's drag.
+        weights: w_i, how many segments each node stands for, shape (n + 1,).
+        inertia: mu / dt over the unit of the metric.
+        across: zeta_perp over the same unit.
+        along: zeta_par over the same unit.
+        blocks: written, shape (n + 1, d, d).
 
     Source: resistive force theory. Deviation: the paper weighs all nodes alike, Z_i = I.
     """
-    segments = np.diff(positions, axis=0)
-    lengths = np.linalg.norm(segments, axis=1)
-    # A segment without a length, a needle that leapt onto a node, has no direction: its drag is isotropic.
-    tangents = segments / np.where(lengths > 0.0, lengths, 1.0)[:, None]
-    identity = np.eye(positions.shape[1])
-    cells = 0.5 * (identity - (1.0 - anisotropy) * tangents[:, :, None] * tangents[:, None, :])
-    metric = np.zeros((len(positions), *identity.shape))
-    metric[:-1] += cells
-    metric[1:] += cells
-    return metric
+    nodes, dimension = positions.shape
+    for i in range(nodes):
+        before, after = max(i - 1, 0), min(i + 1, nodes - 1)
+        square = 0.0
+        for a in range(dimension):
+            square += (positions[after, a] - positions[before, a]) ** 2
+        # Without a direction, where a thread is folded upon itself, the drag is that across.
+        scale = weights[i] * (across - along) / square if square > 0.0 else 0.0
+        for a in range(dimension):
+            for b in range(dimension):
+                blocks[i, a, b] = -scale * (
+                    (positions[after, a] - positions[before, a]) * (positions[after, b] - positions[before, b])
+                )
+            blocks[i, a, a] += weights[i] * (inertia + across)
 
 
-def bending_bands(segments: int, glued: bool) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the bands of the bending Hessian K, so that E_bend = 1/2 x' K x + glue terms.
+def end_corrected_weights(segments: int) -> NDArray[np.float64]:
+    """Return how many segments each node stands for, shape (n + 1,).
 
-        E_bend / (EI / D) = 1/2 sum_{i=1}^{n-1} |x_{i+1} - 2 x_i + x_{i-1}|^2  (+ |x_1 - x_0 + heading|^2 if glued)
+        w = 1/2, 1, ..., 1, 13/12, 5/12
+
+    Half of each adjacent segment, with Gregory's end correction at the free end: the integral of what acts
+    along the thread is then of third order in D there. Half a segment's drag at the free end instead of a
+    whole one matters most: it is the end that moves freely.
+
+    Source: J. Gregory's quadrature. Deviation: the paper weighs all nodes alike.
+    """
+    weights = np.ones(segments + 1)
+    weights[0] = 0.5
+    weights[-1] = 0.5 - END_CORRECTION
+    weights[-2] += END_CORRECTION
+    return weights
+
+
+def rest_distances(rest_turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distance of the nodes before and after each inner node at rest, delta_i, shape (n - 1,).
+
+    delta_i = 2 cos(theta_i / 2)
 
     Args:
-        segments: n.
-        glued: add the clamp of a glued thread on node 1.
-
-    Returns:
-        The diagonal of length n + 1 and the first and second off-diagonals; each entry multiplies
-        the identity of dimension d.
-
-    Source: discrete elastic rod with a straight rest shape. Deviation: the paper has the stiffness
-    CLF V_i instead, which is of fourth order in the bending angle.
+        rest_turns: theta_i, angle by which the thread at rest turns at each inner node, shape (n - 1,) [rad].
     """
-    nodes = segments + 1
-    second_difference = np.zeros((segments - 1, nodes))
-    index = np.arange(segments - 1)
-    second_difference[index, index] = 1.0
-    second_difference[index, index + 1] = -2.0
-    second_difference[index, index + 2] = 1.0
-    hessian = second_difference.T @ second_difference
+    return np.asarray(2.0 * np.cos(0.5 * rest_turns))
+
+
+def bending_bands(segments: int, glued: bool) -> NDArray[np.float64]:
+    """Return the bands of the bending Hessian K, shape (4, n + 1): K[i, i + k] is at [k, i].
+
+        E_bend / (EI / D) = 1/2 sum_i w_i |c_i|^2  +  1/2 sum_i (1/6) |c_{i+1} - c_i|^2
+        c_i = x_{i+1} - 2 x_i + x_{i-1} - rest_i,    c_0 = 2 (x_1 - x_0 + heading) if glued, else 0
+
+    with w_i = 1, but 1/2 at the clamp, which stands for half a segment; the last difference runs to the
+    free end, where c_n = 0, and the first is weighed by 3/2 if glued. The second sum undoes what second
+    differences blur: without it the energy is too low by (D^2 / 12) EI times the integral of the squared
+    slope of the curvature. A clamped beam under an even load is then right to fourth order in D, and to
+    second without.
+
+    Source: discrete elastic rod, Euler-Maclaurin. Deviation: the paper has the stiffness CLF V_i instead,
+    which is of fourth order in the bending angle.
+    """
+    curvatures = sp.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(segments, segments + 1)).tolil()
+    curvatures[0, 0], curvatures[0, 1] = (-2.0, 2.0) if glued else (0.0, 0.0)
+    weights = np.ones(segments)
+    weights[0] = 0.5 if glued else 0.0
+    slopes = sp.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(segments, segments))
+    slope_weights = np.full(segments, CURVATURE_CORRECTION)
     if glued:
-        hessian[:2, :2] += 2.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
-    return np.diag(hessian).copy(), np.diag(hessian, 1).copy(), np.diag(hessian, 2).copy()
+        slope_weights[0] *= CLAMP_CORRECTION
+    middle = sp.diags_array(weights) + slopes.T @ sp.diags_array(slope_weights) @ slopes
+    hessian = sp.csr_array(curvatures.T @ middle @ curvatures)
+    bands = np.zeros((4, segments + 1))
+    for apart in range(4):
+        bands[apart, : segments + 1 - apart] = hessian.diagonal(apart)
+    return bands
 
 
-def bending_gradient(positions: Points, heading: Points | None) -> Points:
-    """Return the derivative of E_bend / (EI / D) by every node's position, shape (n + 1, d).
+@compiled
+def bending_gradient(
+    positions: Points, heading: Points, glued: bool, rest_turns: NDArray[np.float64], work: Points, gradient: Points
+) -> None:
+    """Write the derivative of E_bend / (EI / D) by every node's position.
 
     Args:
         positions: all nodes, shape (n + 1, d).
-        heading: unit vector along the needle if the thread is glued to it, else None.
+        heading: unit vector along the needle, used if glued, shape (d,).
+        glued: whether the thread is glued to the needle.
+        rest_turns: angle by which the thread at rest turns at each inner node, shape (n - 1,).
+        work: any memory, at least shape (2, n + 1, d).
+        gradient: written, shape (n + 1, d).
     """
-    curvature = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
-    gradient = np.zeros_like(positions)
-    gradient[:-2] += curvature
-    gradient[1:-1] -= 2.0 * curvature
-    gradient[2:] += curvature
-    if heading is not None:
-        misfit = 2.0 * (positions[1] - positions[0] + heading)
-        gradient[0] -= misfit
-        gradient[1] += misfit
-    return gradient
+    nodes, dimension = positions.shape
+    segments = nodes - 1
+    deviation, moment = work[0], work[1]
+    for i in range(segments):
+        for a in range(dimension):
+            deviation[i, a] = _turn(positions, heading, i, a) if glued or i > 0 else 0.0
+        if i > 0 and rest_turns[i - 1] != 0.0:
+            _take_rest(positions, i, rest_turns[i - 1], deviation)
+    for i in range(segments):
+        weight = 1.0 if i > 0 else (0.5 if glued else 0.0)
+        after = CURVATURE_CORRECTION * (CLAMP_CORRECTION if glued and i == 0 else 1.0)
+        before = CURVATURE_CORRECTION * (CLAMP_CORRECTION if glued and i == 1 else 1.0)
+        for a in range(dimension):
+            following = deviation[i + 1, a] if i + 1 < segments else 0.0
+            value = weight * deviation[i, a] - after * (following - deviation[i, a])
+            if i > 0:
+                value += before * (deviation[i, a] - deviation[i - 1, a])
+            moment[i, a] = value
+    for a in range(dimension):
+        for i in range(nodes):
+            gradient[i, a] = 0.0
+        if glued:
+            gradient[0, a] -= 2.0 * moment[0, a]
+            gradient[1, a] += 2.0 * moment[0, a]
+        for i in range(1, segments):
+            gradient[i - 1, a] += moment[i, a]
+            gradient[i, a] -= 2.0 * moment[i, a]
+            gradient[i + 1, a] += moment[i, a]
+
+
+@compiled
+def _take_rest(positions: Points, i: int, turn: float, deviation: Points) -> None:
+    """Take the rest curvature at a node from its deviation: in the plane to the left, in space as it bends."""
+    dimension = positions.shape[1]
+    if dimension == 2:
+        along, up = positions[i + 1, 0] - positions[i - 1, 0], positions[i + 1, 1] - positions[i - 1, 1]
+        size = np.hypot(along, up)
+        if size > 0.0:
+            deviation[i, 0] += turn * up / size
+            deviation[i, 1] -= turn * along / size
+        return
+    size = 0.0
+    for a in range(dimension):
+        size += deviation[i, a] ** 2
+    size = np.sqrt(size)
+    if size > 0.0:
+        for a in range(dimension):
+            deviation[i, a] -= abs(turn) * deviation[i, a] / size
+
+
+@compiled
+def chord_lengths(positions: Points, heading: Points, glued: bool, chords: NDArray[np.float64]) -> None:
+    """Write the length of the chord between the ends of each segment, whose arc is 1 long, shape (n,).
+
+        chord / arc = 1 - kappa^2 / 24
+
+    with the mean of the squared turns at both ends, where the segments resolve them. A chain whose chords had the arc's
+    length would be too long wherever it bends.
+
+    Source: series of the sine. Deviation: the paper makes no difference between chord and arc.
+    """
+    nodes, dimension = positions.shape
+    chords[:] = 1.0
+    for i in range(nodes - 1):
+        square = 0.0
+        for a in range(dimension):
+            if glued or i > 0:
+                square += _turn(positions, heading, i, a) ** 2
+        share = _resolved(square)[0] / 48.0
+        chords[i] -= share
+        if i > 0:
+            chords[i - 1] -= share
+
+
+@compiled
+def tension_stiffness(
+    positions: Points,
+    heading: Points,
+    glued: bool,
+    tension: NDArray[np.float64],
+    least: float,
+    interval: float,
+    program: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+) -> None:
+    """Add what the tension does through the chords, implicit in u.
+
+        E_tension = 1/2 sum_i  (T_i + T_{i+1}) / 24  |c_i(x + dt u)|^2,    c_i = x_{i+1} - 2 x_i + x_{i-1}
+
+    The chord's length falls with the curvature, see `chord_lengths`, so a tension T straightens: the
+    derivative of the length by the curvature belongs to the segment's gradient. It is put here instead,
+    with the tension of the last solve, as it would otherwise make the row reach over four nodes.
+
+    Args:
+        positions: all nodes, shape (n + 1, d).
+        heading: unit vector along the needle, used if glued, shape (d,).
+        glued: whether the thread is glued to the needle.
+        tension: multipliers of the segments, shape (n,) or longer.
+        least: bound for a thread that is pushed, negative: never more than bending makes up for.
+        interval: dt [s].
+        program: blocks, couplings and q, which are added to.
+
+    Source: Lagrange's multipliers. Deviation: the paper makes no difference between chord and arc.
+    """
+    blocks, couplings, linear = program
+    nodes, dimension = positions.shape
+    for i in range(0 if glued else 1, nodes - 1):
+        pull = max((tension[i] + (tension[i - 1] if i > 0 else 0.0)) / 24.0, least)
+        square = 0.0
+        for a in range(dimension):
+            square += _turn(positions, heading, i, a) ** 2
+        pull *= _resolved(square)[1]
+        near, outer, far = (1.0, -2.0, 1.0) if i > 0 else (0.0, -2.0, 2.0)
+        weight = interval * pull
+        for a in range(dimension):
+            force = pull * _turn(positions, heading, i, a)
+            if i > 0:
+                linear[i - 1, a] += near * force
+                blocks[i - 1, a, a] += near * near * weight
+            linear[i, a] += outer * force
+            blocks[i, a, a] += outer * outer * weight
+            linear[i + 1, a] += far * force
+            blocks[i + 1, a, a] += far * far * weight
+        couplings[0, i] += outer * far * weight
+        if i > 0:
+            couplings[0, i - 1] += near * outer * weight
+            couplings[1, i - 1] += near * far * weight
+
+
+@compiled
+def _resolved(square: float) -> tuple[float, float]:
+    """Return the part of a squared turn that a chord is corrected for, and its slope.
+
+        f(c^2) = c^2 (1 - (c^2 / c_max^2)^2)
+
+    A sharper turn is a kink that these segments do not resolve; it does not shorten the chords beside it.
+    """
+    share = square / SHARPEST
+    if share >= 1.0:
+        return 0.0, 0.0
+    return square * (1.0 - share * share), max(0.0, 1.0 - 3.0 * share * share)
+
+
+@compiled
+def _turn(positions: Points, heading: Points, i: int, a: int) -> float:
+    """Return a coordinate of c_i; c_0 is that of a glued thread."""
+    if i == 0:
+        return float(2.0 * (positions[1, a] - positions[0, a] + heading[a]))
+    return float(positions[i + 1, a] - 2.0 * positions[i, a] + positions[i - 1, a])

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_along
 from magnetosuture_thread.model.barriers import BarrierRows
-from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.model.solvers import OsqpSolver
+from magnetosuture_thread.model.formulations import Drive, Formulation, StepSolution, ThreadState
+from magnetosuture_thread.model.program import SOLVED, Residuals
 from magnetosuture_thread.model.thread import Thread
 
 FARTHEST = 10.0  # m; nothing that a dish could hold is farther away
+STARTED = "started"  # status of a prediction that no step led to
+LONGEST_WAY = 0.5  # segments; of a driven node in a sub-step
 
 
 @dataclass(frozen=True)
@@ -43,62 +45,80 @@ class Prediction:
         stamp: [s]
         formulation: name of the formulation.
         vertices: all nodes, shape (n + 1, d) [m].
-        stretch: segment length over rest length, less one, shape (n,).
-        margins: every barrier, a `BarrierRows` for each kind, in SI units.
+        stretch: each segment's length from end to end over what it should be, less one, shape (n,).
         interval: time since the previous prediction [s].
         substeps: number of steps it was divided into.
         solver: the solver's name.
-        status: the solver's own word.
+        status: the solver's own word; where one did not solve at once, what had to be tried.
         residual: the largest scaled residual of the solves.
+        judge: works out the margins.
     """
 
     stamp: float
     formulation: str
     vertices: Points
     stretch: NDArray[np.float64]
-    margins: list[BarrierRows]
     interval: float
     substeps: int
     solver: str
     status: str
     residual: float
+    judge: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
+
+    @cached_property
+    def margins(self) -> list[BarrierRows]:
+        """Every barrier, a `BarrierRows` for each kind, in SI units; worked out when it is first asked for."""
+        return self.judge()
 
 
 class ThreadPredictor:
     """Predicts a thread from the needle's poses.
 
     Args:
+        formulation: steps the thread.
         thread: the thread.
-        obstacles: discs in the dish frame [m].
         longest_step: intervals are divided into steps of at most this [s].
         most_substeps: but into at most so many; then the steps get longer.
-        tolerance: the largest scaled residual with which a solution is accepted.
+        held: nodes that stay where they are at the start, as where tissue holds the thread.
     """
 
     def __init__(
         self,
+        formulation: Formulation,
         thread: Thread,
-        obstacles: Sequence[Disc] = (),
         *,
         longest_step: float = 1.0 / 66.0,
         most_substeps: int = 200,
-        tolerance: float = 1e-5,
+        held: Sequence[int] = (),
     ) -> None:
+        for node in held:
+            _check_node("held node", node, thread)
         self.thread = thread
-        self._formulation = RodFormulation(thread, obstacles, OsqpSolver(), tolerance)
+        self._formulation = formulation
         self._longest_step = longest_step
         self._most_substeps = most_substeps
+        self._held = tuple(sorted(set(held)))
         self._pose: NeedlePose | None = None
-        self._vertices: Points | None = None
+        self._state: ThreadState | None = None
 
     @property
     def started(self) -> bool:
         """Whether the thread has a shape to go on from."""
-        return self._vertices is not None
+        return self._state is not None
+
+    def warm_up(self) -> None:
+        """Step a straight thread once, so that no kernel is compiled in the first callback."""
+        dimension = self._formulation.dimension
+        east = np.eye(dimension)[0]
+        path = -self.thread.segment_length * np.arange(self.thread.segments + 1)[:, None] * east
+        self.start_at(NeedlePose(0.0, np.zeros(dimension), east), path)
+        for count in (1, 2):
+            self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
+        self.reset()
 
     def reset(self) -> None:
         """Forget the thread's shape; the next call must be `start`."""
-        self._pose = self._vertices = None
+        self._pose = self._state = None
 
     def start(self, pose: NeedlePose, centreline: Points) -> Prediction:
         """Take the thread's shape from a centreline, seen or assumed, from tail to end.
@@ -121,57 +141,99 @@ class ThreadPredictor:
         path = np.vstack([pose.tail, centreline[1:]])
         if arc_lengths(path)[-1] < unit:
             raise InvalidInputError("centreline", f"{arc_lengths(path)[-1]:.2e} m long", f"at least {unit:.2e} m")
-        self._vertices = chain_along(path, self.thread.segments, self.thread.segment_length)
-        self._pose = pose
-        return self._prediction(pose.stamp, 0.0, 0, "none", "started", 0.0)
+        return self.start_at(pose, chain_along(path, self.thread.segments, unit))
 
-    def step(self, pose: NeedlePose) -> Prediction:
+    def start_at(self, pose: NeedlePose, vertices: Points) -> Prediction:
+        """Take the thread's nodes as they are.
+
+        Args:
+            pose: the needle at the same instant.
+            vertices: all nodes, shape (n + 1, d) [m].
+
+        Raises:
+            InvalidInputError: the pose or a node is not finite, or there are not n + 1 nodes.
+        """
+        check_pose(pose)
+        wanted = (self.thread.segments + 1, len(pose.tail))
+        if vertices.shape != wanted or not np.all(np.isfinite(vertices)):
+            raise InvalidInputError("thread's nodes", f"shape {vertices.shape}", f"finite, shape {wanted} [m]")
+        self._state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
+        self._pose = pose
+        return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0))
+
+    def step(self, pose: NeedlePose, driven: Mapping[int, Points] | None = None) -> Prediction:
         """Follow the needle to its next pose.
 
         The real interval between the stamps is stepped over, in sub-steps along the straight line
-        between the two poses. Where a solve fails, the thread stays as it was at the last pose.
+        between the two poses: so many that neither the time nor the way of a driven node, half a segment,
+        is too long for one. Where a solve fails, the thread stays as it was at the last pose.
+
+        Args:
+            pose: the needle.
+            driven: where other nodes are at the same instant, if their motion is measured: positions of
+                shape (d,) by index [m].
 
         Raises:
-            InvalidInputError: the pose is not finite, or not later than the last one.
+            InvalidInputError: the pose is not finite, or not later than the last one; or a driven node is
+                none of the thread's, or not finite.
             SolverError: a solution's residual is above the tolerance.
         """
-        if self._pose is None or self._vertices is None:
+        if self._pose is None or self._state is None:
             raise InvalidInputError("needle pose", "a pose before the start", "a centreline first")
         check_pose(pose)
-        last = self._pose
+        last, state = self._pose, self._state
         interval = pose.stamp - last.stamp
         if interval <= 0.0:
             raise InvalidInputError("needle pose stamp", f"{pose.stamp:.6f} s", f"later than {last.stamp:.6f} s")
-        substeps = min(self._most_substeps, max(1, math.ceil(interval / self._longest_step - 1e-9)))
-        vertices = self._vertices
-        residual = 0.0
+        ends = {0: pose.tail, **{node: state.positions[node] for node in self._held}}
+        for node, position in (driven or {}).items():
+            _check_node("driven node", node, self.thread)
+            if np.shape(position) != pose.tail.shape or not np.all(np.abs(position) <= FARTHEST):
+                where = np.asarray(position).tolist()
+                raise InvalidInputError(f"position of node {node}", where, f"finite, at most {FARTHEST:g} m from 0")
+            ends[node] = position
+        nodes = tuple(ends)
+        begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
+        begin[0] = last.tail
+        way = float(np.linalg.norm(end - begin, axis=1).max())
+        wanted = max(interval / self._longest_step, way / (LONGEST_WAY * self.thread.segment_length), 1.0)
+        substeps = min(self._most_substeps, math.ceil(wanted - 1e-9))
+        residuals, worst = Residuals(0.0, 0.0, 0.0), None
         for index in range(1, substeps + 1):
             part = index / substeps
-            tail = last.tail + part * (pose.tail - last.tail)
             heading = _between(last.heading, pose.heading, part)
-            done = self._formulation.step(vertices, tail, heading, interval / substeps)
-            vertices = done.positions
-            residual = max(residual, done.residual)
-        self._pose, self._vertices = pose, vertices
-        return self._prediction(pose.stamp, interval, substeps, done.solver, done.status, residual)
+            done = self._formulation.step(
+                state, Drive(nodes, begin + part * (end - begin), heading), interval / substeps
+            )
+            state, residuals = done.state, residuals.or_worse(done.residuals)
+            worst = done if worst is None or worst.status == SOLVED else worst
+        self._pose, self._state = pose, state
+        return self._prediction(pose, interval, substeps, worst, residuals)
 
     def _prediction(
-        self, stamp: float, interval: float, substeps: int, solver: str, status: str, residual: float
+        self, pose: NeedlePose, interval: float, substeps: int, step: StepSolution | None, residuals: Residuals
     ) -> Prediction:
-        assert self._vertices is not None
-        lengths = np.linalg.norm(np.diff(self._vertices, axis=0), axis=1)
+        assert self._state is not None
+        positions = self._state.positions
+        lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         return Prediction(
-            stamp=stamp,
+            stamp=pose.stamp,
             formulation=self._formulation.name,
-            vertices=self._vertices,
-            stretch=lengths / self.thread.segment_length - 1.0,
-            margins=self._formulation.margins(self._vertices),
+            vertices=positions,
+            stretch=lengths / self._formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,
             substeps=substeps,
-            solver=solver,
-            status=status,
-            residual=residual,
+            solver=step.solver if step else "none",
+            status=step.status if step else STARTED,
+            residual=residuals.largest,
+            judge=partial(self._formulation.margins, positions, pose.heading),
         )
+
+
+def _check_node(field: str, node: int, thread: Thread) -> None:
+    """Raise `InvalidInputError` unless this is a node of the thread and not the needle's own."""
+    if not 1 <= node <= thread.segments:
+        raise InvalidInputError(field, node, f"a node from 1 to {thread.segments}; node 0 follows the needle")
 
 
 def check_pose(pose: NeedlePose) -> None:

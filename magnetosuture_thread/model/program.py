@@ -1,53 +1,194 @@
-"""The quadratic program of a step, and a solution that judges itself.
+"""The quadratic program of a step, and a solution that is judged apart from its solver.
 
-minimise over u   1/2 u' P u + q' u
-subject to        lower <= A u <= upper
+    minimise over u, s   1/2 u' P u + q' u + 1/2 sum_r s_r^2 / c_r
+    subject to           lower_r <= a_r' u + s_r <= upper_r,    u_i = 0 for the known nodes
+
+The unknowns are the velocities u_i of a chain's nodes. A slack s_r with weight W_r is what its
+multiplier makes of it, s_r = lambda_r / W_r: so it is no variable but the row's compliance c_r = 1 / W_r,
+and 0 makes the row hard. Every row touches at most three nodes in a row, and P couples nodes at most
+three apart: with d coordinates a node, all is one band of half-width 3 d.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
+
 Vector = NDArray[np.float64]
 
+SPAN = 3  # nodes that a row may touch, and how far apart nodes may be coupled
+SOLVED = "solved"  # every solver's word for a solution at the first attempt
 
-class SparsePattern:
-    """Builds sparse matrices of one pattern fast: entries in, compressed columns out.
 
-    Args:
-        rows: row of each entry.
-        columns: column of each entry; entries at one place add up.
-        shape: the matrix's shape.
+class ChainProgram(NamedTuple):
+    """One program over the velocities of a chain of m >= 3 nodes in d dimensions.
+
+    Attributes:
+        blocks: diagonal blocks of P, symmetric, shape (m, d, d).
+        couplings: off-diagonal entries of P, shape (3, m): [k - 1, i] times the identity couples the
+            nodes i and i + k.
+        linear: q, shape (m, d).
+        known: nodes whose velocity is none of the unknowns, as their motion is known, shape (m,).
+        first: the first of the three nodes of each row, at most m - 3, shape (r,).
+        gradient: a_r on these three nodes, shape (r, 3, d).
+        lower: shape (r,), -inf where there is none.
+        upper: shape (r,), inf where there is none.
+        compliance: c_r >= 0, shape (r,).
     """
 
-    def __init__(self, rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]) -> None:
-        self.shape = shape
-        places, self._slot = np.unique(columns * np.int64(shape[0]) + rows, return_inverse=True)
-        self._indices = (places % shape[0]).astype(np.int32)
-        counts = np.bincount(places // shape[0], minlength=shape[1])
-        self._indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    blocks: NDArray[np.float64]
+    couplings: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    known: NDArray[np.bool_]
+    first: NDArray[np.int64]
+    gradient: NDArray[np.float64]
+    lower: Vector
+    upper: Vector
+    compliance: Vector
 
-    def matrix(self, entries: Vector) -> sp.csc_matrix:
-        """Return the matrix with these entries, in the order in which the pattern was given."""
-        data = np.bincount(self._slot, weights=entries, minlength=len(self._indices))
-        return sp.csc_matrix((data, self._indices, self._indptr), shape=self.shape)
+
+class Residuals(NamedTuple):
+    """The largest scaled violations of the Karush-Kuhn-Tucker conditions, inf for a NaN.
+
+    Attributes:
+        primal: of the bounds, with y = a' u + c lambda:  max(lower - y, y - upper, 0).
+        dual: of the balance of forces:  |P u + q - sum a lambda|.
+        complementarity: |lambda| times the distance of y from the bound that its sign names.
+    """
+
+    primal: float
+    dual: float
+    complementarity: float
+
+    @property
+    def largest(self) -> float:
+        """The largest of the three."""
+        return max(self)
+
+    def or_worse(self, other: Residuals) -> Residuals:
+        """Return the larger of each."""
+        return Residuals(max(self[0], other[0]), max(self[1], other[1]), max(self[2], other[2]))
+
+
+class Solution(NamedTuple):
+    """What a solver found.
+
+    Attributes:
+        velocities: u, shape (m, d), 0 at the known nodes.
+        multipliers: lambda of the rows, shape (r,); positive at a lower bound, negative at an upper one.
+        solver: the solver's name.
+        status: its own word.
+        iterations: how many it took.
+        residuals: computed apart from the solver, by `residuals_of`.
+    """
+
+    velocities: NDArray[np.float64]
+    multipliers: Vector
+    solver: str
+    status: str
+    iterations: int
+    residuals: Residuals
+
+
+class Solver(Protocol):
+    """Solves programs, one after the other."""
+
+    name: str
+
+    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
+        """Return the solution with its residuals, whatever it is: the caller judges it.
+
+        Args:
+            program: the program.
+            velocities: a guess, shape (m, d).
+            multipliers: a guess, shape (r,).
+        """
+        ...
+
+
+def residuals_of(program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Residuals:
+    """Return how far a solution is from optimal.
+
+    A row is divided by max(1, its own largest term), so that a far obstacle does not make light of the
+    others; the balance of forces by max(1, its largest force); the complementarity by
+    max(1, the largest multiplier).
+    """
+    return Residuals(*compiled_residuals(program, velocities, multipliers))
+
+
+@compiled
+def compiled_residuals(
+    program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector
+) -> tuple[float, float, float]:
+    """Return the same, for compiled code: primal, dual, complementarity."""
+    nodes, dimension = velocities.shape
+    force = np.empty((nodes, dimension))
+    largest = 1.0
+    for i in range(nodes):
+        for k in range(dimension):
+            value = 0.0
+            for j in range(dimension):
+                value += program.blocks[i, k, j] * velocities[i, j]
+            for apart in range(1, SPAN + 1):
+                if i >= apart:
+                    value += program.couplings[apart - 1, i - apart] * velocities[i - apart, k]
+                if i + apart < nodes:
+                    value += program.couplings[apart - 1, i] * velocities[i + apart, k]
+            largest = max(largest, abs(value), abs(program.linear[i, k]))
+            force[i, k] = value + program.linear[i, k]
+    pulled = np.zeros((nodes, dimension))
+    primal, complementarity, pushed = 0.0, 0.0, 1.0
+    finite = True
+    for r in range(len(program.lower)):
+        first, multiplier = program.first[r], multipliers[r]
+        image, scale = 0.0, 1.0
+        for node in range(SPAN):
+            for k in range(dimension):
+                gradient = program.gradient[r, node, k]
+                image += gradient * velocities[first + node, k]
+                pulled[first + node, k] += gradient * multiplier
+        image += program.compliance[r] * multiplier
+        scale = max(scale, abs(image))
+        lower, upper = program.lower[r], program.upper[r]
+        if np.isfinite(lower):
+            scale = max(scale, abs(lower))
+        if np.isfinite(upper):
+            scale = max(scale, abs(upper))
+        primal = max(primal, (lower - image) / scale, (image - upper) / scale)
+        # A push on a bound that does not exist counts as one from a whole scale away.
+        gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
+        complementarity = max(complementarity, abs(multiplier) * (min(gap / scale, 1.0)))
+        pushed = max(pushed, abs(multiplier))
+        finite = finite and np.isfinite(image) and np.isfinite(multiplier)
+    dual = 0.0
+    for i in range(nodes):
+        for k in range(dimension):
+            finite = finite and np.isfinite(force[i, k])
+            if not program.known[i]:
+                largest = max(largest, abs(pulled[i, k]))
+                dual = max(dual, abs(force[i, k] - pulled[i, k]))
+    if not finite:
+        return np.inf, np.inf, np.inf
+    return primal, dual / largest, complementarity / pushed
 
 
 @dataclass(frozen=True)
 class QuadraticProgram:
-    """One program.
+    """The same program for a general solver: minimise 1/2 x' P x + q' x subject to lower <= A x <= upper.
 
     Attributes:
-        P: upper triangle of the symmetric positive definite Hessian, shape (m, m).
-        q: shape (m,).
-        A: shape (r, m).
+        P: upper triangle of the symmetric positive definite Hessian, shape (v, v).
+        q: shape (v,).
+        A: shape (r, v).
         lower: shape (r,), -inf where there is none.
         upper: shape (r,), inf where there is none.
+        unknown: which of the chain's m d coordinates the first variables are; slacks follow them.
     """
 
     P: sp.csc_matrix
@@ -55,58 +196,46 @@ class QuadraticProgram:
     A: sp.csc_matrix
     lower: Vector
     upper: Vector
+    unknown: NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class Solution:
-    """What a solver found; `residual` is computed here, never taken from the solver.
+def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
+    """Write a chain's program with sparse matrices, its known nodes taken out and its slacks as variables.
 
-    Attributes:
-        u: the minimiser, shape (m,).
-        multipliers: of the rows, shape (r,); negative at a lower bound, positive at an upper one.
-        solver: its name.
-        status: its own word.
-        residual: the largest violation of the optimality conditions, relative to the largest term of
-            each (at least 1).
+    A slack is scaled by the root of its weight, s = sqrt(c) s', so that its own entry in P is 1: with the
+    weights themselves, 1 beside 1e5, a first-order method does not converge.
     """
+    nodes, dimension = program.linear.shape
+    coordinates = np.arange(nodes * dimension).reshape(nodes, dimension)
+    upper = np.triu_indices(dimension)
+    rows, columns = [coordinates[:, upper[0]].ravel()], [coordinates[:, upper[1]].ravel()]
+    entries = [program.blocks[:, upper[0], upper[1]].ravel()]
+    for apart in range(1, SPAN + 1):
+        rows.append(coordinates[:-apart].ravel())
+        columns.append(coordinates[apart:].ravel())
+        entries.append(np.repeat(program.couplings[apart - 1, :-apart], dimension))
+    hessian = _matrix(entries, rows, columns, (nodes * dimension, nodes * dimension))
+    touched = coordinates[program.first[:, None] + np.arange(SPAN)].reshape(len(program.first), -1)
+    row = np.repeat(np.arange(len(program.first)), SPAN * dimension)
+    image = _matrix([program.gradient.ravel()], [row], [touched.ravel()], (len(program.first), nodes * dimension))
+    unknown = np.flatnonzero(np.repeat(~program.known, dimension))
+    soft = np.flatnonzero(program.compliance > 0.0)
+    slack = sp.csc_matrix(
+        (np.sqrt(program.compliance[soft]), (soft, np.arange(len(soft)))), shape=(len(program.first), len(soft))
+    )
+    return QuadraticProgram(
+        P=sp.csc_matrix(sp.block_diag([hessian[unknown][:, unknown], sp.eye(len(soft))])),
+        q=np.concatenate([program.linear.ravel()[unknown], np.zeros(len(soft))]),
+        A=sp.csc_matrix(sp.hstack([image[:, unknown], slack])),
+        lower=program.lower,
+        upper=program.upper,
+        unknown=unknown,
+    )
 
-    u: Vector
-    multipliers: Vector
-    solver: str
-    status: str
-    residual: float
 
-
-class Solver(Protocol):
-    """Solves programs of one pattern, one after the other."""
-
-    name: str
-
-    def solve(self, program: QuadraticProgram) -> Solution:
-        """Return the solution with its residual, whatever it is: the caller judges it."""
-        ...
-
-
-def optimality_residual(program: QuadraticProgram, u: Vector, multipliers: Vector) -> float:
-    """Return the largest scaled violation of the Karush-Kuhn-Tucker conditions, inf for a NaN.
-
-    Primal: max(lower - A u, A u - upper, 0). Dual: |P u + q + A' y|. Complementarity: |y| times the
-    distance from the bound that its sign names. A row is divided by max(1, its own largest term), so that
-    a far obstacle does not make light of the others; the balance of forces by max(1, its largest force).
-    """
-    if not (np.all(np.isfinite(u)) and np.all(np.isfinite(multipliers))):
-        return float("inf")
-    image = program.A @ u
-    below, above = program.lower - image, image - program.upper
-    lower, upper = (np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (program.lower, program.upper))
-    scale = np.maximum.reduce([np.ones_like(image), np.abs(image), lower, upper])
-    primal = float((np.maximum(below, above) / scale).max(initial=0.0))
-    curved = program.P @ u + program.P.T @ u - program.P.diagonal() * u
-    pulled = program.A.T @ multipliers
-    largest = max(float(np.abs(part).max(initial=0.0)) for part in (curved, program.q, pulled))
-    dual = float(np.abs(curved + program.q + pulled).max(initial=0.0)) / max(1.0, largest)
-    # A push on a bound that does not exist counts as one from a whole scale away.
-    gap = np.where(multipliers < 0.0, np.abs(below), np.abs(above)) / scale
-    pushed = np.abs(multipliers) * np.where(np.isfinite(gap), gap, 1.0)
-    complementarity = float(pushed.max(initial=0.0)) / max(1.0, float(np.abs(multipliers).max(initial=0.0)))
-    return max(primal, dual, complementarity)
+def _matrix(
+    entries: list[Vector], rows: list[NDArray[np.intp]], columns: list[NDArray[np.intp]], shape: tuple[int, int]
+) -> sp.csc_matrix:
+    return sp.csc_matrix(
+        (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape, dtype=np.float64
+    )

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings, triangulate
+from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
+from magnetosuture_thread.model.formulations import PaperOptions
+from magnetosuture_thread.model.medium import Medium
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+
+MEDIA = ("liquid", "air")
 
 
 @dataclass(frozen=True)
@@ -18,6 +24,10 @@ class ThreadModelSettings(Configuration):
 
     GROUP: ClassVar[str] = "thread_model"
 
+    formulation: str = quantity(
+        "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS
+    )
+    solver: str = quantity("banded", "what solves a step's program", choices=SOLVERS)
     material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
     length: float = quantity(0.019, "rest length of the thread", unit="m", minimum=0.001, maximum=2.0)
     segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
@@ -25,6 +35,19 @@ class ThreadModelSettings(Configuration):
         Attachment.PINNED.value,
         "how the thread is fixed to the needle: pinned turns freely, glued leaves along the needle's axis",
         choices=tuple(kind.value for kind in Attachment),
+    )
+    rest_curvature: float = quantity(
+        0.0,
+        "curvature that the thread keeps in memory, positive to the left, seen from the needle along it",
+        unit="1/m",
+        minimum=-2000.0,
+        maximum=2000.0,
+    )
+    held_nodes: tuple[int, ...] = quantity(
+        (), "nodes that stay where they are at the start, as where tissue holds the thread", minimum=1, maximum=2000
+    )
+    medium: str = quantity(
+        "liquid", "what the thread moves in: liquid drags it, in air its inertia and weight count", choices=MEDIA
     )
     viscosity: float = quantity(
         1.0,
@@ -36,13 +59,34 @@ class ThreadModelSettings(Configuration):
     wetted_fraction: float = quantity(
         0.5, "part of the thread's surface in the liquid; half for a floating thread", minimum=0.05, maximum=1.0
     )
+    mass_per_length: float = quantity(
+        4e-6, "mass of the thread in air per length", unit="kg/m", minimum=1e-9, maximum=10.0
+    )
+    air_drag: float = quantity(
+        1e-4, "drag of the thread in air per length and speed", unit="Pa s", minimum=0.0, maximum=10.0
+    )
+    bending_damping: float = quantity(
+        0.0,
+        "time in which bending in air is damped: its moment over its stiffness and rate",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
+    )
+    gravity: tuple[float, ...] = quantity(
+        (),
+        "weight in the plane of the camera, for a thread in air: x, y",
+        unit="m/s^2",
+        minimum=-20.0,
+        maximum=20.0,
+        multiple=2,
+    )
     initial_shape: str = quantity(
         "seen",
         "where the thread starts: as the camera first sees it, or straight behind the needle",
         choices=("seen", "straight"),
     )
     longest_step: float = quantity(
-        1.0 / 66.0,
+        1.0 / 60.0,
         "intervals between poses are divided into steps of at most this",
         unit="s",
         minimum=1e-4,
@@ -56,11 +100,42 @@ class ThreadModelSettings(Configuration):
         maximum=1.0,
         multiple=3,
     )
+    polygon_obstacles: tuple[float, ...] = quantity(
+        (),
+        "corners of polygons in the dish frame: x, y of each in turn, one outline after the other",
+        unit="m",
+        minimum=-1.0,
+        maximum=1.0,
+        multiple=2,
+    )
+    polygon_sizes: tuple[int, ...] = quantity(
+        (),
+        "number of corners of each outline in polygon_obstacles; negative for a hole in the polygon before it",
+        minimum=-10000,
+        maximum=10000,
+    )
+    corner_radius: float = quantity(
+        2e-4, "sharp corners of polygons are rounded by this; 0 leaves them", unit="m", minimum=0.0, maximum=0.1
+    )
+    corner_angle: float = quantity(
+        math.pi / 6.0,
+        "a corner is sharp where the outline turns by more than this",
+        unit="rad",
+        minimum=0.05,
+        maximum=3.1,
+    )
+    margin_range: float = quantity(
+        5e-3,
+        "margins are published of nodes and obstacles that are closer than this",
+        unit="m",
+        minimum=1e-4,
+        maximum=1.0,
+    )
     contact_tolerance: float = quantity(
         2e-6, "a node this close to an obstacle touches it", unit="m", minimum=0.0, maximum=1e-3
     )
     residual_tolerance: float = quantity(
-        1e-5, "largest scaled residual with which a solution is accepted", minimum=1e-12, maximum=1e-2
+        1e-6, "largest scaled residual with which a solution is accepted", minimum=1e-12, maximum=1e-2
     )
 
     def check(self) -> None:
@@ -68,30 +143,91 @@ class ThreadModelSettings(Configuration):
 
         A segment could lie across such an obstacle with both of its nodes outside.
         """
-        for disc in self.discs():
-            least = 0.5 * self.length / self.segments
+        least = 0.5 * self.length / self.segments
+        for disc in self._discs():
             if disc.radius < least:
                 name, words = f"{self.GROUP}.disc_obstacles", "as every third number a radius of at least"
                 raise ConfigurationError(name, disc.radius, f"{words} {least:g} m, half of a segment")
+        for index, polygon in enumerate(self._polygons()):
+            if not polygon.has_room_for(least):
+                name, words = f"{self.GROUP}.polygon_obstacles", "polygons with room for a disc of a radius of at least"
+                raise ConfigurationError(name, f"polygon {index}", f"{words} {least:g} m, half of a segment")
         diameter = MATERIALS[self.material].diameter
         if self.length / self.segments <= diameter:
             most = math.ceil(self.length / diameter) - 1
             raise ConfigurationError(
                 f"{self.GROUP}.segments", self.segments, f"at most {most}, so that a segment is longer than thick"
             )
+        for node in self.held_nodes:
+            if node > self.segments:
+                raise ConfigurationError(f"{self.GROUP}.held_nodes", node, f"nodes from 1 to {self.segments}")
 
-    def discs(self) -> tuple[Disc, ...]:
-        """Return the round obstacles."""
+    def obstacles(self) -> tuple[Disc | Polygon, ...]:
+        """Return all obstacles: the discs, then the polygons, in the order in which margins number them."""
+        return (*self._discs(), *self._polygons())
+
+    def _discs(self) -> tuple[Disc, ...]:
         values = self.disc_obstacles
         return tuple(Disc(values[k : k + 2], values[k + 2]) for k in range(0, len(values), 3))
 
+    def _polygons(self) -> tuple[Polygon, ...]:
+        name, corners = f"{self.GROUP}.polygon_sizes", len(self.polygon_obstacles) // 2
+        if sum(abs(size) for size in self.polygon_sizes) != corners:
+            raise ConfigurationError(name, list(self.polygon_sizes), f"sizes that add up to {corners} corners")
+        shapes: list[list[tuple[tuple[float, float], ...]]] = []
+        begin = 0
+        for size in self.polygon_sizes:
+            end = begin + 2 * abs(size)
+            values = self.polygon_obstacles[begin:end]
+            ring = tuple(zip(values[::2], values[1::2], strict=True))
+            if size > 0:
+                shapes.append([ring])
+            elif shapes:
+                shapes[-1].append(ring)
+            else:
+                raise ConfigurationError(name, list(self.polygon_sizes), "an outline before its holes")
+            begin = end
+        polygons = []
+        for index, rings in enumerate(shapes):
+            try:
+                polygon = Polygon(rings[0], tuple(rings[1:]))
+                if self.corner_radius > 0.0:
+                    polygon = polygon.smoothed(self.corner_radius, self.corner_angle)
+                triangulate(polygon)
+            except ConfigurationError as error:
+                where = f"{self.GROUP}.polygon_obstacles, {error.name.replace('polygon', f'polygon {index}', 1)}"
+                raise ConfigurationError(where, error.value, error.expectation) from None
+            polygons.append(polygon)
+        return tuple(polygons)
+
     def thread(self) -> Thread:
         """Return the thread."""
-        return Thread.of(
+        thread = Thread.of(
             MATERIALS[self.material],
             length=self.length,
             segments=self.segments,
             attachment=Attachment(self.attachment),
             viscosity=self.viscosity,
             wetted_fraction=self.wetted_fraction,
+            rest_curvature=self.rest_curvature,
         )
+        if self.medium == "air":
+            air = Medium.air(self.mass_per_length, self.gravity[:2], self.air_drag, self.bending_damping)
+            return replace(thread, medium=air)
+        return thread
+
+    def predictor(self) -> ThreadPredictor:
+        """Return a predictor of this thread among these obstacles, its kernels compiled.
+
+        Raises:
+            ConfigurationError: an obstacle cannot be used; the message says why.
+        """
+        thread, surroundings = self.thread(), Surroundings(self.obstacles(), self.margin_range)
+        tolerance = self.residual_tolerance
+        paper = PaperOptions.tuned(MATERIALS[self.material].stiffness_weight)
+        formulation = make_formulation(
+            self.formulation, thread, surroundings, make_solver(self.solver, tolerance), tolerance, paper
+        )
+        predictor = ThreadPredictor(formulation, thread, longest_step=self.longest_step, held=self.held_nodes)
+        predictor.warm_up()
+        return predictor

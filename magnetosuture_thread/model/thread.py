@@ -6,6 +6,11 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.model.medium import Medium
+
 
 @dataclass(frozen=True)
 class Material:
@@ -16,12 +21,15 @@ class Material:
         diameter: [m]
         elastic_modulus: effective modulus in bending [Pa].
         source: where the numbers come from.
+        stiffness_weight: W_stiff of the formulation `paper`, which has no stiffness in N m^2; tuned on the
+            reference set, see README.
     """
 
     name: str
     diameter: float
     elastic_modulus: float
     source: str
+    stiffness_weight: float = 1.0
 
 
 _REFERENCE_SET = "as in the reference trajectories; USP size and a handbook modulus, not measured on a sample"
@@ -29,8 +37,8 @@ _REFERENCE_SET = "as in the reference trajectories; USP size and a handbook modu
 MATERIALS = {
     material.name: material
     for material in (
-        Material("polyamide_7_0", diameter=60e-6, elastic_modulus=2.0e9, source=_REFERENCE_SET),
-        Material("silk_6_0", diameter=85e-6, elastic_modulus=0.1e9, source=_REFERENCE_SET),
+        Material("polyamide_7_0", 60e-6, 2.0e9, _REFERENCE_SET, stiffness_weight=0.01),
+        Material("silk_6_0", 85e-6, 0.1e9, _REFERENCE_SET, stiffness_weight=100.0),
     )
 }
 
@@ -44,7 +52,7 @@ class Attachment(Enum):
 
 @dataclass(frozen=True)
 class Thread:
-    """One thread of n equal segments in a viscous medium.
+    """One thread of n equal segments in a medium.
 
     Attributes:
         material: name of its material.
@@ -52,9 +60,12 @@ class Thread:
         segments: n; the thread has n + 1 vertices, vertex 0 at the needle's tail.
         diameter: [m]
         bending_stiffness: EI [N m^2].
-        drag_across: zeta_perp, drag per length and speed across the thread [Pa s].
-        drag_along: zeta_par, the same along the thread [Pa s].
+        medium: what it moves in.
         attachment: how it is fixed to the needle.
+        rest_curvature: the curvature that it keeps in memory and goes back to, one for all of it or one
+            for each of the n - 1 inner nodes [1/m]; in the plane positive to the left, seen from the needle
+            along the thread; in space, where nothing keeps the thread from turning about its own axis, its
+            size.
     """
 
     material: str
@@ -62,14 +73,19 @@ class Thread:
     segments: int
     diameter: float
     bending_stiffness: float
-    drag_across: float
-    drag_along: float
+    medium: Medium
     attachment: Attachment
+    rest_curvature: float | tuple[float, ...] = 0.0
 
     @property
     def segment_length(self) -> float:
         """Rest length of a segment, D = L / n [m]."""
         return self.length / self.segments
+
+    @property
+    def rest_turns(self) -> NDArray[np.float64]:
+        """Angle by which the thread at rest turns at each inner node, D kappa_i, shape (n - 1,) [rad]."""
+        return self.segment_length * np.broadcast_to(np.asarray(self.rest_curvature, dtype=float), self.segments - 1)
 
     @classmethod
     def of(
@@ -81,13 +97,13 @@ class Thread:
         attachment: Attachment,
         viscosity: float = 1.0,
         wetted_fraction: float = 0.5,
+        rest_curvature: float | tuple[float, ...] = 0.0,
     ) -> Thread:
         """Make a thread of a material that floats in a viscous liquid.
 
-        Bending stiffness of a round section and slender-body drag:
+        Bending stiffness of a round section:
 
-            EI        = E pi d^4 / 64
-            zeta_perp = f 4 pi mu / ln(2 L / d),    zeta_par = zeta_perp / 2
+            EI = E pi d^4 / 64
 
         Args:
             material: the material.
@@ -97,18 +113,18 @@ class Thread:
             viscosity: mu of the liquid [Pa s]; glycerin at room temperature is about 1.
             wetted_fraction: f, the part of the thread's surface that the liquid touches; half for a
                 thread that floats.
+            rest_curvature: see the attributes.
 
-        Source: slender-body theory, leading order in 1 / ln(2 L / d). Deviation: none; the paper has
-        no physical drag, only the damping kappa.
+        Source: Euler-Bernoulli beam; drag as `Medium.liquid`. Deviation: the paper has no physical
+        stiffness, only the weight W_stiff.
         """
-        drag_across = wetted_fraction * 4.0 * math.pi * viscosity / math.log(2.0 * length / material.diameter)
         return cls(
             material=material.name,
             length=length,
             segments=segments,
             diameter=material.diameter,
             bending_stiffness=material.elastic_modulus * math.pi * material.diameter**4 / 64.0,
-            drag_across=drag_across,
-            drag_along=0.5 * drag_across,
+            medium=Medium.liquid(viscosity, length, material.diameter, wetted_fraction),
             attachment=attachment,
+            rest_curvature=rest_curvature,
         )

@@ -15,7 +15,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.coils.allocation import Allocation
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, triangulate
 from magnetosuture_thread.interface import DISH_FRAME
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction
 
@@ -184,14 +184,22 @@ def thread_markers(stamp: Time, prediction: Prediction, diameter: float) -> Mark
     return MarkerArray(markers=[line])
 
 
-def obstacle_markers(stamp: Time, discs: Sequence[Disc]) -> MarkerArray:
-    """Return the obstacles as flat cylinders."""
+def obstacle_markers(stamp: Time, obstacles: Sequence[Obstacle]) -> MarkerArray:
+    """Return the obstacles: discs as flat cylinders, polygons as their triangles."""
     markers = []
-    for index, disc in enumerate(discs):
-        marker = Marker(header=header(stamp), ns="obstacles", id=index, type=Marker.CYLINDER, action=Marker.ADD)
-        marker.pose = _pose(np.asarray(disc.centre), 0.0)
-        marker.scale = Vector3(x=2.0 * disc.radius, y=2.0 * disc.radius, z=1e-3)
+    for index, obstacle in enumerate(obstacles):
+        marker = Marker(header=header(stamp), ns="obstacles", id=index, action=Marker.ADD)
         marker.color = ColorRGBA(r=0.85, g=0.65, b=0.6, a=0.8)
+        if isinstance(obstacle, Disc):
+            marker.type = Marker.CYLINDER
+            marker.pose = _pose(np.asarray(obstacle.centre), 0.0)
+            marker.scale = Vector3(x=2.0 * obstacle.radius, y=2.0 * obstacle.radius, z=1e-3)
+        elif isinstance(obstacle, Polygon):
+            shape = triangulate(obstacle)
+            marker.type = Marker.TRIANGLE_LIST
+            marker.pose = _pose(np.zeros(2), 0.0)
+            marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
+            marker.points = _points(shape.vertices[shape.triangles].reshape(-1, 2))
         markers.append(marker)
     return MarkerArray(markers=markers)
 

@@ -21,6 +21,10 @@ _TYPES = {
 }
 
 
+def _type(about: Described) -> Parameter.Type:
+    return Parameter.Type.INTEGER_ARRAY if about.kind is tuple and about.entry is int else _TYPES[about.kind]
+
+
 def declare(node: Node, cls: type[C]) -> C:
     """Declare every field of a configuration class, read-only, and return the settings in force.
 
@@ -41,7 +45,7 @@ def declare(node: Node, cls: type[C]) -> C:
     for about in described(cls):
         if about.name in given:
             node.undeclare_parameter(about.name)
-        parameter = Parameter(about.name, _TYPES[about.kind], values[about.name])
+        parameter = Parameter(about.name, _type(about), values[about.name])
         node.declare_parameter(about.name, parameter.value, _descriptor(about), ignore_override=True)
     return settings
 
@@ -55,7 +59,7 @@ def _descriptor(about: Described) -> ParameterDescriptor:
     quantity = about.quantity
     descriptor = ParameterDescriptor(
         name=about.name,
-        type=_TYPES[about.kind].value,
+        type=_type(about).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
         additional_constraints=quantity.expectation(about.kind),
         read_only=True,

@@ -13,7 +13,8 @@ from nav_msgs.msg import Path
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
+from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
@@ -31,12 +32,7 @@ class ThreadModelNode(Node):
         super().__init__("thread_model", automatically_declare_parameters_from_overrides=True, **options)
         self._settings = declare(self, ThreadModelSettings)
         self._thread = self._settings.thread()
-        self._predictor = ThreadPredictor(
-            self._thread,
-            self._settings.discs(),
-            longest_step=self._settings.longest_step,
-            tolerance=self._settings.residual_tolerance,
-        )
+        self._predictor = self._settings.predictor()
         self._health = Health(self)
         self._seen: tuple[float, np.ndarray] | None = None
         self._early: deque[PoseStamped] = deque(maxlen=EARLY)
@@ -45,7 +41,7 @@ class ThreadModelNode(Node):
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         obstacles = topics.OBSTACLE_MARKERS.publisher(self)
-        obstacles.publish(messages.obstacle_markers(self.get_clock().now().to_msg(), self._settings.discs()))
+        obstacles.publish(messages.obstacle_markers(self.get_clock().now().to_msg(), self._settings.obstacles()))
         topics.SEEN_THREAD.subscribe(self, self.on_seen_thread)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
         self._health.warn("no needle pose yet")
@@ -117,7 +113,11 @@ class ThreadModelNode(Node):
         self._predicted.publish(messages.prediction_message(stamp, prediction, settings.material, step_time))
         self._margins.publish(messages.margins_message(stamp, prediction, settings.contact_tolerance))
         self._markers.publish(messages.thread_markers(stamp, prediction, self._thread.diameter))
-        self._health.ok("predicting", residual=f"{prediction.residual:.1e}", step_time=f"{step_time:.4f} s")
+        figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
+        if prediction.status in (SOLVED, STARTED):
+            self._health.ok("predicting", **figures)
+        else:
+            self._health.warn(f"predicting, but {prediction.status}", **figures)
 
 
 def main(arguments: list[str] | None = None) -> int:

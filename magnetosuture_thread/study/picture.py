@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.study.replayed import Instant, Summary
 
 INK, FAINT = "#22303c", "#7b8794"
@@ -35,7 +36,7 @@ def draw_summary(
     view: DishView,
     chosen: Instant,
     instants: list[Instant],
-    discs: tuple[Disc, ...],
+    obstacles: Sequence[Obstacle],
     start: int,
     summary: Summary,
 ) -> None:
@@ -47,7 +48,7 @@ def draw_summary(
         view: where the dish is in it.
         chosen: the instant to show.
         instants: all predicted frames, by time.
-        discs: round obstacles [m].
+        obstacles: discs and polygons [m].
         start: of the bag [ns].
         summary: the figures.
     """
@@ -55,8 +56,8 @@ def draw_summary(
     times = np.array([(instant.stamp - start) * 1e-9 for instant in instants])
     at = (chosen.stamp - start) * 1e-9
     scene = figure.add_axes((0.015, 0.115, 0.44, 0.775))
-    line = _draw_frame(scene, frame, view, chosen, discs)
-    _draw_close_up(scene, frame, view, chosen, discs)
+    line = _draw_frame(scene, frame, view, chosen, obstacles)
+    _draw_close_up(scene, frame, view, chosen, obstacles)
     _draw_colours(figure, line)
     figure.text(
         0.015,
@@ -73,7 +74,7 @@ def draw_summary(
     _draw_stretch(plots[2], times, instants)
     for axes in plots:
         axes.axvline(at, color=FAINT, linewidth=0.9, linestyle=(0, (2, 2)), zorder=0)
-        _tidy(axes)
+        tidy(axes)
     plots[2].set_xlim(times[0], times[-1])
     plots[2].set_xlabel("time since the bag's start [s]", color=INK)
     figure.text(0.015, 0.938, _title(summary), fontsize=12, color=INK, linespacing=1.4)
@@ -88,10 +89,10 @@ def _title(summary: Summary) -> str:
 
 
 def _draw_frame(
-    axes: Axes, frame: NDArray[np.uint8], view: DishView, chosen: Instant, discs: tuple[Disc, ...]
+    axes: Axes, frame: NDArray[np.uint8], view: DishView, chosen: Instant, obstacles: Sequence[Obstacle]
 ) -> LineCollection:
     """Draw the dish, filling the axes, and return the predicted thread's line."""
-    line = _draw_threads(axes, frame, view, chosen, discs, magnified=1.0)
+    line = _draw_threads(axes, frame, view, chosen, obstacles, magnified=1.0)
     if len(chosen.tail):
         _draw_heading(axes, view, chosen)
     height, width = frame.shape[:2]
@@ -108,16 +109,26 @@ def _draw_frame(
 
 
 def _draw_threads(
-    axes: Axes, frame: NDArray[np.uint8], view: DishView, chosen: Instant, discs: tuple[Disc, ...], magnified: float
+    axes: Axes,
+    frame: NDArray[np.uint8],
+    view: DishView,
+    chosen: Instant,
+    obstacles: Sequence[Obstacle],
+    magnified: float,
 ) -> LineCollection:
     """Draw frame, obstacles, seen and predicted thread."""
     axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
     axes.set_xticks([])
     axes.set_yticks([])
-    for disc in discs:
-        centre = view.to_pixels(np.asarray(disc.centre))
-        radius = disc.radius / view.metres_per_pixel
-        axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, color=INK, linewidth=0.9))
+    for obstacle in obstacles:
+        if isinstance(obstacle, Disc):
+            centre = view.to_pixels(np.asarray(obstacle.centre))
+            radius = obstacle.radius / view.metres_per_pixel
+            axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, color=INK, linewidth=0.9))
+        elif isinstance(obstacle, Polygon):
+            for ring in obstacle.rings:
+                corners = view.to_pixels(np.vstack([ring, ring[:1]]))
+                axes.plot(corners[:, 0], corners[:, 1], color=INK, linewidth=0.9)
     if len(chosen.seen) > 1:
         seen = view.to_pixels(chosen.seen)
         axes.plot(seen[:, 0], seen[:, 1], color=SEEN, linewidth=5.0 * magnified, alpha=0.45, solid_capstyle="round")
@@ -135,7 +146,7 @@ def _draw_threads(
 
 
 def _draw_close_up(
-    scene: Axes, frame: NDArray[np.uint8], view: DishView, chosen: Instant, discs: tuple[Disc, ...]
+    scene: Axes, frame: NDArray[np.uint8], view: DishView, chosen: Instant, obstacles: Sequence[Obstacle]
 ) -> None:
     """Draw the surroundings of the node nearest to an obstacle, or of the thread's end, magnified."""
     vertices = view.to_pixels(chosen.vertices)
@@ -152,7 +163,7 @@ def _draw_close_up(
     inset = scene.inset_axes(
         (x + 0.01 * (x == 0.0) - 0.01 * (x > 0), y + 0.01 * (y == 0.0) - 0.01 * (y > 0), 0.38, 0.38)
     )
-    _draw_threads(inset, frame, view, chosen, discs, magnified=1.8)
+    _draw_threads(inset, frame, view, chosen, obstacles, magnified=1.8)
     inset.set_xlim(centre[0] - half, centre[0] + half)
     inset.set_ylim(centre[1] + half, centre[1] - half)
     for side in inset.spines.values():
@@ -197,7 +208,7 @@ def _draw_clearance(axes: Axes, times: NDArray[np.float64], instants: list[Insta
     clearance = np.array([i.least.get("obstacle", np.nan) for i in instants]) * 1e3
     axes.set_title("least distance of a node from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
     if not np.isfinite(clearance).any():
-        axes.text(0.5, 0.5, "no obstacle in this set-up", transform=axes.transAxes, ha="center", color=FAINT)
+        axes.text(0.5, 0.5, "no obstacle near the thread", transform=axes.transAxes, ha="center", color=FAINT)
         return
     axes.plot(times, clearance, color="#1f9d55", linewidth=1.4)
     top = max(1.05 * float(np.nanmax(clearance)), 1e-3)
@@ -213,7 +224,8 @@ def _draw_stretch(axes: Axes, times: NDArray[np.float64], instants: list[Instant
     axes.set_title("greatest stretch or compression of a segment [%]", fontsize=9.5, color=INK, loc="left")
 
 
-def _tidy(axes: Axes) -> None:
+def tidy(axes: Axes) -> None:
+    """Give a plot the look of all of ours."""
     axes.grid(True, color="#e4e8ec", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8.5, colors=INK, length=3)

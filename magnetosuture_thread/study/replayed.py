@@ -23,7 +23,8 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.study.score import prediction_error_percent
 
-KINDS = ("connectivity", "compression", "obstacle")  # by the number in the message BarrierMargin
+# By the number in the message BarrierMargin.
+KINDS = ("connectivity", "compression", "obstacle", "enhanced_connectivity", "stiffness")
 
 
 @dataclass(frozen=True)

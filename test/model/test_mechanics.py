@@ -1,55 +1,162 @@
-"""Drag and bending."""
+"""Metric, bending, chords and tension."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from magnetosuture_thread.model.mechanics import bending_bands, bending_gradient, drag_metric
+from magnetosuture_thread.model import mechanics
 
 
-def energy(positions: np.ndarray, heading: np.ndarray | None) -> float:
+def energy(positions: np.ndarray, heading: np.ndarray, glued: bool) -> float:
     """Return the bending energy over EI / D, straight from its formula."""
-    bend = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
-    glue = 0.0 if heading is None else float(((positions[1] - positions[0] + heading) ** 2).sum())
-    return 0.5 * float((bend**2).sum()) + glue
+    turns = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
+    first = 2.0 * (positions[1] - positions[0] + heading) if glued else np.zeros(positions.shape[1])
+    every = np.vstack([first, turns, np.zeros_like(first)])
+    slopes = (np.diff(every, axis=0) ** 2).sum(axis=1)
+    slopes[0] *= 1.5 if glued else 1.0
+    return 0.5 * float((turns**2).sum()) + 0.25 * float((first**2).sum()) + float(slopes.sum()) / 12.0
+
+
+def gradient_of(positions: np.ndarray, heading: np.ndarray, glued: bool, rest: np.ndarray | None = None) -> np.ndarray:
+    """Return the compiled gradient."""
+    rest = np.zeros(len(positions) - 2) if rest is None else rest
+    gradient = np.empty_like(positions)
+    mechanics.bending_gradient(positions, heading, glued, rest, np.empty((2, *positions.shape)), gradient)
+    return gradient
+
+
+def full(bands: np.ndarray) -> np.ndarray:
+    """Return a symmetric matrix from its bands."""
+    nodes = bands.shape[1]
+    matrix = np.diag(bands[0])
+    for apart in range(1, 4):
+        band = bands[apart, : nodes - apart]
+        matrix += np.diag(band, apart) + np.diag(band, -apart)
+    return matrix
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("glued", [False, True])
 def test_gradient_and_hessian_are_those_of_the_energy(dimension: int, glued: bool):
     random = np.random.default_rng(0)
-    positions = random.normal(size=(8, dimension))
-    heading = random.normal(size=dimension) if glued else None
-    gradient = bending_gradient(positions, heading)
-    diagonal, first, second = bending_bands(7, glued)
-    hessian = np.diag(diagonal) + sum(np.diag(band, k) + np.diag(band, -k) for k, band in ((1, first), (2, second)))
+    positions, heading = random.normal(size=(8, dimension)), random.normal(size=dimension)
+    gradient = gradient_of(positions, heading, glued)
+    hessian = full(mechanics.bending_bands(7, glued))
     for node in range(8):
         for axis in range(dimension):
             step = np.zeros_like(positions)
             step[node, axis] = 1e-5
-            slope = (energy(positions + step, heading) - energy(positions - step, heading)) / 2e-5
+            slope = (energy(positions + step, heading, glued) - energy(positions - step, heading, glued)) / 2e-5
             assert gradient[node, axis] == pytest.approx(slope, abs=1e-8)
-            change = (bending_gradient(positions + step, heading) - bending_gradient(positions - step, heading)) / 2e-5
-            np.testing.assert_allclose(change[:, axis], hessian[:, node], atol=1e-8)
+            ahead, behind = (gradient_of(positions + s * step, heading, glued) for s in (1.0, -1.0))
+            np.testing.assert_allclose((ahead - behind)[:, axis] / 2e-5, hessian[:, node], atol=1e-8)
 
 
-def test_a_straight_thread_has_no_bending_force():
-    positions = np.arange(6.0)[:, None] * np.array([0.6, 0.8])
-    np.testing.assert_allclose(bending_gradient(positions, None), 0.0, atol=1e-14)
-    np.testing.assert_allclose(bending_gradient(positions, -np.array([0.6, 0.8])), 0.0, atol=1e-14)
+def cantilever_error(segments: int) -> float:
+    """Return the relative error of the end of a clamped beam under an even load, by the bands alone."""
+    hessian = full(mechanics.bending_bands(segments, True))[1:, 1:] * segments**3
+    load = mechanics.end_corrected_weights(segments)[1:] / segments
+    return abs(8.0 * float(np.linalg.solve(hessian, load)[-1]) - 1.0)
 
 
-def test_drag_is_half_along_the_thread_and_half_at_its_end():
-    positions = np.column_stack([np.arange(4.0), np.zeros(4)])
-    metric = drag_metric(positions, 0.5)
+def test_a_cantilever_bends_as_beam_theory_says_to_high_order():
+    """The end of a clamped beam under the load q sinks by q L^4 / (8 EI)."""
+    assert cantilever_error(25) < 1e-6
+    assert cantilever_error(10) / cantilever_error(20) > 12.0  # fourth order
+
+
+def arc(segments: int, turn: float) -> np.ndarray:
+    """Return a chain of arcs of unit length that turns by an angle at each node, to the left."""
+    angles = turn * (np.arange(segments) + 0.5)
+    chord = 2.0 * np.sin(0.5 * turn) / turn
+    steps = chord * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+
+
+def test_a_thread_in_its_rest_shape_has_no_bending_force():
+    straight = np.arange(6.0)[:, None] * np.array([0.6, 0.8])
+    for glued in (False, True):
+        np.testing.assert_allclose(gradient_of(straight, -np.array([0.6, 0.8]), glued), 0.0, atol=1e-14)
+    bent = arc(12, 0.1)
+    at_rest = gradient_of(bent, np.zeros(2), False, np.full(11, 0.1))
+    assert np.abs(at_rest).max() < 0.02 * np.abs(gradient_of(bent, np.zeros(2), False)).max()
+    wrong_way = gradient_of(bent, np.zeros(2), False, np.full(11, -0.1))
+    assert np.abs(wrong_way).max() > 1.9 * np.abs(gradient_of(bent, np.zeros(2), False)).max()
+
+
+def test_in_space_the_rest_shape_may_lie_any_way():
+    bent = np.column_stack([arc(12, 0.1), np.zeros(13)])
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    rest, nothing = np.full(11, 0.1), np.zeros(3)
+    flat, turned = gradient_of(bent, nothing, False, rest), gradient_of(bent @ turn.T, nothing, False, rest)
+    np.testing.assert_allclose(flat @ turn.T, turned, atol=1e-13)
+    np.testing.assert_allclose(flat[:, :2], gradient_of(bent[:, :2].copy(), np.zeros(2), False, rest), atol=1e-13)
+
+
+@pytest.mark.parametrize("turn", [0.05, 0.2, 0.4])
+def test_a_chord_is_shorter_than_its_arc(turn: float):
+    chords = np.empty(30)
+    mechanics.chord_lengths(arc(30, turn), np.zeros(2), False, chords)
+    assert chords[10] == pytest.approx(2.0 * np.sin(0.5 * turn) / turn, abs=turn**4 / 20.0)
+
+
+def test_a_kink_between_straight_segments_shortens_none():
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [2.0, 1.0], [2.0, 2.0]])
+    chords = np.empty(4)
+    mechanics.chord_lengths(corner, np.zeros(2), False, chords)
+    np.testing.assert_array_equal(chords, 1.0)
+
+
+def metric_of(positions: np.ndarray, along: float = 0.5, inertia: float = 0.0) -> np.ndarray:
+    """Return the compiled metric."""
+    nodes, dimension = positions.shape
+    blocks = np.empty((nodes, dimension, dimension))
+    mechanics.metric(positions, mechanics.end_corrected_weights(nodes - 1), inertia, 1.0, along, blocks)
+    return blocks
+
+
+def test_drag_is_half_along_the_thread_and_less_than_half_at_its_end():
+    metric = metric_of(np.column_stack([np.arange(5.0), np.zeros(5)]))
     np.testing.assert_allclose(metric[1], np.diag([0.5, 1.0]))
-    np.testing.assert_allclose(metric[3], np.diag([0.25, 0.5]))
+    np.testing.assert_allclose(metric[3], 13.0 / 12.0 * np.diag([0.5, 1.0]))
+    np.testing.assert_allclose(metric[4], 5.0 / 12.0 * np.diag([0.5, 1.0]))
+    np.testing.assert_allclose(metric.sum(axis=0), 4.0 * np.diag([0.5, 1.0]))
 
 
 def test_drag_turns_with_the_thread():
     positions = np.random.default_rng(2).normal(size=(5, 2))
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    np.testing.assert_allclose(
-        drag_metric(positions @ turn.T, 0.5), turn @ drag_metric(positions, 0.5) @ turn.T, atol=1e-14
-    )
+    np.testing.assert_allclose(metric_of(positions @ turn.T), turn @ metric_of(positions) @ turn.T, atol=1e-14)
+
+
+def test_a_folded_thread_has_a_drag():
+    """Its node has no tangent."""
+    metric = metric_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]))
+    np.testing.assert_allclose(metric[1], np.eye(2))
+
+
+@pytest.mark.parametrize("glued", [False, True])
+def test_tension_is_the_slope_of_its_energy(glued: bool):
+    random = np.random.default_rng(4)
+    positions = np.cumsum(random.normal(size=(7, 2)) * 0.1 + [1.0, 0.0], axis=0)
+    heading, tension, interval = np.array([-1.0, 0.1]), random.uniform(1.0, 2.0, 6), 0.3
+
+    def stretched(at: np.ndarray) -> float:
+        chords = np.empty(6)
+        mechanics.chord_lengths(at, heading, glued, chords)
+        return float(-(tension * chords).sum())
+
+    blocks, couplings, linear = np.zeros((7, 2, 2)), np.zeros((3, 7)), np.zeros((7, 2))
+    mechanics.tension_stiffness(positions, heading, glued, tension, -1.0, interval, (blocks, couplings, linear))
+    for node in range(7):
+        step = np.zeros_like(positions)
+        step[node, 1] = 1e-6
+        slope = (stretched(positions + step) - stretched(positions - step)) / 2e-6
+        # -sum T chord has the slope of the energy where the turns are resolved.
+        assert linear[node, 1] == pytest.approx(slope, abs=2e-3)
+    hessian = np.vstack([np.diag(blocks[:, 0, 0]), np.zeros((0, 7))])
+    for apart in range(1, 4):
+        hessian += np.diag(couplings[apart - 1, :-apart], apart) + np.diag(couplings[apart - 1, :-apart], -apart)
+    assert np.linalg.eigvalsh(hessian).min() > -1e-12
+    np.testing.assert_allclose(hessian.sum(axis=1)[2:], 0.0, atol=1e-12)

@@ -1,63 +1,116 @@
-"""The program and its residual."""
+"""The program, its form for general solvers, and its residuals."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 
-from magnetosuture_thread.model.program import QuadraticProgram, SparsePattern, optimality_residual
+from magnetosuture_thread.model.program import ChainProgram, Residuals, as_quadratic_program, residuals_of
 
 
-def small_program() -> QuadraticProgram:
+def random_program(seed: int, nodes: int = 9, dimension: int = 2, soft: bool = False) -> ChainProgram:
+    """Return a feasible program with segments that are equations and contacts that are bounds."""
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(nodes, dimension, dimension))
+    blocks = root @ root.transpose(0, 2, 1) + 8.0 * np.eye(dimension)
+    couplings = random.uniform(-1.0, 1.0, (3, nodes))
+    rows = 2 * nodes
+    gradient = random.normal(size=(rows, 3, dimension))
+    gradient[nodes:, 1:] = 0.0
+    first = np.concatenate([np.arange(nodes), random.permutation(nodes)]).clip(0, nodes - 3)
+    inside = random.normal(size=(nodes, dimension))
+    known = np.arange(nodes) % 7 == 0
+    inside[known] = 0.0
+    image = np.einsum("rkd,rkd->r", gradient, inside[first[:, None] + np.arange(3)])
+    lower, upper = image - random.uniform(0.0, 1.0, rows), np.full(rows, np.inf)
+    lower[:3] = upper[:3] = image[:3]
+    upper[3:6] = image[3:6] + 0.1
+    compliance = np.where(np.arange(rows) % 2 == 0, 1e-3, 0.0) if soft else np.zeros(rows)
+    linear = 10.0 * random.normal(size=(nodes, dimension))
+    return ChainProgram(blocks, couplings, linear, known, first, gradient, lower, upper, compliance)
+
+
+def one_node(compliance: float = 0.0) -> ChainProgram:
     """Return: minimise x^2 + y^2 - 2 x - 4 y with x + y <= 1 and x >= 0; solved by x = 0, y = 1."""
-    return QuadraticProgram(
-        P=sp.csc_matrix(np.diag([2.0, 2.0])),
-        q=np.array([-2.0, -4.0]),
-        A=sp.csc_matrix(np.array([[1.0, 1.0], [1.0, 0.0]])),
+    gradient = np.zeros((2, 3, 2))
+    gradient[0, 0], gradient[1, 0] = (1.0, 1.0), (1.0, 0.0)
+    return ChainProgram(
+        blocks=np.tile(2.0 * np.eye(2), (3, 1, 1)),
+        couplings=np.zeros((3, 3)),
+        linear=np.array([[-2.0, -4.0], [0.0, 0.0], [0.0, 0.0]]),
+        known=np.array([False, True, True]),
+        first=np.zeros(2, dtype=np.int64),
+        gradient=gradient,
         lower=np.array([-np.inf, 0.0]),
         upper=np.array([1.0, np.inf]),
+        compliance=np.full(2, compliance),
     )
 
 
-def test_a_pattern_adds_up_what_falls_on_one_place():
-    rows, columns = np.array([0, 2, 0, 1]), np.array([1, 0, 1, 1])
-    pattern = SparsePattern(rows, columns, (3, 2))
-    for seed in range(3):
-        entries = np.random.default_rng(seed).normal(size=4)
-        expected = sp.coo_matrix((entries, (rows, columns)), shape=(3, 2)).toarray()
-        np.testing.assert_allclose(pattern.matrix(entries).toarray(), expected)
-    assert pattern.matrix(np.ones(4)).has_sorted_indices
+def at(x: float, y: float) -> np.ndarray:
+    """Return velocities of the one node."""
+    return np.array([[x, y], [0.0, 0.0], [0.0, 0.0]])
 
 
-def test_the_residual_vanishes_at_the_solution():
-    assert optimality_residual(small_program(), np.array([0.0, 1.0]), np.array([2.0, 0.0])) < 1e-15
+def test_the_residuals_vanish_at_the_solution():
+    assert residuals_of(one_node(), at(0.0, 1.0), np.array([-2.0, 0.0])).largest < 1e-15
 
 
-def test_a_far_bound_does_not_make_light_of_the_others():
-    near = small_program()
-    far = QuadraticProgram(
-        near.P,
-        near.q,
-        sp.csc_matrix(np.vstack([near.A.toarray(), [0.0, 1.0]])),
-        np.append(near.lower, -1e5),
-        np.append(near.upper, np.inf),
-    )
-    outside = np.array([0.1, 1.0])
-    expected = optimality_residual(near, outside, np.array([2.0, 0.0]))
-    assert optimality_residual(far, outside, np.array([2.0, 0.0, 0.0])) == pytest.approx(expected)
+def test_a_soft_row_gives_way_by_its_compliance():
+    """With c = 1/2 the first row is x + y - l / 2 <= 1; the balance 2 x - 2 = 2 y - 4 = -l gives l = 4/3."""
+    solution = at(1.0 / 3.0, 4.0 / 3.0)
+    assert residuals_of(one_node(0.5), solution, np.array([-4.0 / 3.0, 0.0])).largest < 1e-15
+    assert residuals_of(one_node(0.0), solution, np.array([-4.0 / 3.0, 0.0])).primal > 0.3
 
 
 @pytest.mark.parametrize(
-    ("u", "multipliers"),
+    ("u", "multipliers", "which"),
     [
-        ([0.1, 1.0], [2.0, 0.0]),  # outside
-        ([-0.1, 1.1], [2.0, 0.0]),  # outside of the other
-        ([0.0, 1.0], [1.0, 0.0]),  # forces out of balance
-        ([0.0, 0.5], [3.0, -1.0]),  # pushes without touching
-        ([float("nan"), 1.0], [2.0, 0.0]),
-        ([0.0, 1.0], [float("inf"), 0.0]),
+        (at(0.1, 1.0), [-2.0, 0.0], "primal"),  # outside
+        (at(-0.1, 1.1), [-2.0, 0.0], "primal"),  # outside of the other
+        (at(0.0, 1.0), [-1.0, 0.0], "dual"),  # forces out of balance
+        (at(0.0, 0.5), [-3.0, 1.0], "complementarity"),  # pushes without touching
+        (at(0.0, 1.0), [2.0, 0.0], "complementarity"),  # pushes on a bound that does not exist
+        (at(float("nan"), 1.0), [-2.0, 0.0], "primal"),
+        (at(0.0, 1.0), [float("inf"), 0.0], "primal"),
     ],
 )
-def test_the_residual_sees_every_fault(u: list[float], multipliers: list[float]):
-    assert optimality_residual(small_program(), np.array(u), np.array(multipliers)) > 0.03
+def test_the_residuals_see_every_fault(u: np.ndarray, multipliers: list[float], which: str):
+    assert getattr(residuals_of(one_node(), u, np.array(multipliers)), which) > 0.03
+
+
+def test_a_far_bound_does_not_make_light_of_the_others():
+    near = one_node()
+    far = near._replace(lower=np.array([-1e5, 0.0]))
+    outside, multipliers = at(0.1, 1.0), np.array([-2.0, 0.0])
+    assert residuals_of(near, outside, multipliers).primal == pytest.approx(0.1 / 1.1)
+    far = far._replace(upper=np.array([1e5, np.inf]), lower=np.array([-np.inf, 0.2]))
+    assert residuals_of(far, outside, np.zeros(2)).primal == pytest.approx(0.1)
+
+
+def test_the_worse_of_two_residuals_is_taken_one_by_one():
+    assert Residuals(1.0, 2.0, 3.0).or_worse(Residuals(3.0, 0.0, 4.0)) == Residuals(3.0, 2.0, 4.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("soft", [False, True])
+def test_both_forms_are_the_same_program(dimension: int, soft: bool):
+    program = random_program(1, dimension=dimension, soft=soft)
+    general = as_quadratic_program(program)
+    random = np.random.default_rng(5)
+    u = random.normal(size=program.linear.shape)
+    u[program.known] = 0.0
+    slack = random.normal(size=len(general.q) - len(general.unknown))
+    x = np.concatenate([u.ravel()[general.unknown], slack])
+    dense = general.P.toarray()
+    value = 0.5 * x @ (dense + dense.T - np.diag(np.diag(dense))) @ x + general.q @ x
+    nodes = len(u)
+    expected = 0.5 * float(slack @ slack) + float((program.linear * u).sum())
+    expected += 0.5 * float(np.einsum("iab,ia,ib->", program.blocks, u, u))
+    for apart in range(1, 4):
+        expected += float((program.couplings[apart - 1, : nodes - apart, None] * u[:-apart] * u[apart:]).sum())
+    assert value == pytest.approx(expected)
+    image = np.einsum("rkd,rkd->r", program.gradient, u[program.first[:, None] + np.arange(3)])
+    image[program.compliance > 0.0] += np.sqrt(program.compliance[program.compliance > 0.0]) * slack
+    np.testing.assert_allclose(general.A @ x, image, atol=1e-12)
+    assert (len(slack) > 0) == soft

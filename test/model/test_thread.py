@@ -18,6 +18,6 @@ from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 def test_stiffness_and_drag_are_those_of_the_reference_set(name: str, length: float, stiffness: float, drag: float):
     thread = Thread.of(MATERIALS[name], length=length, segments=25, attachment=Attachment.PINNED)
     assert thread.bending_stiffness == pytest.approx(stiffness, rel=1e-12)
-    assert thread.drag_across == pytest.approx(drag, rel=1e-12)
-    assert thread.drag_along == pytest.approx(0.5 * drag, rel=1e-12)
+    assert thread.medium.drag_across == pytest.approx(drag, rel=1e-12)
+    assert thread.medium.drag_along == pytest.approx(0.5 * drag, rel=1e-12)
     assert thread.segment_length == pytest.approx(length / 25)

@@ -62,7 +62,7 @@ def test_the_bags_and_the_graph_have_the_same_own_messages():
 def test_the_kinds_of_barrier_have_the_same_numbers_everywhere():
     constants = {
         name.removeprefix("KIND_").lower(): getattr(BarrierMargin, name)
-        for name in ("KIND_CONNECTIVITY", "KIND_COMPRESSION", "KIND_OBSTACLE")
+        for name in (f"KIND_{kind.name}" for kind in BarrierKind)
     }
     assert constants == {kind.name.lower(): int(kind) for kind in BarrierKind}
     assert constants == {name: number for number, name in enumerate(KINDS)}

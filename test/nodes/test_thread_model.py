@@ -12,6 +12,8 @@ from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
 from nav_msgs.msg import Path
 from visualization_msgs.msg import Marker
 
+from magnetosuture_thread.model import choices
+from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 
@@ -44,14 +46,14 @@ def test_the_thread_starts_where_it_is_seen_and_follows(graph):
     last = predicted[-1]
     assert last.header.frame_id == "dish"
     assert last.header.stamp == pose(1.0 + 10 / 30.0).header.stamp
-    assert (last.formulation, last.material, last.solver) == ("rod", "polyamide_7_0", "osqp")
+    assert (last.formulation, last.material, last.solver) == ("rod", "polyamide_7_0", "banded")
     assert len(last.vertices) == 26
     assert len(last.stretch) == 25
     assert last.vertices[0].x == pytest.approx(1e-3)
     assert last.vertices[25].x == pytest.approx(1e-3 - 0.019, abs=1e-6)
     assert max(abs(value) for value in last.stretch) < 1e-5
     assert 0.0 < last.residual < 1e-5
-    assert last.substeps == 3
+    assert last.substeps == 2
     assert last.interval == pytest.approx(1 / 30.0, abs=1e-6)
     assert 0.0 < last.step_time < 1.0
     graph.wait(lambda: len(margins) >= 11 and len(markers) >= 11, "margins and markers")
@@ -110,6 +112,57 @@ def test_obstacles_give_margins_contact_and_a_latched_marker(graph):
     assert least.node == 12
     assert least.clearance == pytest.approx(1e-6, abs=1e-9)
     assert obstacles[0].markers[0].scale.x == pytest.approx(0.004)
+
+
+def test_polygons_give_margins_and_are_shown_as_triangles(graph):
+    """A square with its edge 1 mm above the thread, its corners rounded."""
+    corners = [-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007]
+    graph.add(ThreadModelNode, polygon_obstacles=corners, polygon_sizes=[4], initial_shape="straight")
+    margins, obstacles = graph.listen(topics.MARGINS), graph.listen(topics.OBSTACLE_MARKERS)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: bool(margins and obstacles), "margins and obstacles")
+    least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_OBSTACLE)
+    assert least.clearance == pytest.approx(1e-3 - 30e-6, abs=1e-9)
+    marker = obstacles[0].markers[0]
+    assert marker.type == Marker.TRIANGLE_LIST
+    corner = np.array([[p.x, p.y] for p in marker.points]).reshape(-1, 3, 2)
+    sides = corner[:, 1:] - corner[:, :1]
+    area = 0.5 * np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum()
+    assert area == pytest.approx(36e-6, rel=1e-2)
+
+
+def test_the_papers_formulation_runs_in_the_graph(graph):
+    graph.add(ThreadModelNode, formulation="paper", initial_shape="straight")
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+    for k in range(3):
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, 1e-4 * k))
+    graph.wait(lambda: len(predicted) == 3 and len(margins) == 3, "predictions")
+    assert predicted[-1].formulation == "paper"
+    assert margins[-1].valid
+    assert {least.kind for least in margins[-1].least} == {
+        BarrierMargin.KIND_CONNECTIVITY,
+        BarrierMargin.KIND_ENHANCED_CONNECTIVITY,
+    }
+
+
+class LameSolver(BandedSolver):
+    """May take no step."""
+
+    def __init__(self) -> None:
+        super().__init__(iterations=0)
+
+
+def test_a_step_that_fell_back_is_published_and_said(graph, monkeypatch):
+    monkeypatch.setattr(choices, "BandedSolver", LameSolver)
+    graph.add(ThreadModelNode, initial_shape="straight")
+    predicted, diagnostics = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.publish(topics.NEEDLE_POSE, pose(1.03, 1e-4))
+    graph.wait(lambda: len(predicted) == 2, "a prediction")
+    assert predicted[1].solver == "osqp"
+    assert predicted[1].solver_status.startswith("solved, after banded: iteration limit")
+    assert predicted[1].residual < 1e-6
+    graph.wait(lambda: any("after banded" in d.status[0].message for d in diagnostics), "a warning")
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
 """Control barrier functions of the thread, a file for each kind."""
 
-from magnetosuture_thread.model.barriers.connectivity import Compression, Connectivity
-from magnetosuture_thread.model.barriers.obstacle import ObstacleAvoidance
+from magnetosuture_thread.model.barriers.connectivity import Compression, Connectivity, EnhancedConnectivity
+from magnetosuture_thread.model.barriers.obstacle import ObstacleAvoidance, SquaredObstacleAvoidance
 from magnetosuture_thread.model.barriers.rows import NO_OBSTACLE, Barrier, BarrierKind, BarrierRows
+from magnetosuture_thread.model.barriers.stiffness import Stiffness
 
 __all__ = [
     "NO_OBSTACLE",
@@ -11,5 +12,8 @@ __all__ = [
     "BarrierRows",
     "Compression",
     "Connectivity",
+    "EnhancedConnectivity",
     "ObstacleAvoidance",
+    "SquaredObstacleAvoidance",
+    "Stiffness",
 ]

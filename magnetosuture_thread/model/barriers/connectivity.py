@@ -1,11 +1,13 @@
-"""Connectivity and compression: a segment is neither longer nor shorter than at rest."""
+"""Connectivity, enhanced connectivity and compression: two nodes are neither too far apart nor too near."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers.rows import NO_OBSTACLE, BarrierKind, BarrierRows
 
@@ -28,20 +30,21 @@ class Connectivity:
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _segment_rows(positions, self.segment_length, BarrierKind.CONNECTIVITY, 1.0)
+        return _rows(positions, 1, self.segment_length, BarrierKind.CONNECTIVITY, 1.0)
 
 
 @dataclass(frozen=True)
-class Compression:
-    """No segment is shorter than its rest length.
+class EnhancedConnectivity:
+    """No two nodes with one between them are farther apart than two rest lengths.
 
-        h_cmp,i = (|x_i - x_{i-1}|^2 - D^2) / 2,    i = 1 ... n
+        h_enh,i = ((2 D)^2 - |x_i - x_{i-2}|^2) / 2,    i = 2 ... n
 
-    Together with the connectivity it makes the thread inextensible. Unit of h: that of the positions,
+    The first row links the thread's second node to the needle, x_0. Unit of h: that of the positions,
     squared.
 
-    Source: none. Deviation: the paper leaves it out, so that nodes may coincide in a loop; without it
-    the thread bunches up where it is pushed.
+    Source: [Forghani2025], enhanced connectivity functions. Deviation: printed with the same Delta as the
+    connectivity; taken at its word that would fold the thread, so it is read as 2 Delta. The paper counts
+    its constraints as 3 n - 2 and as 3 n - 1; here are n - 1 of this kind.
 
     Attributes:
         segment_length: D, in the unit of the positions.
@@ -50,20 +53,79 @@ class Compression:
     segment_length: float
 
     def rows(self, positions: Points) -> BarrierRows:
+        """Return the n - 1 rows at positions of shape (n + 1, d)."""
+        return _rows(positions, 2, 2.0 * self.segment_length, BarrierKind.ENHANCED_CONNECTIVITY, 1.0)
+
+
+@dataclass(frozen=True)
+class Compression:
+    """No segment is shorter than its rest length.
+
+        h_cmp,i = (|x_i - x_{i-1}|^2 - D_i^2) / 2,    i = 1 ... n
+
+    Together with the connectivity it makes the thread inextensible. Unit of h: that of the positions,
+    squared.
+
+    Source: none. Deviation: the paper leaves it out, so that nodes may coincide in a loop; without it
+    the thread bunches up where it is pushed.
+
+    Attributes:
+        segment_length: D_i, of all segments or of each, shape (n,), in the unit of the positions.
+    """
+
+    segment_length: float | NDArray[np.float64]
+
+    def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _segment_rows(positions, self.segment_length, BarrierKind.COMPRESSION, -1.0)
+        return _rows(positions, 1, self.segment_length, BarrierKind.COMPRESSION, -1.0)
 
 
-def _segment_rows(positions: Points, segment_length: float, kind: BarrierKind, sign: float) -> BarrierRows:
-    segments = np.diff(positions, axis=0)
-    count = len(segments)
-    lengths = np.linalg.norm(segments, axis=1)
+@compiled
+def distance_barrier(
+    positions: Points,
+    apart: int,
+    longest: NDArray[np.float64],
+    value: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> None:
+    """Write h_i = (longest_i^2 - |x_{i + apart} - x_i|^2) / 2 and its gradient at the nodes i ... i + 2.
+
+    Args:
+        positions: all nodes, shape (m, d).
+        apart: 1 or 2.
+        longest: greatest distance, shape (m - apart,).
+        value: written, shape (m - apart,).
+        gradient: written, at the three nodes from min(i, m - 3) on, shape (m - apart, 3, d).
+    """
+    nodes, dimension = positions.shape
+    for i in range(nodes - apart):
+        shift = i - min(i, nodes - 3)
+        square = 0.0
+        for a in range(dimension):
+            gradient[i, 0, a] = gradient[i, 1, a] = gradient[i, 2, a] = 0.0
+            difference = positions[i + apart, a] - positions[i, a]
+            gradient[i, shift, a] = difference
+            gradient[i, shift + apart, a] = -difference
+            square += difference * difference
+        value[i] = 0.5 * (longest[i] ** 2 - square)
+
+
+def _rows(
+    positions: Points, apart: int, longest: float | NDArray[np.float64], kind: BarrierKind, sign: float
+) -> BarrierRows:
+    positions = np.ascontiguousarray(positions)
+    count = len(positions) - apart
+    bound = np.full(count, 1.0) * longest
+    value, gradient = np.empty(count), np.empty((count, 3, positions.shape[1]))
+    distance_barrier(positions, apart, bound, value, gradient)
     first = np.arange(count)
+    shift = first - np.minimum(first, len(positions) - 3)
+    ends = np.stack([gradient[first, shift], gradient[first, shift + apart]], axis=1)
     return BarrierRows(
         kind=kind,
-        nodes=np.column_stack([first, first + 1]),
+        nodes=np.column_stack([first, first + apart]),
         obstacle=np.full(count, NO_OBSTACLE),
-        value=sign * 0.5 * (segment_length**2 - lengths**2),
-        gradient=sign * np.stack([segments, -segments], axis=1),
-        clearance=sign * (segment_length - lengths),
+        value=sign * value,
+        gradient=sign * ends,
+        clearance=sign * (bound - np.linalg.norm(positions[apart:] - positions[:-apart], axis=1)),
     )

@@ -1,53 +1,92 @@
-"""Obstacle avoidance: no node of the thread enters an obstacle."""
+"""Obstacle avoidance: no node of the thread, and not the needle, enters an obstacle."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers.rows import BarrierKind, BarrierRows
 
 
 @dataclass(frozen=True)
 class ObstacleAvoidance:
-    """Every thread node keeps its distance from every obstacle.
+    """Every node, the needle's tail among them, keeps its distance from every obstacle that is near.
 
-        h_obs,i,O = sd_O(x_i) - rho,    i = 1 ... n,  O = 1 ... M
+        h_obs,i,O = sd_O(x_i) - rho,    i = 0 ... n,  O = 1 ... M
 
-    with the signed distance sd_O, negative inside. Unit of h: that of the positions.
+    with the signed distance sd_O, negative inside. Unit of h: that of the positions. A pair of node and
+    obstacle that is farther apart than the surroundings' reach has no row.
 
-    Source: [Forghani2025], obstacle avoidance functions h_obs,i,O. Deviation: the paper has
-    (|x_i - p_O|^2 - rho^2) / 2 with the closest point p_O. Outside of the obstacle both have the same
-    safe set; but the paper's gradient vanishes on the surface and points inwards below it, so that a
-    node which once got inside is kept there. The signed distance has a unit gradient everywhere.
+    Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: the paper
+    has (|x_i - p_O|^2 - rho^2) / 2 with the closest point p_O, see `SquaredObstacleAvoidance`. Outside of
+    the obstacle both have the same safe set; but the paper's gradient vanishes on the surface and points
+    inwards below it, so that a node which once got inside is kept there. The signed distance has a unit
+    gradient everywhere.
 
     Attributes:
-        obstacles: the obstacles, M of them.
+        surroundings: the obstacles, in the unit of the positions.
         distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
-    obstacles: Sequence[Disc]
+    surroundings: Surroundings
     distance: float
 
     def rows(self, positions: Points) -> BarrierRows:
-        """Return the M n rows at positions of shape (n + 1, d), obstacle by obstacle."""
-        nodes = np.arange(1, len(positions))
-        values, outwards = [], []
-        for obstacle in self.obstacles:
-            signed, outward = obstacle.signed_distance(positions[1:])
-            values.append(signed - self.distance)
-            outwards.append(outward)
-        value = np.concatenate(values) if values else np.empty(0)
-        gradient = np.vstack(outwards) if outwards else np.empty((0, positions.shape[1]))
+        """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
+        found = self.surroundings.near(positions)
+        value = found.distance[found.nearest] - self.distance
         return BarrierRows(
             kind=BarrierKind.OBSTACLE,
-            nodes=np.tile(nodes, len(self.obstacles))[:, None],
-            obstacle=np.repeat(np.arange(len(self.obstacles)), len(nodes)),
+            nodes=found.node[found.nearest][:, None],
+            obstacle=found.obstacle[found.nearest],
             value=value,
-            gradient=gradient[:, None, :],
+            gradient=found.outward[found.nearest][:, None, :],
             clearance=value,
         )
+
+
+@dataclass(frozen=True)
+class SquaredObstacleAvoidance:
+    """The same margin in the paper's form.
+
+        h_obs,i,O = (sd |sd| - rho^2) / 2,    sd = sd_O(x_i)
+
+    Unit of h: that of the positions, squared.
+
+    Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: |x - p|^2
+    is signed, negative inside, so that the gradient |sd| n points out of the obstacle on both sides. It
+    vanishes on the surface: the formulation `paper` takes `ObstacleAvoidance` for nodes that are too near.
+
+    Attributes:
+        surroundings: the obstacles, in the unit of the positions.
+        distance: rho, least distance of a node from a surface; the thread's radius.
+    """
+
+    surroundings: Surroundings
+    distance: float
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
+        found = self.surroundings.near(positions)
+        signed = found.distance[found.nearest]
+        value, slope = np.empty(len(signed)), np.empty(len(signed))
+        for k in range(len(signed)):
+            value[k], slope[k] = squared_barrier(signed[k], self.distance)
+        return BarrierRows(
+            kind=BarrierKind.OBSTACLE,
+            nodes=found.node[found.nearest][:, None],
+            obstacle=found.obstacle[found.nearest],
+            value=value,
+            gradient=(slope[:, None] * found.outward[found.nearest])[:, None, :],
+            clearance=signed - self.distance,
+        )
+
+
+@compiled
+def squared_barrier(signed: float, distance: float) -> tuple[float, float]:
+    """Return h = (sd |sd| - rho^2) / 2 and its slope by sd, |sd|."""
+    return 0.5 * (signed * abs(signed) - distance * distance), abs(signed)

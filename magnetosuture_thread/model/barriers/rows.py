@@ -1,8 +1,8 @@
 """What every control barrier function of the thread gives: its rows.
 
-A row is one barrier h, safe at h >= 0, with its gradient at the one or two nodes that it touches. The
-set of verbs is the same for each kind: a class with a method `rows(positions)` that returns
-`BarrierRows`.
+A row is one barrier h, safe at h >= 0, with its gradient at the nodes that it touches. The set of verbs
+is the same for each kind: a class with a method `rows(positions)` that returns `BarrierRows`, over a
+compiled function that the formulations call as well.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ class BarrierKind(IntEnum):
     CONNECTIVITY = 0
     COMPRESSION = 1
     OBSTACLE = 2
+    ENHANCED_CONNECTIVITY = 3
+    STIFFNESS = 4
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Solvers of the step's program, a file for each."""
 
+from magnetosuture_thread.model.solvers.banded import BandedSolver
+from magnetosuture_thread.model.solvers.fallback import FallbackSolver
 from magnetosuture_thread.model.solvers.osqp import OsqpSolver
 
-__all__ = ["OsqpSolver"]
+__all__ = ["BandedSolver", "FallbackSolver", "OsqpSolver"]

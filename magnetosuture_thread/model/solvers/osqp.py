@@ -1,4 +1,4 @@
-"""OSQP as solver of the step's program."""
+"""OSQP as solver of the step's program: the paper's way, a general first-order method."""
 
 from __future__ import annotations
 
@@ -6,12 +6,20 @@ from typing import Any
 
 import numpy as np
 import osqp
+from numpy.typing import NDArray
 
-from magnetosuture_thread.model.program import QuadraticProgram, Solution, optimality_residual
+from magnetosuture_thread.model.program import (
+    ChainProgram,
+    QuadraticProgram,
+    Solution,
+    Vector,
+    as_quadratic_program,
+    residuals_of,
+)
 
 
 class OsqpSolver:
-    """Solves programs of one pattern with OSQP, each started from the last one's solution.
+    """Solves programs with OSQP, each of the last one's pattern started from its solution.
 
     Args:
         tolerance: absolute and relative tolerance asked of OSQP before its solution is polished.
@@ -29,29 +37,46 @@ class OsqpSolver:
             "verbose": False,
         }
         self._solver: Any = None
-        self._pattern: tuple[tuple[int, int], int, int] | None = None
+        self._loaded: QuadraticProgram | None = None
 
-    def solve(self, program: QuadraticProgram) -> Solution:
-        """Solve one program; the first of a pattern pays for the set-up."""
+    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
+        """Solve one program; the first of a pattern pays for the set-up.
+
+        The guess is not used: OSQP starts from its own last solution, slacks included.
+        """
+        general = as_quadratic_program(program)
+        u, status, iterations = np.full(program.linear.shape, np.nan), "", 0
+        found_multipliers = np.full(len(program.first), np.nan)
         try:
-            self._load(program)
+            self._load(general)
+            found = self._solver.solve(raise_error=False)
         except osqp.OSQPException as error:
-            self._pattern = None
-            nothing = np.full(len(program.q), np.nan)
-            return Solution(nothing, np.full(len(program.lower), np.nan), self.name, f"refused: {error}", np.inf)
-        found = self._solver.solve(raise_error=False)
-        if found.info.status != "solved":
-            self._pattern = None  # or the next program would start from what is no solution, even from NaN
-        u = np.asarray(found.x, dtype=np.float64)
-        multipliers = np.asarray(found.y, dtype=np.float64)
-        residual = optimality_residual(program, u, multipliers)
-        return Solution(u, multipliers, self.name, str(found.info.status), residual)
+            self._loaded, status = None, f"refused: {error}"
+        else:
+            status, iterations = str(found.info.status), int(found.info.iter)
+            if status != "solved":
+                self._loaded = None  # or the next program would start from what is no solution, even from NaN
+            flat = np.zeros(program.linear.size)
+            flat[general.unknown] = found.x[: len(general.unknown)]
+            u = flat.reshape(program.linear.shape)
+            found_multipliers = -np.asarray(found.y, dtype=np.float64)  # OSQP's sign is the other one
+        residuals = residuals_of(program, u, found_multipliers)
+        return Solution(u, found_multipliers, self.name, status, iterations, residuals)
 
     def _load(self, program: QuadraticProgram) -> None:
-        pattern = (program.A.shape, program.A.nnz, program.P.nnz)
-        if pattern == self._pattern:
+        if self._loaded is not None and _alike(self._loaded, program):
             self._solver.update(Px=program.P.data, Ax=program.A.data, q=program.q, l=program.lower, u=program.upper)
         else:
             self._solver = osqp.OSQP()
             self._solver.setup(program.P, program.q, program.A, program.lower, program.upper, **self._settings)
-            self._pattern = pattern
+        self._loaded = program
+
+
+def _alike(one: QuadraticProgram, other: QuadraticProgram) -> bool:
+    """Whether the entries of two programs are at the same places."""
+    return all(
+        first.shape == second.shape
+        and np.array_equal(first.indptr, second.indptr)
+        and np.array_equal(first.indices, second.indices)
+        for first, second in ((one.P, other.P), (one.A, other.A))
+    )

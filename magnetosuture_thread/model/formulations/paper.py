@@ -1,0 +1,201 @@
+"""The formulation `paper`: the program as printed.
+
+    minimise over u, s   1/2 sum_i |u_i - kappa v_i|^2  +  1/2 s' W s
+    subject to           grad h_con,i' u >= -alpha h_con,i - s_i       connectivity, W_con
+                         grad h_enh,i' u >= -alpha h_enh,i - s_i       enhanced connectivity, W_con
+                         grad V_i' u     <= -gamma V_i + s_i           stiffness, W_stiff
+                         grad h_obs' u   >= -alpha h_obs               obstacles, hard
+
+in units of the segment length D, so that weights and gains mean the same for each thread; the paper leaves
+that open. v_i is the node's velocity over the last step. Where the lead moves first (`lead_ahead`), x_0 in
+the rows is the needle's new position, else the old one, as printed.
+
+Source: [Forghani2025], controller. Deviation: enhanced connectivity with 2 Delta, see its class; the
+obstacle function is signed, see `SquaredObstacleAvoidance`, and where it is below 0 the signed distance
+stands for it, with a compliance of 1e-7: its own gradient vanishes on the surface, and nodes that are inside
+of two obstacles at once could not obey two hard rows. What the paper leaves open, alpha, gamma,
+W_stiff of each material and the lead's order, is in `PaperOptions`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.geometry.obstacles import Surroundings, SurroundingsData
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, EnhancedConnectivity, ObstacleAvoidance
+from magnetosuture_thread.model.barriers.connectivity import distance_barrier
+from magnetosuture_thread.model.barriers.obstacle import squared_barrier
+from magnetosuture_thread.model.barriers.stiffness import stiffness_function
+from magnetosuture_thread.model.formulations.step import (
+    Drive,
+    Memory,
+    StepSolution,
+    ThreadState,
+    contact_rows,
+    driven,
+    remember_push,
+)
+from magnetosuture_thread.model.mechanics import rest_distances
+from magnetosuture_thread.model.program import Solver, Vector
+from magnetosuture_thread.model.thread import Thread
+
+ROW_REACH = 1.0  # segments; obstacles farther from a node than this have no row in the program
+
+
+@dataclass(frozen=True)
+class PaperOptions:
+    """The parameters of the printed program.
+
+    Attributes:
+        damping: kappa, part of its velocity that a node keeps from step to step.
+        gain: alpha of all barriers [1/s].
+        stiffness_gain: gamma of the stiffness [1/s].
+        connectivity_weight: W_con, of connectivity and enhanced connectivity.
+        stiffness_weight: W_stiff.
+        lead_ahead: whether the needle moves before the rows are set up.
+    """
+
+    damping: float = 0.95
+    gain: float = 20.0
+    stiffness_gain: float = 20.0
+    connectivity_weight: float = 1e5
+    stiffness_weight: float = 1.0
+    lead_ahead: bool = False
+
+    @classmethod
+    def tuned(cls, stiffness_weight: float) -> PaperOptions:
+        """Return what the paper leaves open as it did best on the reference set; W_stiff is the material's."""
+        return cls(gain=66.0, stiffness_gain=2.0, stiffness_weight=stiffness_weight, lead_ahead=True)
+
+
+class PaperFormulation:
+    """Steps a thread by the program above.
+
+    Args:
+        thread: the thread; of its mechanics only the rest shape counts.
+        surroundings: obstacles [m]; their reach is that of the margins.
+        solver: solves the program.
+        tolerance: the largest residual with which a solution is accepted.
+        options: what the paper sets or leaves open.
+    """
+
+    name = "paper"
+
+    def __init__(
+        self,
+        thread: Thread,
+        surroundings: Surroundings,
+        solver: Solver,
+        tolerance: float,
+        options: PaperOptions | None = None,
+    ) -> None:
+        nodes, dimension = thread.segments + 1, surroundings.dimension
+        self.dimension = dimension
+        self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
+        self._options = options or PaperOptions()
+        self._near = Surroundings(surroundings.shapes, ROW_REACH * thread.segment_length, dimension)
+        self._rest = rest_distances(thread.rest_turns)
+        self._rows = 3 * thread.segments - 2
+        self._memory = Memory.of(nodes, dimension, self._rows, 2 * nodes)
+
+    def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
+        """Move the driven nodes and let the thread follow; see `Formulation`."""
+        unit, options = self._thread.segment_length, self._options
+        before, velocities = state.positions / unit, state.velocities / unit
+        moved, known = driven(before, drive, unit)
+        start = moved if options.lead_ahead else before
+        while True:
+            contacts = _assemble(
+                self._memory,
+                self._near.data,
+                start,
+                velocities,
+                known,
+                self._rest,
+                unit,
+                0.5 * self._thread.diameter,
+                options.damping,
+                options.gain,
+                options.stiffness_gain,
+                1.0 / options.connectivity_weight,
+                1.0 / options.stiffness_weight,
+            )
+            if contacts >= 0:
+                break
+            self._memory = self._memory.with_room()
+        count = self._rows + contacts
+        solution = self._solver.solve(self._memory.program(count, known), velocities, self._memory.multipliers[:count])
+        if not solution.residuals.largest <= self._tolerance:
+            self._memory.multipliers[:] = self._memory.push[:] = 0.0
+            raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
+        self._memory.multipliers[:count] = solution.multipliers
+        remember_push(self._memory.node, solution.multipliers[self._rows :], self._memory.push)
+        end = moved + interval * solution.velocities
+        after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
+        return StepSolution(after, solution.solver, solution.status, solution.residuals, 1)
+
+    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
+        """Return the segments' length at rest; see `Formulation`."""
+        return np.full(self._thread.segments, self._thread.segment_length)
+
+    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
+        """Return every barrier; see `Formulation`. There is none of compression in this formulation."""
+        unit = self._thread.segment_length
+        return [
+            Connectivity(unit).rows(positions),
+            EnhancedConnectivity(unit).rows(positions),
+            ObstacleAvoidance(self._surroundings, 0.5 * self._thread.diameter).rows(positions),
+        ]
+
+
+@compiled
+def _assemble(
+    memory: Memory,
+    surroundings: SurroundingsData,
+    start: Points,
+    velocities: Points,
+    known: NDArray[np.bool_],
+    rest: Vector,
+    unit: float,
+    radius: float,
+    damping: float,
+    gain: float,
+    stiffness_gain: float,
+    connectivity_compliance: float,
+    stiffness_compliance: float,
+) -> int:
+    """Write the program; return the number of contacts, -1 if there is no room for them."""
+    nodes, dimension = start.shape
+    segments = nodes - 1
+    memory.couplings[:] = 0.0
+    for i in range(nodes):
+        for a in range(dimension):
+            for b in range(dimension):
+                memory.blocks[i, a, b] = 1.0 if a == b else 0.0
+            memory.linear[i, a] = -damping * velocities[i, a]
+    enhanced, stiff = segments, 2 * segments - 1
+    rows = 3 * segments - 2
+    one = np.ones(segments)
+    distance_barrier(start, 1, one, memory.value, memory.gradient)
+    distance_barrier(start, 2, 2.0 * one, memory.value[enhanced:], memory.gradient[enhanced:])
+    stiffness_function(start, rest, memory.value[stiff:], memory.gradient[stiff:])
+    for r in range(rows):
+        node = r if r < enhanced else (r - enhanced if r < stiff else r - stiff)
+        memory.first[r] = min(node, nodes - 3)
+        memory.lower[r] = -(gain if r < stiff else stiffness_gain) * memory.value[r]
+        memory.upper[r] = np.inf
+        memory.compliance[r] = connectivity_compliance if r < stiff else stiffness_compliance
+    contacts, _ = contact_rows(memory, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
+    for r in range(rows, rows + contacts):
+        clearance = memory.value[r]
+        if clearance > 0.0:
+            # grad h' u >= -alpha h, divided by the slope: the row's own size does not matter, it is hard.
+            value, slope = squared_barrier(clearance + radius / unit, radius / unit)
+            memory.lower[r] = -gain * value / slope
+    return contacts

@@ -1,0 +1,261 @@
+"""One step of the thread: what goes in, what comes out, and the rows that every formulation shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles import SurroundingsData, find_near
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.barriers import BarrierRows
+from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Vector
+
+PUSHING_OUT = 1e-7  # compliance of a contact that has to push a node out
+
+
+@dataclass(frozen=True)
+class ThreadState:
+    """The thread at one instant.
+
+    Attributes:
+        positions: of all nodes, shape (n + 1, d) [m].
+        velocities: of all nodes over the last step, shape (n + 1, d) [m/s].
+        interval: duration of the last step, 0 if there was none [s].
+    """
+
+    positions: Points
+    velocities: Points
+    interval: float = 0.0
+
+    @classmethod
+    def at_rest(cls, positions: Points) -> ThreadState:
+        """Return a thread that does not move."""
+        return cls(positions, np.zeros_like(positions))
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The nodes whose motion is known: the lead, what tissue holds, what another instrument grasps.
+
+    Attributes:
+        nodes: their indices, k of them; node 0 is the needle's tail.
+        positions: where they are at the end of the step, shape (k, d) [m].
+        heading: unit vector along the needle at the end of the step, shape (d,).
+    """
+
+    nodes: tuple[int, ...]
+    positions: Points
+    heading: Points
+
+
+@dataclass(frozen=True)
+class StepSolution:
+    """One step's end point and how it was found.
+
+    Attributes:
+        state: the thread at the end of the step.
+        solver: the solver's name.
+        status: its own word for the last solve; of a solve that was not at once accepted, if there was one.
+        residuals: the largest of each kind over the step's solves.
+        solves: number of programs solved.
+    """
+
+    state: ThreadState
+    solver: str
+    status: str
+    residuals: Residuals
+    solves: int
+
+
+class Formulation(Protocol):
+    """A way of writing one step of the thread as a quadratic program."""
+
+    name: str
+    dimension: int
+
+    def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
+        """Move the driven nodes and let the thread follow for one interval [s].
+
+        Raises:
+            SolverError: a solution's residual is above the tolerance.
+        """
+        ...
+
+    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
+        """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
+        ...
+
+    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
+        """Return every barrier at positions of shape (n + 1, d) [m], in SI units."""
+        ...
+
+
+class Memory(NamedTuple):
+    """Memory for a step's program and its contacts, kept from step to step so that no step pays for it.
+
+    Attributes:
+        blocks: see `ChainProgram`, as are the following; n + 1 nodes.
+        couplings: shape (3, n + 1).
+        linear: shape (n + 1, d).
+        first: rows: those of the formulation, then those of the contacts, shape (r,).
+        gradient: shape (r, 3, d).
+        lower: shape (r,).
+        upper: shape (r,).
+        compliance: shape (r,).
+        value: h of each row, shape (r,).
+        multipliers: a guess for the next solve, shape (r,).
+        chords: length of each segment, shape (n,).
+        work: shape (3, n + 1, d).
+        node: contacts: as `find_near` writes them, shape (c,).
+        obstacle: shape (c,).
+        distance: shape (c,).
+        outward: shape (c, d).
+        nearest: shape (c,).
+        push: what contacts last pushed each node with, shape (n + 1,).
+    """
+
+    blocks: NDArray[np.float64]
+    couplings: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    first: NDArray[np.int64]
+    gradient: NDArray[np.float64]
+    lower: Vector
+    upper: Vector
+    compliance: Vector
+    value: Vector
+    multipliers: Vector
+    chords: Vector
+    work: NDArray[np.float64]
+    node: NDArray[np.int64]
+    obstacle: NDArray[np.int64]
+    distance: Vector
+    outward: Points
+    nearest: NDArray[np.bool_]
+    push: Vector
+
+    @classmethod
+    def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> Memory:
+        """Return memory for a number of rows, and of contacts besides."""
+        total = rows + contacts
+        return cls(
+            np.zeros((nodes, dimension, dimension)),
+            np.zeros((SPAN, nodes)),
+            np.zeros((nodes, dimension)),
+            np.zeros(total, dtype=np.int64),
+            np.zeros((total, SPAN, dimension)),
+            np.zeros(total),
+            np.zeros(total),
+            np.zeros(total),
+            np.zeros(total),
+            np.zeros(total),
+            np.zeros(nodes - 1),
+            np.zeros((3, nodes, dimension)),
+            np.zeros(contacts, dtype=np.int64),
+            np.zeros(contacts, dtype=np.int64),
+            np.zeros(contacts),
+            np.zeros((contacts, dimension)),
+            np.zeros(contacts, dtype=np.bool_),
+            np.zeros(nodes),
+        )
+
+    def with_room(self) -> Memory:
+        """Return memory for twice as many contacts, with the same guess."""
+        nodes, dimension = self.linear.shape
+        rows = len(self.first) - len(self.node)
+        larger = Memory.of(nodes, dimension, rows, 2 * len(self.node))
+        larger.multipliers[:rows] = self.multipliers[:rows]
+        larger.push[:] = self.push
+        return larger
+
+    def program(self, count: int, known: NDArray[np.bool_]) -> ChainProgram:
+        """Return the program with the first rows."""
+        return ChainProgram(
+            self.blocks,
+            self.couplings,
+            self.linear,
+            known,
+            self.first[:count],
+            self.gradient[:count],
+            self.lower[:count],
+            self.upper[:count],
+            self.compliance[:count],
+        )
+
+
+@compiled
+def contact_rows(
+    memory: Memory,
+    row: int,
+    surroundings: SurroundingsData,
+    about: Points,
+    start: Points,
+    known: NDArray[np.bool_],
+    interval: float,
+    unit: float,
+    radius: float,
+) -> tuple[int, float]:
+    """Write the rows  n' u >= (-h(y) - n' (x - y)) / dt  of the contacts near y, with h = sd(y) - rho.
+
+    Args:
+        memory: written, from a row on.
+        row: the first of these rows.
+        surroundings: obstacles [m].
+        about: y, shape (n + 1, d) [D].
+        start: x, shape (n + 1, d) [D].
+        known: nodes that have no rows, as nothing can push them, shape (n + 1,).
+        interval: dt [s].
+        unit: D [m].
+        radius: rho [m].
+
+    Returns:
+        The number of rows, -1 if there is no room for them, and the greatest depth of a node [m].
+    """
+    nodes, dimension = about.shape
+    found = find_near(
+        about * unit, surroundings, memory.node, memory.obstacle, memory.distance, memory.outward, memory.nearest
+    )
+    if found < 0 or row + found > len(memory.first):
+        return -1, 0.0
+    kept, depth = 0, 0.0
+    for c in range(found):
+        i = memory.node[c]
+        if known[i]:
+            continue
+        clearance = memory.distance[c] - radius
+        depth = max(depth, -clearance)
+        bound = -clearance / unit
+        begin, here = min(i, nodes - 3), row + kept
+        for a in range(dimension):
+            outward = memory.outward[c, a]
+            for k in range(SPAN):
+                memory.gradient[here, k, a] = outward if begin + k == i else 0.0
+            bound -= outward * (start[i, a] - about[i, a])
+        memory.first[here], memory.value[here] = begin, clearance / unit
+        memory.lower[here], memory.upper[here] = bound / interval, np.inf
+        # A node that has to be pushed out may be held in by something else: then as far as it goes.
+        memory.compliance[here] = PUSHING_OUT if bound > 0.0 else 0.0
+        memory.multipliers[here] = memory.push[i]
+        memory.node[kept] = i
+        kept += 1
+    return kept, depth
+
+
+@compiled
+def remember_push(node: NDArray[np.int64], multipliers: Vector, push: Vector) -> None:
+    """Keep the multipliers of the contact rows, the largest of each node, for the next guess."""
+    push[:] = 0.0
+    for c in range(len(multipliers)):
+        push[node[c]] = max(push[node[c]], multipliers[c])
+
+
+def driven(positions: Points, drive: Drive, unit: float) -> tuple[Points, NDArray[np.bool_]]:
+    """Return the positions with the driven nodes moved, and which nodes these are; positions in units [m]."""
+    moved, known = positions.copy(), np.zeros(len(positions), dtype=np.bool_)
+    for node, position in zip(drive.nodes, drive.positions, strict=True):
+        moved[node] = position / unit
+        known[node] = True
+    return moved, known

@@ -1,0 +1,41 @@
+"""Solvers tried one after the other, until a solution passes its residual check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector
+
+
+class FallbackSolver:
+    """Solves by the first solver; where its residual check fails, again from a cold start, then by the others.
+
+    The solution's status says what was tried before: "solved, after banded: iteration limit".
+
+    Args:
+        solvers: in the order in which they are tried.
+        tolerance: the largest residual with which a solution is accepted.
+    """
+
+    def __init__(self, solvers: Sequence[Solver], tolerance: float) -> None:
+        self._solvers, self._tolerance = tuple(solvers), tolerance
+        self.name = self._solvers[0].name
+
+    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
+        """Return the first solution that passes, else the best; see `Solver`."""
+        solution = self._solvers[0].solve(program, velocities, multipliers)
+        if solution.residuals.largest <= self._tolerance:
+            return solution
+        tried, best = [f"{solution.solver}: {solution.status}"], solution
+        still, free = np.zeros_like(program.linear), np.zeros(len(program.first))
+        for solver in self._solvers:
+            solution = solver.solve(program, still, free)
+            if solution.residuals.largest < best.residuals.largest:
+                best = solution
+            if solution.residuals.largest <= self._tolerance:
+                break
+            tried.append(f"{solution.solver} from a cold start: {solution.status}")
+        return best._replace(status=f"{best.status}, after {', '.join(tried)}")

@@ -1,0 +1,157 @@
+"""The formulation `paper`: what is printed, and what follows from it."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
+from magnetosuture_thread.model.barriers import BarrierKind, Connectivity, EnhancedConnectivity, Stiffness
+from magnetosuture_thread.model.formulations import PaperFormulation, PaperOptions, ThreadState
+from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector
+from magnetosuture_thread.model.solvers import BandedSolver
+from test.model.formulations.scenes import (
+    DT,
+    TOLERANCE,
+    east,
+    followed,
+    formulated,
+    lead,
+    polyamide,
+    silk,
+    straight,
+    stretch,
+)
+
+
+class Listening:
+    """Solves, and keeps the programs."""
+
+    name = "listening"
+
+    def __init__(self) -> None:
+        self.programs: list[ChainProgram] = []
+        self._solver = BandedSolver()
+
+    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+        """Solve a program."""
+        copied = copy.deepcopy(program)
+        self.programs.append(copied)
+        return self._solver.solve(program, velocities, multipliers)
+
+
+def test_the_program_is_the_printed_one():
+    """P = I, q = -kappa v, rows grad h' u >= -alpha h with the weights' inverses as compliances."""
+    thread, solver = polyamide(), Listening()
+    options = PaperOptions(gain=30.0, stiffness_gain=7.0, stiffness_weight=0.5)
+    formulation = PaperFormulation(thread, Surroundings((), 0.01), solver, TOLERANCE, options)
+    random = np.random.default_rng(2)
+    unit = thread.segment_length
+    state = ThreadState(straight(thread) + 1e-4 * random.normal(size=(26, 2)), 1e-3 * random.normal(size=(26, 2)))
+    formulation.step(state, lead(np.array([1e-4, 0.0])), DT)
+    program = solver.programs[0]
+    np.testing.assert_allclose(program.blocks, np.tile(np.eye(2), (26, 1, 1)))
+    np.testing.assert_array_equal(program.couplings, 0.0)
+    np.testing.assert_allclose(program.linear, -0.95 * state.velocities / unit)
+    np.testing.assert_array_equal(program.known, np.arange(26) == 0)
+    x = state.positions / unit  # as printed, the needle's own motion is not ahead
+    expected = [
+        (Connectivity(1.0).rows(x), 30.0, 1e-5),
+        (EnhancedConnectivity(1.0).rows(x), 30.0, 1e-5),
+        (Stiffness(np.full(24, 2.0)).rows(x), 7.0, 2.0),
+    ]
+    row = 0
+    for rows, gain, compliance in expected:
+        for k in range(len(rows.value)):
+            full = np.zeros((26, 2))
+            full[program.first[row] : program.first[row] + 3] = program.gradient[row]
+            wanted = np.zeros((26, 2))
+            wanted[rows.nodes[k]] = rows.gradient[k]
+            np.testing.assert_allclose(full, wanted, atol=1e-12)
+            assert program.lower[row] == pytest.approx(-gain * rows.value[k])
+            assert program.upper[row] == np.inf
+            assert program.compliance[row] == pytest.approx(compliance)
+            row += 1
+    assert row == len(program.first) == 3 * 25 - 2
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_straight_thread_at_rest_stays_and_a_pulled_one_follows(dimension: int):
+    thread = polyamide()
+    for name_options in (PaperOptions(), PaperOptions.tuned(1.0)):
+        formulation = formulated(thread, name="paper", dimension=dimension, paper=name_options)
+        start = straight(thread, dimension)
+        still = followed(formulation, start, lambda _: np.zeros(dimension), 5)[-1]
+        np.testing.assert_allclose(still.state.positions, start, atol=1e-9)
+        pulled = followed(formulation, start, lambda k: k * DT * 5e-3 * east(dimension), 200)[-1]
+        behind = straight(thread, dimension) + 200 * DT * 5e-3 * east(dimension)
+        assert np.linalg.norm(pulled.state.positions - behind, axis=1).max() < 0.1 * thread.length
+
+
+def first_segment(options: PaperOptions) -> float:
+    """Return how much the first segment is stretched while the needle moves at 5 mm/s."""
+    thread = polyamide()
+    steps = followed(
+        formulated(thread, name="paper", paper=options), straight(thread), lambda k: k * DT * 5e-3 * east(), 100
+    )
+    positions = steps[-1].state.positions
+    return float(np.linalg.norm(positions[1] - positions[0])) / thread.segment_length - 1.0
+
+
+def test_the_needles_own_motion_is_missed_unless_it_is_fed_forward_or_the_gain_is_high():
+    """With alpha = 20 /s the first segment stretches by a tenth or more; with the others by a few percent."""
+    assert first_segment(PaperOptions(gain=20.0)) > 0.1
+    assert first_segment(PaperOptions(gain=1.0 / DT)) < 0.5 * first_segment(PaperOptions(gain=20.0))
+    assert first_segment(PaperOptions(gain=1.0 / DT, lead_ahead=True)) < 0.03
+
+
+def test_a_needle_that_leapt_out_of_the_safe_set_is_followed_back_into_it():
+    thread = silk()
+    formulation = formulated(thread, name="paper", paper=PaperOptions.tuned(1.0))
+    jump = np.array([3.0 * thread.segment_length, 0.0])
+    steps = followed(formulation, straight(thread), lambda _: jump, 200)
+    margins = [formulation.margins(done.state.positions, east())[0].clearance.min() for done in steps]
+    assert margins[0] < -0.2 * thread.segment_length
+    assert margins[-1] > -1e-3 * thread.segment_length
+    assert stretch(thread, steps[-1].state.positions) < 2e-3
+
+
+@pytest.mark.parametrize(
+    "obstacle", [Disc((-0.009, 0.0025), 0.0015), Polygon(((-0.012, 0.001), (-0.006, 0.001), (-0.009, 0.004)))]
+)
+def test_no_node_enters_an_obstacle_and_one_inside_is_pushed_out(obstacle: Disc | Polygon):
+    thread = polyamide()
+    formulation = formulated(thread, (obstacle,), name="paper", paper=PaperOptions.tuned(0.01))
+
+    def least(positions: np.ndarray) -> float:
+        rows = formulation.margins(positions, east())[2]
+        assert rows.kind is BarrierKind.OBSTACLE
+        return float(rows.clearance[rows.nodes[:, 0] > 0].min(initial=np.inf))
+
+    touched = False
+    for done in followed(formulation, straight(thread), lambda k: k * 4e-5 * np.array([0.0, 1.0]), 300):
+        assert least(done.state.positions) > -5e-6
+        touched = touched or least(done.state.positions) < 2e-5
+    assert touched
+    inside = straight(thread) + np.array([0.0, 0.0016])
+    assert least(inside) < -4e-4
+    last = followed(formulation, inside, lambda _: inside[0], 100)[-1]
+    assert least(last.state.positions) > -5e-6
+
+
+class Lying(Listening):
+    """Says that it solved what it did not."""
+
+    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+        """Return a solution with a bad residual."""
+        return super().solve(program, velocities, multipliers)._replace(residuals=Residuals(1.0, 0.0, 0.0))
+
+
+def test_a_solution_is_refused_by_its_residual():
+    thread = polyamide()
+    formulation = PaperFormulation(thread, Surroundings((), 0.01), Lying(), TOLERANCE)
+    with pytest.raises(SolverError):
+        formulation.step(ThreadState.at_rest(straight(thread)), lead(np.zeros(2)), DT)

@@ -1,0 +1,154 @@
+"""The solvers, judged by residuals that are computed apart from them, and against each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
+from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver
+from test.model.test_program import one_node, random_program
+
+
+def solved(solver: Solver, program: ChainProgram) -> Solution:
+    """Return the solution from a cold start."""
+    return solver.solve(program, np.zeros_like(program.linear), np.zeros(len(program.first)))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("soft", [False, True])
+def test_both_solvers_agree(dimension: int, soft: bool):
+    for seed in range(20):
+        program = random_program(seed, dimension=dimension, soft=soft)
+        banded, osqp = solved(BandedSolver(), program), solved(OsqpSolver(), program)
+        assert banded.status == osqp.status == "solved"
+        assert banded.residuals.largest < 1e-7
+        assert osqp.residuals.largest < 1e-5
+        np.testing.assert_allclose(banded.velocities, osqp.velocities, atol=1e-4)
+        assert (banded.velocities[program.known] == 0.0).all()
+
+
+def test_residuals_are_those_of_the_program():
+    program = random_program(3)
+    solution = solved(BandedSolver(), program)
+    assert solution.residuals == residuals_of(program, solution.velocities, solution.multipliers)
+
+
+def test_a_good_guess_is_solved_in_one_iteration():
+    program = random_program(4, nodes=60)
+    solver = BandedSolver()
+    first = solved(solver, program)
+    again = solver.solve(program, first.velocities, first.multipliers)
+    assert first.iterations > again.iterations
+    assert again.iterations <= 2
+
+
+def test_a_bad_guess_is_as_good_as_none():
+    program, random = random_program(5, nodes=40), np.random.default_rng(0)
+    solver = BandedSolver()
+    expected = solved(solver, program)
+    for _ in range(20):
+        guess = 1e3 * random.normal(size=program.linear.shape)
+        push = 1e4 * random.normal(size=len(program.first)) * random.integers(0, 2, len(program.first))
+        found = solver.solve(program, guess, push)
+        assert found.residuals.largest < 1e-6
+        np.testing.assert_allclose(found.velocities, expected.velocities, atol=1e-5)
+
+
+def test_programs_of_any_size_follow_one_another():
+    solver = BandedSolver()
+    for nodes, dimension in ((30, 2), (5, 3), (80, 2), (80, 3), (3, 2)):
+        assert solved(solver, random_program(1, nodes, dimension)).residuals.largest < 1e-7
+
+
+def test_the_same_row_twice_is_no_harm():
+    program = one_node()
+    twice = program._replace(
+        first=np.repeat(program.first, 2),
+        gradient=np.repeat(program.gradient, 2, axis=0),
+        lower=np.repeat(program.lower, 2),
+        upper=np.repeat(program.upper, 2),
+        compliance=np.repeat(program.compliance, 2),
+    )
+    solution = solved(BandedSolver(), twice)
+    assert solution.residuals.largest < 1e-7
+    np.testing.assert_allclose(solution.velocities[0], [0.0, 1.0], atol=1e-7)
+
+
+def infeasible() -> ChainProgram:
+    """Return a program that asks for x >= 1 and x <= 0."""
+    program = one_node()
+    gradient = program.gradient.copy()
+    gradient[:, 0] = (1.0, 0.0)
+    return program._replace(gradient=gradient, lower=np.array([1.0, -np.inf]), upper=np.array([np.inf, 0.0]))
+
+
+def nothing() -> ChainProgram:
+    """Return a program with a NaN."""
+    program = one_node()
+    return program._replace(linear=np.full_like(program.linear, np.nan))
+
+
+def indefinite() -> ChainProgram:
+    """Return a program without a least value."""
+    program = one_node()
+    return program._replace(blocks=-program.blocks, lower=np.full(2, -np.inf), upper=np.full(2, np.inf))
+
+
+@pytest.mark.parametrize("solver", [BandedSolver(), OsqpSolver()], ids=lambda solver: solver.name)
+@pytest.mark.parametrize("program", [infeasible(), nothing(), indefinite()])
+def test_what_cannot_be_solved_is_said_so_and_the_next_program_is_solved(solver: Solver, program: ChainProgram):
+    bad = solved(solver, program)
+    assert bad.status != "solved"
+    assert bad.residuals.largest > 1e-2
+    assert solved(solver, random_program(2)).residuals.largest < 1e-5
+
+
+class Named:
+    """A solver that gives what it is told to."""
+
+    def __init__(self, name: str, status: str, residual: float) -> None:
+        self.name, self._status, self._residual = name, status, residual
+        self.guesses: list[float] = []
+
+    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+        """Return a solution with the residual."""
+        self.guesses.append(float(np.abs(velocities).max()))
+        residuals = Residuals(self._residual, 0.0, 0.0)
+        return Solution(velocities, multipliers, self.name, self._status, 1, residuals)
+
+
+def attempt(*solvers: Named) -> Solution:
+    """Solve with a warm start."""
+    program = one_node()
+    return FallbackSolver(solvers, 1e-6).solve(program, np.ones_like(program.linear), np.ones(2))
+
+
+def test_the_first_solver_is_enough_where_it_passes():
+    second = Named("second", "solved", 0.0)
+    assert attempt(Named("first", "solved", 1e-9), second).status == "solved"
+    assert second.guesses == []
+
+
+def test_a_failed_check_falls_back_to_a_cold_start_then_to_the_next_solver_and_says_so():
+    first, second = Named("first", "iteration limit", 1e-3), Named("second", "solved", 1e-9)
+    found = attempt(first, second)
+    assert found.solver == "second"
+    assert found.status == "solved, after first: iteration limit, first from a cold start: iteration limit"
+    assert first.guesses == [1.0, 0.0]
+    assert second.guesses == [0.0]
+
+
+def test_where_all_fail_the_best_is_returned_for_the_caller_to_refuse():
+    found = attempt(Named("first", "solved", 1e-3), Named("second", "solved", 1e-4), Named("third", "nan", np.nan))
+    assert found.solver == "second"
+    assert found.residuals.largest == 1e-4
+    assert "third from a cold start: nan" in found.status
+
+
+def test_osqp_is_started_from_its_last_solution_of_the_same_pattern():
+    solver, program = OsqpSolver(), random_program(7)
+    first = solved(solver, program)
+    again = solved(solver, program._replace(linear=1.001 * program.linear))
+    assert again.residuals.largest < 1e-5
+    assert again.iterations <= first.iterations

@@ -1,0 +1,112 @@
+"""Settings of the thread model: what they make, and what they refuse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.settings import ThreadModelSettings
+
+SQUARE = [0.0, 0.0, 0.01, 0.0, 0.01, 0.01, 0.0, 0.01]
+HOLE = [0.004, 0.004, 0.006, 0.004, 0.006, 0.006, 0.004, 0.006]
+
+
+def made(**values: Any) -> ThreadModelSettings:
+    """Return settings from what a set-up file would hold."""
+    return from_mapping(ThreadModelSettings, values)
+
+
+def test_obstacles_are_discs_then_polygons_with_their_holes():
+    settings = made(
+        disc_obstacles=[0.02, 0.0, 0.001],
+        polygon_obstacles=[*SQUARE, *HOLE, *(np.array(SQUARE) - 0.012).tolist()],
+        polygon_sizes=[4, -4, 4],
+        corner_radius=0.0,
+    )
+    disc, first, second = settings.obstacles()
+    assert isinstance(disc, Disc)
+    assert isinstance(first, Polygon)
+    assert isinstance(second, Polygon)
+    assert first.area == pytest.approx(1e-4 - 4e-6)
+    assert len(first.holes) == 1
+    assert len(second.holes) == 0
+
+
+def test_sharp_corners_are_rounded():
+    rounded = made(polygon_obstacles=SQUARE, polygon_sizes=[4]).obstacles()[0]
+    assert isinstance(rounded, Polygon)
+    assert len(rounded.outline) > 8
+    blunt = made(polygon_obstacles=SQUARE, polygon_sizes=[4], corner_angle=3.0).obstacles()[0]
+    assert isinstance(blunt, Polygon)
+    assert len(blunt.outline) == 4
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"polygon_obstacles": SQUARE}, "polygon_sizes: .* add up to 4 corners"),
+        ({"polygon_obstacles": SQUARE, "polygon_sizes": [3]}, "add up to 4 corners"),
+        ({"polygon_obstacles": SQUARE, "polygon_sizes": [-4]}, "an outline before its holes"),
+        ({"polygon_obstacles": SQUARE, "polygon_sizes": [4.0]}, "a list of whole numbers"),
+        ({"polygon_obstacles": SQUARE[:-1], "polygon_sizes": [4]}, "multiple of 2"),
+        (
+            {"polygon_obstacles": [0.0, 0.0, 0.01, 0.01, 0.01, 0.0, 0.0, 0.01], "polygon_sizes": [4]},
+            "polygon 0.*does not cross",
+        ),
+        ({"polygon_obstacles": SQUARE[:4], "polygon_sizes": [2]}, "at least 3 points"),
+        ({"polygon_obstacles": [float("nan"), *SQUARE[1:]], "polygon_sizes": [4]}, "polygon_obstacles"),
+        ({"polygon_obstacles": [1e3 * x for x in SQUARE], "polygon_sizes": [4]}, "from -1 to 1"),
+        ({"polygon_obstacles": [0.1 * x for x in HOLE], "polygon_sizes": [4]}, "half of a segment"),
+        ({"disc_obstacles": [0.0, 0.0, 1e-4]}, "half of a segment"),
+        ({"held_nodes": [26]}, "nodes from 1 to 25"),
+        ({"held_nodes": [0]}, "from 1 to"),
+        ({"formulation": "magic"}, "one of rod, paper"),
+        ({"solver": "magic"}, "one of banded, osqp"),
+        ({"medium": "honey"}, "one of liquid, air"),
+        ({"gravity": [9.81]}, "multiple of 2"),
+        ({"segments": 400}, "longer than thick"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        made(**values)
+    assert "thread_model." in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"formulation": "paper"},
+        {"solver": "osqp", "attachment": "glued"},
+        {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
+        {"held_nodes": [20], "rest_curvature": 30.0},
+        {"polygon_obstacles": SQUARE, "polygon_sizes": [4], "margin_range": 0.02},
+    ],
+)
+def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
+    predictor = made(**values).predictor()
+    assert not predictor.started
+    east = np.array([1.0, 0.0])
+    tail = np.array([-0.005, -0.005])
+    predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
+    for k in range(1, 6):
+        prediction = predictor.step(NeedlePose(k / 60.0, tail + k * 5e-5 * east, east))
+    assert prediction.formulation == values.get("formulation", "rod")
+    assert prediction.solver == values.get("solver", "banded")
+    assert np.isfinite(prediction.vertices).all()
+    assert prediction.residual < 1e-6
+
+
+def test_inertia_and_weight_come_from_the_settings():
+    thread = made(medium="air", mass_per_length=1e-5, air_drag=2e-4, gravity=[0.0, -9.81]).thread()
+    assert thread.medium.mass_per_length == 1e-5
+    assert thread.medium.drag_across == thread.medium.drag_along == 2e-4
+    assert thread.medium.gravity == (0.0, -9.81)
+    assert made().thread().medium.mass_per_length == 0.0
