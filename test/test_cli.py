@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread import cli
+from test.study.test_evaluation import write
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -20,16 +22,25 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_help_names_every_command_and_the_exit_codes():
     shown = run("--help")
     assert shown.returncode == 0
-    for words in ("replay", "record", "no medical device", "0 done, 1 the job failed, 2 wrong use"):
+    for words in (
+        "replay",
+        "record",
+        "evaluate",
+        "bench",
+        "no medical device",
+        "0 done, 1 the job failed, 2 wrong use",
+    ):
         assert words in shown.stdout
 
 
-@pytest.mark.parametrize("name", ["replay", "record"])
-def test_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize(
+    ("name", "option"), [("replay", "--output"), ("record", "--output"), ("evaluate", "--json"), ("bench", "--json")]
+)
+def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         cli.main([name, "--help"])
     assert ended.value.code == 0
-    assert "--output" in capsys.readouterr().out
+    assert option in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -44,6 +55,11 @@ def test_every_command_has_help(name: str, capsys: pytest.CaptureFixture[str]):
         ["record", "r.npz", "--output", "out"],
         ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--seed", "-1"],
         ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--quality", "0"],
+        ["evaluate"],
+        ["evaluate", "dir", "--formulation", "magic"],
+        ["evaluate", "dir", "--solver", "magic"],
+        ["evaluate", "dir", "--segments", "2"],
+        ["bench", "--peers", "all"],
     ],
 )
 def test_wrong_use_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
@@ -90,3 +106,20 @@ def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path
     assert cli.main(["replay", str(short_bag), "--output", str(tmp_path / "out")]) == 1
     assert "the live graph needs ROS 2 Jazzy" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_evaluate_prints_a_table_and_writes_figures_and_pictures(tmp_path: Path):
+    write(tmp_path, "straight")
+    figures, pictures = tmp_path / "figures.json", tmp_path / "pictures"
+    done = run("evaluate", str(tmp_path), "--json", str(figures), "--pictures", str(pictures), "--segments", "20")
+    assert done.returncode == 0, done.stderr
+    assert "mean of the cases" in done.stdout
+    assert json.loads(figures.read_text())["cases"][0]["name"] == "straight"
+    assert (pictures / "straight.png").is_file()
+
+
+def test_evaluate_refuses_what_is_no_trajectory(tmp_path: Path):
+    (tmp_path / "broken.npz").write_bytes(b"no archive")
+    refused = run("evaluate", str(tmp_path))
+    assert refused.returncode == 1
+    assert "broken.npz: is no reference trajectory" in refused.stderr

@@ -1,9 +1,10 @@
-"""The table of a replayed bag, for a terminal."""
+"""Tables for a terminal: of a replayed bag, and of an evaluation."""
 
 from __future__ import annotations
 
 from rich.table import Table
 
+from magnetosuture_thread.study.evaluation import Evaluation
 from magnetosuture_thread.study.replayed import Spread, Summary
 
 
@@ -40,6 +41,35 @@ def summary_table(summary: Summary) -> Table:
         elif figures is not None:
             scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
             table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
+    return table
+
+
+def evaluation_table(evaluation: Evaluation) -> Table:
+    """Return the scores of a set of trajectories as a table that fits 80 columns."""
+    title = f"formulation {evaluation.formulation}, solver {evaluation.solver}"
+    table = Table(title=title, title_justify="left", title_style="bold", caption_justify="left")
+    residual = max(case.max_residual for case in evaluation.cases)
+    table.caption = (
+        "errors in % of the length, mean and greatest over time; stretch in %;\n"
+        "deepest node in an obstacle in m; step in µs of wall clock, median and p99;\n"
+        f"largest residual {residual:.0e}, {sum(case.fallbacks for case in evaluation.cases)} steps fell back"
+    )
+    table.add_column("case", no_wrap=True)
+    for name in ("error", "greatest", "stretch", "depth", "step", "p99"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for case in evaluation.cases:
+        table.add_row(
+            case.name,
+            f"{case.mean_error_percent:.3f}",
+            f"{case.max_error_percent:.3f}",
+            f"{100.0 * case.max_stretch:.3f}",
+            f"{case.max_penetration_m:.0e}" if case.max_penetration_m else "none",
+            f"{1e6 * case.step_median_s:.0f}",
+            f"{1e6 * case.step_p99_s:.0f}",
+        )
+    table.add_section()
+    table.add_row("mean of the cases", f"{evaluation.mean_error_percent:.3f}")
+    table.add_row("worst case", f"{evaluation.worst_error_percent:.3f}")
     return table
 
 
