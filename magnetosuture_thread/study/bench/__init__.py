@@ -1,0 +1,1 @@
+"""How fast the model is, beside other solvers of the same programs and other simulators of the same motion."""
