@@ -9,6 +9,7 @@ import osqp
 from numpy.typing import NDArray
 
 from magnetosuture_thread.model.program import (
+    SOLVED,
     ChainProgram,
     QuadraticProgram,
     Solution,
@@ -45,23 +46,31 @@ class OsqpSolver:
         The guess is not used: OSQP starts from its own last solution, slacks included.
         """
         general = as_quadratic_program(program)
-        u, status, iterations = np.full(program.linear.shape, np.nan), "", 0
-        found_multipliers = np.full(len(program.first), np.nan)
+        return self.read(program, general, self.run(general))
+
+    def run(self, general: QuadraticProgram) -> Any:
+        """Return what OSQP finds for a program in general form, or the error by which it refuses it."""
         try:
             self._load(general)
             found = self._solver.solve(raise_error=False)
         except osqp.OSQPException as error:
-            self._loaded, status = None, f"refused: {error}"
-        else:
+            self._loaded = None
+            return error
+        if found.info.status != SOLVED:
+            self._loaded = None  # or the next program would start from what is no solution, even from NaN
+        return found
+
+    def read(self, program: ChainProgram, general: QuadraticProgram, found: Any) -> Solution:
+        """Return what was found as a solution of the chain's program."""
+        u, multipliers = np.full(program.linear.shape, np.nan), np.full(len(program.first), np.nan)
+        status, iterations = f"refused: {found}", 0
+        if not isinstance(found, osqp.OSQPException):
             status, iterations = str(found.info.status), int(found.info.iter)
-            if status != "solved":
-                self._loaded = None  # or the next program would start from what is no solution, even from NaN
             flat = np.zeros(program.linear.size)
             flat[general.unknown] = found.x[: len(general.unknown)]
             u = flat.reshape(program.linear.shape)
-            found_multipliers = -np.asarray(found.y, dtype=np.float64)  # OSQP's sign is the other one
-        residuals = residuals_of(program, u, found_multipliers)
-        return Solution(u, found_multipliers, self.name, status, iterations, residuals)
+            multipliers = -np.asarray(found.y, dtype=np.float64)  # OSQP's sign is the other one
+        return Solution(u, multipliers, self.name, status, iterations, residuals_of(program, u, multipliers))
 
     def _load(self, program: QuadraticProgram) -> None:
         if self._loaded is not None and _alike(self._loaded, program):
