@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS
 from test.study.test_evaluation import write
 
 
@@ -123,3 +124,12 @@ def test_evaluate_refuses_what_is_no_trajectory(tmp_path: Path):
     refused = run("evaluate", str(tmp_path))
     assert refused.returncode == 1
     assert "broken.npz: is no reference trajectory" in refused.stderr
+
+
+def test_the_words_of_the_command_are_those_of_the_model(capsys: pytest.CaptureFixture[str]):
+    """They are written out in the parser, which would be slow to start if it asked the model."""
+    with pytest.raises(SystemExit):
+        cli.main(["evaluate", "--help"])
+    shown = capsys.readouterr().out
+    assert "{" + ",".join(FORMULATIONS) + "}" in shown
+    assert "{" + ",".join(SOLVERS) + "}" in shown

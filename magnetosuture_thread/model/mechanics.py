@@ -108,16 +108,16 @@ def bending_bands(segments: int, glued: bool) -> NDArray[np.float64]:
     Source: discrete elastic rod, Euler-Maclaurin. Deviation: the paper has the stiffness CLF V_i instead,
     which is of fourth order in the bending angle.
     """
-    curvatures = sp.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(segments, segments + 1)).tolil()
+    curvatures = sp.diags([1.0, -2.0, 1.0], [-1, 0, 1], shape=(segments, segments + 1)).tolil()
     curvatures[0, 0], curvatures[0, 1] = (-2.0, 2.0) if glued else (0.0, 0.0)
     weights = np.ones(segments)
     weights[0] = 0.5 if glued else 0.0
-    slopes = sp.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(segments, segments))
+    slopes = sp.diags([-1.0, 1.0], [0, 1], shape=(segments, segments))
     slope_weights = np.full(segments, CURVATURE_CORRECTION)
     if glued:
         slope_weights[0] *= CLAMP_CORRECTION
-    middle = sp.diags_array(weights) + slopes.T @ sp.diags_array(slope_weights) @ slopes
-    hessian = sp.csr_array(curvatures.T @ middle @ curvatures)
+    middle = sp.diags(weights) + slopes.T @ sp.diags(slope_weights) @ slopes
+    hessian = sp.csr_matrix(curvatures.T @ middle @ curvatures)
     bands = np.zeros((4, segments + 1))
     for apart in range(4):
         bands[apart, : segments + 1 - apart] = hessian.diagonal(apart)

@@ -51,6 +51,8 @@ class Prediction:
         solver: the solver's name.
         status: the solver's own word; where one did not solve at once, what had to be tried.
         residual: the largest scaled residual of the solves.
+        converged: whether every step ended where the barriers themselves hold, not only their linearisations;
+            if not, the margins are those of a thread that is not where the equations say.
         judge: works out the margins.
     """
 
@@ -63,6 +65,7 @@ class Prediction:
     solver: str
     status: str
     residual: float
+    converged: bool
     judge: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
 
     @cached_property
@@ -151,15 +154,20 @@ class ThreadPredictor:
             vertices: all nodes, shape (n + 1, d) [m].
 
         Raises:
-            InvalidInputError: the pose or a node is not finite, or there are not n + 1 nodes.
+            InvalidInputError: the pose or a node is not finite, there are not n + 1 nodes, or the first is
+                farther than a segment from the tail.
         """
         check_pose(pose)
         wanted = (self.thread.segments + 1, len(pose.tail))
         if vertices.shape != wanted or not np.all(np.isfinite(vertices)):
             raise InvalidInputError("thread's nodes", f"shape {vertices.shape}", f"finite, shape {wanted} [m]")
+        gap = float(np.linalg.norm(vertices[0] - pose.tail))
+        if gap > self.thread.segment_length:
+            nearest = f"at most {self.thread.segment_length:.2e} m"
+            raise InvalidInputError("thread's first node", f"{gap:.2e} m from the needle's tail", nearest)
         self._state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
         self._pose = pose
-        return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0))
+        return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0), True)
 
     def step(self, pose: NeedlePose, driven: Mapping[int, Points] | None = None) -> Prediction:
         """Follow the needle to its next pose.
@@ -194,11 +202,10 @@ class ThreadPredictor:
             ends[node] = position
         nodes = tuple(ends)
         begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
-        begin[0] = last.tail
         way = float(np.linalg.norm(end - begin, axis=1).max())
         wanted = max(interval / self._longest_step, way / (LONGEST_WAY * self.thread.segment_length), 1.0)
         substeps = min(self._most_substeps, math.ceil(wanted - 1e-9))
-        residuals, worst = Residuals(0.0, 0.0, 0.0), None
+        residuals, worst, converged = Residuals(0.0, 0.0, 0.0), None, True
         for index in range(1, substeps + 1):
             part = index / substeps
             heading = _between(last.heading, pose.heading, part)
@@ -206,12 +213,19 @@ class ThreadPredictor:
                 state, Drive(nodes, begin + part * (end - begin), heading), interval / substeps
             )
             state, residuals = done.state, residuals.or_worse(done.residuals)
+            converged = converged and done.converged
             worst = done if worst is None or worst.status == SOLVED else worst
         self._pose, self._state = pose, state
-        return self._prediction(pose, interval, substeps, worst, residuals)
+        return self._prediction(pose, interval, substeps, worst, residuals, converged)
 
     def _prediction(
-        self, pose: NeedlePose, interval: float, substeps: int, step: StepSolution | None, residuals: Residuals
+        self,
+        pose: NeedlePose,
+        interval: float,
+        substeps: int,
+        step: StepSolution | None,
+        residuals: Residuals,
+        converged: bool,
     ) -> Prediction:
         assert self._state is not None
         positions = self._state.positions
@@ -226,6 +240,7 @@ class ThreadPredictor:
             solver=step.solver if step else "none",
             status=step.status if step else STARTED,
             residual=residuals.largest,
+            converged=converged,
             judge=partial(self._formulation.margins, positions, pose.heading),
         )
 

@@ -126,7 +126,10 @@ def residuals_of(program: ChainProgram, velocities: NDArray[np.float64], multipl
 def compiled_residuals(
     program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector
 ) -> tuple[float, float, float]:
-    """Return the same, for compiled code: primal, dual, complementarity."""
+    """Return the same, for compiled code: primal, dual, complementarity.
+
+    Shares nothing with a solver, so P u is written out here once more.
+    """
     nodes, dimension = velocities.shape
     force = np.empty((nodes, dimension))
     largest = 1.0
@@ -166,6 +169,7 @@ def compiled_residuals(
         complementarity = max(complementarity, abs(multiplier) * (min(gap / scale, 1.0)))
         pushed = max(pushed, abs(multiplier))
         finite = finite and np.isfinite(image) and np.isfinite(multiplier)
+        finite = finite and not (np.isnan(lower) or np.isnan(upper))
     dual = 0.0
     for i in range(nodes):
         for k in range(dimension):
@@ -215,7 +219,7 @@ def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
         columns.append(coordinates[apart:].ravel())
         entries.append(np.repeat(program.couplings[apart - 1, :-apart], dimension))
     hessian = _matrix(entries, rows, columns, (nodes * dimension, nodes * dimension))
-    touched = coordinates[program.first[:, None] + np.arange(SPAN)].reshape(len(program.first), -1)
+    touched = coordinates[program.first[:, None] + np.arange(SPAN)].reshape(len(program.first), SPAN * dimension)
     row = np.repeat(np.arange(len(program.first)), SPAN * dimension)
     image = _matrix([program.gradient.ravel()], [row], [touched.ravel()], (len(program.first), nodes * dimension))
     unknown = np.flatnonzero(np.repeat(~program.known, dimension))

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.configuration import Configuration, described, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings, triangulate
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
@@ -16,6 +16,15 @@ from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 
 MEDIA = ("liquid", "air")
+OF_MEDIUM = {
+    "viscosity": "liquid",
+    "wetted_fraction": "liquid",
+    "mass_per_length": "air",
+    "air_drag": "air",
+    "bending_damping": "air",
+    "gravity": "air",
+}
+SHARPEST_TURN = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
 @dataclass(frozen=True)
@@ -33,7 +42,7 @@ class ThreadModelSettings(Configuration):
     segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
     attachment: str = quantity(
         Attachment.PINNED.value,
-        "how the thread is fixed to the needle: pinned turns freely, glued leaves along the needle's axis",
+        "how the thread is fixed to the needle: pinned turns freely, glued leaves along the needle's axis; for rod",
         choices=tuple(kind.value for kind in Attachment),
     )
     rest_curvature: float = quantity(
@@ -47,7 +56,9 @@ class ThreadModelSettings(Configuration):
         (), "nodes that stay where they are at the start, as where tissue holds the thread", minimum=1, maximum=2000
     )
     medium: str = quantity(
-        "liquid", "what the thread moves in: liquid drags it, in air its inertia and weight count", choices=MEDIA
+        "liquid",
+        "what the thread moves in: liquid drags it, in air its inertia and weight count; for rod",
+        choices=MEDIA,
     )
     viscosity: float = quantity(
         1.0,
@@ -158,6 +169,18 @@ class ThreadModelSettings(Configuration):
             raise ConfigurationError(
                 f"{self.GROUP}.segments", self.segments, f"at most {most}, so that a segment is longer than thick"
             )
+        if len(self.gravity) not in (0, 2):
+            raise ConfigurationError(f"{self.GROUP}.gravity", list(self.gravity), "two numbers, x and y, or none")
+        turn = abs(self.rest_curvature) * self.length / self.segments
+        if turn > SHARPEST_TURN:
+            sharpest = SHARPEST_TURN * self.segments / self.length
+            words = f"at most {sharpest:.0f} 1/m with {self.segments} segments, which turn by half a radian then"
+            raise ConfigurationError(f"{self.GROUP}.rest_curvature", self.rest_curvature, words)
+        for about in described(type(self)):
+            other = OF_MEDIUM.get(about.name, self.medium)
+            if other != self.medium and getattr(self, about.name) != about.default:
+                name, value = f"{self.GROUP}.{about.name}", getattr(self, about.name)
+                raise ConfigurationError(name, value, f"its default, as it counts for the medium {other} only")
         for node in self.held_nodes:
             if node > self.segments:
                 raise ConfigurationError(f"{self.GROUP}.held_nodes", node, f"nodes from 1 to {self.segments}")
@@ -212,7 +235,7 @@ class ThreadModelSettings(Configuration):
             rest_curvature=self.rest_curvature,
         )
         if self.medium == "air":
-            air = Medium.air(self.mass_per_length, self.gravity[:2], self.air_drag, self.bending_damping)
+            air = Medium.air(self.mass_per_length, self.gravity, self.air_drag, self.bending_damping)
             return replace(thread, medium=air)
         return thread
 

@@ -67,10 +67,13 @@ class ThreadModelNode(Node):
 
     def on_seen_thread(self, message: Path) -> None:
         """Keep the thread that the camera sees, to start from."""
-        if self._predictor.started or self._settings.initial_shape != "seen":
+        if self._settings.initial_shape != "seen":
+            return
+        stamp = messages.seconds(message.header.stamp)
+        if self._predictor.started and stamp >= self._last - REPLAYED:
             return
         try:
-            self._seen = (messages.seconds(message.header.stamp), messages.path_points(message))
+            self._seen = (stamp, messages.path_points(message))
         except InvalidInputError as error:
             self._health.refuse(error)
             return
@@ -86,7 +89,10 @@ class ThreadModelNode(Node):
         pose = messages.needle_pose(message)
         if pose.stamp < self._last - REPLAYED:
             self._predictor.reset()
-            self._seen = None
+            self._last = -np.inf
+            self._early.clear()
+            if self._seen is not None and self._seen[0] > pose.stamp:
+                self._seen = None  # of the time before it was set back
         if self._predictor.started:
             prediction = self._predictor.step(pose)
         else:
@@ -111,7 +117,11 @@ class ThreadModelNode(Node):
     def _publish(self, message: PoseStamped, prediction: Prediction, step_time: float) -> None:
         stamp, settings = message.header.stamp, self._settings
         self._predicted.publish(messages.prediction_message(stamp, prediction, settings.material, step_time))
-        self._margins.publish(messages.margins_message(stamp, prediction, settings.contact_tolerance))
+        if prediction.converged:
+            margins = messages.margins_message(stamp, prediction, settings.contact_tolerance)
+        else:
+            margins = messages.invalid_margins(stamp, prediction.status)
+        self._margins.publish(margins)
         self._markers.publish(messages.thread_markers(stamp, prediction, self._thread.diameter))
         figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
         if prediction.status in (SOLVED, STARTED):

@@ -37,8 +37,8 @@ class CaseScore:
         max_error_percent: the largest over time.
         max_stretch: greatest length of a segment over what it should be, less one.
         max_penetration_m: deepest that a node was in the obstacle, 0 if none was.
-        step_median_s: of the wall-clock time of a sample's step, margins included.
-        step_p99_s: of the same.
+        step_median_s: of the wall-clock time of a sample's step, without the margins' message [s].
+        step_p99_s: of the same [s].
         max_residual: the largest scaled residual of a solve.
         fallbacks: steps whose first solve did not pass its residual check.
     """

@@ -8,22 +8,25 @@ import pytest
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
 from magnetosuture_thread.model.needle import NeedleFilter
-from magnetosuture_thread.model.program import Residuals
-from magnetosuture_thread.model.solvers import BandedSolver
+from magnetosuture_thread.model.program import Residuals, Solver
+from magnetosuture_thread.model.solvers import BandedSolver, OsqpSolver
 
 DISC = Disc((0.0, 0.0), 2e-3)
 CORNER = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.005, 0.01), (0.005, 0.005), (0.0, 0.005)))  # an L
 
 
-def filtered(obstacles: tuple[Disc | Polygon, ...], position: list[float], commanded: list[float]) -> np.ndarray:
+def filtered(
+    obstacles: tuple[Disc | Polygon, ...], position: list[float], commanded: list[float], solver: Solver | None = None
+) -> np.ndarray:
     """Return the safe velocity."""
-    needle = NeedleFilter(Surroundings(obstacles, 5e-3), 2e-4, 20.0, BandedSolver())
+    needle = NeedleFilter(Surroundings(obstacles, 5e-3), 2e-4, 20.0, solver or BandedSolver())
     return needle.safe_velocity(np.array(position), np.array(commanded))
 
 
 def test_far_from_obstacles_the_needle_goes_where_it_is_told():
     np.testing.assert_allclose(filtered((DISC,), [9e-3, 0.0], [-5e-3, 1e-3]), [-5e-3, 1e-3], atol=1e-12)
     np.testing.assert_allclose(filtered((), [0.0, 0.0], [-5e-3, 1e-3]), [-5e-3, 1e-3], atol=1e-12)
+    np.testing.assert_allclose(filtered((), [0.0, 0.0], [-5e-3, 1e-3], OsqpSolver()), [-5e-3, 1e-3], atol=1e-9)
 
 
 def test_towards_an_obstacle_it_slows_down_and_slides_along():

@@ -88,6 +88,13 @@ def test_a_far_bound_does_not_make_light_of_the_others():
     assert residuals_of(far, outside, np.zeros(2)).primal == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("bound", ["lower", "upper"])
+def test_a_bound_that_is_no_number_is_never_met(bound: str):
+    program = one_node()
+    broken = program._replace(**{bound: np.array([1.0, np.nan])})
+    assert residuals_of(broken, at(0.0, 0.0), np.zeros(2)).largest == np.inf
+
+
 def test_the_worse_of_two_residuals_is_taken_one_by_one():
     assert Residuals(1.0, 2.0, 3.0).or_worse(Residuals(3.0, 0.0, 4.0)) == Residuals(3.0, 2.0, 4.0)
 

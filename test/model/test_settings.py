@@ -70,6 +70,10 @@ def test_sharp_corners_are_rounded():
         ({"solver": "magic"}, "one of banded, osqp"),
         ({"medium": "honey"}, "one of liquid, air"),
         ({"gravity": [9.81]}, "multiple of 2"),
+        ({"medium": "air", "gravity": [0.0, -9.8, 1.0, 2.0]}, "two numbers"),
+        ({"gravity": [0.0, -9.81]}, "gravity.*medium air only"),
+        ({"medium": "air", "viscosity": 0.5}, "viscosity.*medium liquid only"),
+        ({"rest_curvature": 900.0}, "half a radian"),
         ({"segments": 400}, "longer than thick"),
     ],
 )

@@ -142,6 +142,7 @@ def test_the_papers_formulation_runs_in_the_graph(graph):
     assert {least.kind for least in margins[-1].least} == {
         BarrierMargin.KIND_CONNECTIVITY,
         BarrierMargin.KIND_ENHANCED_CONNECTIVITY,
+        BarrierMargin.KIND_STIFFNESS,
     }
 
 
@@ -199,6 +200,34 @@ def test_time_set_back_starts_anew(graph):
     graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.002))
     graph.wait(lambda: len(predicted) == 2, "the new start")
     assert predicted[1].solver_status == "started"
+
+
+def test_time_set_back_starts_anew_from_what_is_seen_then(graph):
+    graph.add(ThreadModelNode)
+    predicted = graph.listen(topics.PREDICTED_THREAD)
+    graph.publish(topics.SEEN_THREAD, seen(100.0))
+    graph.publish(topics.NEEDLE_POSE, pose(100.0))
+    graph.wait(lambda: len(predicted) == 1, "the start")
+    for k in range(3):
+        graph.publish(topics.SEEN_THREAD, seen(1.0 + 0.1 * k))
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + 0.1 * k))
+        graph.wait(lambda k=k: len(predicted) == 2 + k, "a prediction after the bag began again")
+    assert [p.solver_status for p in predicted[1:]] == ["started", "solved", "solved"]
+
+
+def test_a_step_that_did_not_converge_gives_no_margin(graph):
+    graph.add(
+        ThreadModelNode,
+        initial_shape="straight",
+        disc_obstacles=[c for k in range(12) for c in (-0.005 + 0.0005 * k, 0.004, 0.001)],
+        longest_step=0.1,
+    )
+    margins, predicted = graph.listen(topics.MARGINS), graph.listen(topics.PREDICTED_THREAD)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: len(margins) == 1, "the start")
+    graph.publish(topics.NEEDLE_POSE, pose(1.01, 0.0, 0.0185))
+    graph.wait(lambda: len(predicted) == 2 and len(margins) == 2, "a prediction")
+    assert margins[1].valid == ("not converged" not in predicted[1].solver_status)
 
 
 def test_an_unproven_solution_gives_no_margin(graph):

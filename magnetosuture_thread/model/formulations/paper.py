@@ -14,7 +14,8 @@ Source: [Forghani2025], controller. Deviation: enhanced connectivity with 2 Delt
 obstacle function is signed, see `SquaredObstacleAvoidance`, and where it is below 0 the signed distance
 stands for it, with a compliance of 1e-7: its own gradient vanishes on the surface, and nodes that are inside
 of two obstacles at once could not obey two hard rows. What the paper leaves open, alpha, gamma,
-W_stiff of each material and the lead's order, is in `PaperOptions`.
+W_stiff of each material and the lead's order, is in `PaperOptions`; a gain is never taken higher than 1 / dt,
+where the discrete step would overshoot the barrier.
 """
 
 from __future__ import annotations
@@ -28,11 +29,18 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Surroundings, SurroundingsData
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, EnhancedConnectivity, ObstacleAvoidance
+from magnetosuture_thread.model.barriers import (
+    BarrierRows,
+    Connectivity,
+    EnhancedConnectivity,
+    ObstacleAvoidance,
+    Stiffness,
+)
 from magnetosuture_thread.model.barriers.connectivity import distance_barrier
 from magnetosuture_thread.model.barriers.obstacle import squared_barrier
 from magnetosuture_thread.model.barriers.stiffness import stiffness_function
 from magnetosuture_thread.model.formulations.step import (
+    ROW_REACH,
     Drive,
     Memory,
     StepSolution,
@@ -44,8 +52,6 @@ from magnetosuture_thread.model.formulations.step import (
 from magnetosuture_thread.model.mechanics import rest_distances
 from magnetosuture_thread.model.program import Solver, Vector
 from magnetosuture_thread.model.thread import Thread
-
-ROW_REACH = 1.0  # segments; obstacles farther from a node than this have no row in the program
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,8 @@ class PaperFormulation:
         before, velocities = state.positions / unit, state.velocities / unit
         moved, known = driven(before, drive, unit)
         start = moved if options.lead_ahead else before
+        if state.interval == 0.0:
+            self._memory.forget()
         while True:
             contacts = _assemble(
                 self._memory,
@@ -121,8 +129,8 @@ class PaperFormulation:
                 unit,
                 0.5 * self._thread.diameter,
                 options.damping,
-                options.gain,
-                options.stiffness_gain,
+                min(options.gain, 1.0 / interval),
+                min(options.stiffness_gain, 1.0 / interval),
                 1.0 / options.connectivity_weight,
                 1.0 / options.stiffness_weight,
             )
@@ -132,24 +140,28 @@ class PaperFormulation:
         count = self._rows + contacts
         solution = self._solver.solve(self._memory.program(count, known), velocities, self._memory.multipliers[:count])
         if not solution.residuals.largest <= self._tolerance:
-            self._memory.multipliers[:] = self._memory.push[:] = 0.0
+            self._memory.forget()
             raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
         self._memory.multipliers[:count] = solution.multipliers
         remember_push(self._memory.node, solution.multipliers[self._rows :], self._memory.push)
         end = moved + interval * solution.velocities
         after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
-        return StepSolution(after, solution.solver, solution.status, solution.residuals, 1)
+        return StepSolution(after, solution.solver, solution.status, solution.residuals, 1, converged=True)
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the segments' length at rest; see `Formulation`."""
         return np.full(self._thread.segments, self._thread.segment_length)
 
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return every barrier; see `Formulation`. There is none of compression in this formulation."""
+        """Return every barrier; see `Formulation`. There is none of compression in this formulation.
+
+        Connectivity may give way, as the paper's has slack; what is left of it is what the margins say.
+        """
         unit = self._thread.segment_length
         return [
             Connectivity(unit).rows(positions),
             EnhancedConnectivity(unit).rows(positions),
+            Stiffness(unit * self._rest).rows(positions),
             ObstacleAvoidance(self._surroundings, 0.5 * self._thread.diameter).rows(positions),
         ]
 

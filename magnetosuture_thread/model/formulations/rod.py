@@ -10,12 +10,15 @@ the needle's tail among them, have moved before the step and are no unknowns.
 In a viscous liquid Z_i is the drag, and the rate of change at the end of the step is the second-order
 backward difference a u - v, with v = b times the last step's velocities, a = (1 + 2 w) / (1 + w),
 b = w / (1 + w), and w = dt over the last step's dt; the first step, and one more than twice as long as
-the last, has a = 1, v = 0. With inertia Z_i is mass / dt + drag, a = 1 and v = velocity + dt g.
+the last, has a = 1, v = 0. In air there is besides the drag, with a = 1 and v = 0, the inertia
+
+    1/2 sum_i (m_i / dt) |u_i - (velocity_i + dt g)|^2
 
 The barriers are linearised about the end point that the last velocities predict, and again at the one
-that each solve predicts until it is exact, as the discrete-time condition
-h(x + dt u) >= (1 - alpha dt) h(x) with alpha = 1 / dt. One solve is nearly always enough: the prediction
-is of second order already, and with the constraints' curvature in P each solve is a Newton step.
+that each solve predicts, as the discrete-time condition h(x + dt u) >= (1 - alpha dt) h(x) with
+alpha = 1 / dt, until segments are right to a thousandth and nodes to 1e-7 m, or for `MOST_SOLVES` times.
+One solve is nearly always enough: the prediction is of second order already, and with the constraints'
+curvature in P (`rod_program`) each solve is a Newton step.
 
 Source: [Forghani2025], controller (quadratic program over all velocities). Deviation: the objective is
 dissipation and elastic energy instead of |u - kappa v|^2, the thread may not be compressed, segments have
@@ -32,13 +35,20 @@ from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance
-from magnetosuture_thread.model.formulations.rod_program import Rod, assemble
-from magnetosuture_thread.model.formulations.step import Drive, Memory, StepSolution, ThreadState, driven, remember_push
+from magnetosuture_thread.model.formulations.rod_program import LONGEST_RATIO, Rod, assemble
+from magnetosuture_thread.model.formulations.step import (
+    ROW_REACH,
+    Drive,
+    Memory,
+    StepSolution,
+    ThreadState,
+    driven,
+    remember_push,
+)
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.thread import Attachment, Thread
 
 MOST_SOLVES = 8  # in a step
-ROW_REACH = 1.0  # segments; obstacles farther from a node than this have no row in the program
 
 
 class RodFormulation:
@@ -83,22 +93,20 @@ class RodFormulation:
         before = state.positions / unit
         velocities = last = state.velocities / unit
         start, known = driven(before, drive, unit)
-        about, worst, solves, status = (
-            _extrapolated(start, velocities, known, interval),
-            Residuals(0.0, 0.0, 0.0),
-            0,
-            SOLVED,
-        )
+        if state.interval == 0.0:
+            self._memory.forget()
+        about = _extrapolated(start, velocities, known, interval, state.interval)
+        worst, solves, status = Residuals(0.0, 0.0, 0.0), 0, SOLVED
         while True:
-            contacts, reached = self._assemble(
+            contacts, off = self._assemble(
                 solves, about, start, before, last, known, drive.heading, interval, state.interval
             )
-            if reached or solves == MOST_SOLVES:
+            if off <= 1.0 or solves == MOST_SOLVES:
                 break
             program = self._memory.program(segments + contacts, known)
             solution = self._solver.solve(program, velocities, self._memory.multipliers[: segments + contacts])
             if not solution.residuals.largest <= self._tolerance:
-                self._memory.multipliers[:] = self._memory.push[:] = 0.0
+                self._memory.forget()
                 raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
             worst, solves, velocities = worst.or_worse(solution.residuals), solves + 1, solution.velocities
             status = status if status != SOLVED else solution.status
@@ -107,7 +115,9 @@ class RodFormulation:
                 remember_push(self._memory.node, solution.multipliers[segments:], self._memory.push)
             about = start + interval * velocities  # known nodes have moved, and have no velocity
         end = ThreadState(about * unit, (about - before) * (unit / interval), interval)
-        return StepSolution(end, solution.solver, status, worst, solves)
+        if off > 1.0:
+            status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
+        return StepSolution(end, solution.solver, status, worst, solves, converged=off <= 1.0)
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the chords of the segments' arcs; see `Formulation`."""
@@ -134,9 +144,9 @@ class RodFormulation:
         heading: Points,
         interval: float,
         last_interval: float,
-    ) -> tuple[int, bool]:
+    ) -> tuple[int, float]:
         while True:
-            contacts, reached = assemble(
+            contacts, off = assemble(
                 solves,
                 self._rod,
                 self._memory,
@@ -151,12 +161,20 @@ class RodFormulation:
                 last_interval,
             )
             if contacts >= 0:
-                return contacts, reached
+                return contacts, off
             self._memory = self._memory.with_room()
 
 
-def _extrapolated(start: Points, velocities: Points, known: NDArray[np.bool_], interval: float) -> Points:
-    """Return where the thread would be if it moved on as it did: the first guess, of second order."""
+def _extrapolated(
+    start: Points, velocities: Points, known: NDArray[np.bool_], interval: float, last_interval: float
+) -> Points:
+    """Return where the thread would be if it moved on as it did: the first guess, of second order.
+
+    Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
+    farther than a segment: then the guess is where the thread is.
+    """
+    if last_interval <= 0.0 or interval > LONGEST_RATIO * last_interval:
+        return start
     end = start + interval * velocities
     end[known] = start[known]
-    return end
+    return end if np.abs(end - start).max() <= 1.0 else start

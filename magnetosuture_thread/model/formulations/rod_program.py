@@ -52,20 +52,20 @@ def assemble(
     heading: Points,
     interval: float,
     last_interval: float,
-) -> tuple[int, bool]:
+) -> tuple[int, float]:
     """Write the program about a predicted end point; where that came from a solve and is exact, do not.
 
-    Returns the number of contacts, -1 if there is no room for them, and whether that was so.
+    Returns the number of contacts, -1 if there is no room for them, and how far off the barriers the point
+    is: the stretch or the depth over what is allowed, 1 or less if it is exact.
     """
     segments = len(about) - 1
-    if solves == 0:
-        mechanics.chord_lengths(about, heading, rod.glued, memory.chords)
+    mechanics.chord_lengths(about, heading, rod.glued, memory.chords)
     stretch = _segment_rows(memory, about, start, known, interval)
     contacts, depth = contact_rows(memory, segments, surroundings, about, start, known, interval, rod.unit, rod.radius)
-    reached = solves > 0 and stretch <= STRETCH_REACHED and depth <= DEPTH_REACHED
-    if contacts >= 0 and not reached:
+    off = max(stretch / STRETCH_REACHED, depth / DEPTH_REACHED)
+    if contacts >= 0 and (solves == 0 or off > 1.0):
         _objective(rod, memory, about, start, before, last, heading, interval, last_interval)
-    return contacts, reached
+    return contacts, off if solves > 0 else np.inf
 
 
 @compiled
@@ -82,9 +82,10 @@ def _objective(
 ) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
-    P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z v    (with inertia: only its part of Z)
+        P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z v
 
-    `shift` is the velocity of the driven nodes, which have moved already.
+    and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the driven nodes, which have
+    moved already. In air a = 1, and of Z v only the inertia's part is left.
     """
     nodes, dimension = start.shape
     blocks, couplings, linear = memory.blocks, memory.couplings, memory.linear
@@ -163,6 +164,9 @@ def _segment_rows(memory: Memory, about: Points, start: Points, known: NDArray[n
                 bound -= memory.gradient[i, k, a] * (start[begin + k, a] - about[begin + k, a])
         memory.lower[i] = memory.upper[i] = bound / interval
         memory.compliance[i] = COMPLIANCE
-        if not (known[i] and known[i + 1]):
+        if known[i] and known[i + 1]:
+            # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
+            memory.lower[i], memory.upper[i], memory.multipliers[i] = -np.inf, np.inf, 0.0
+        else:
             stretch = max(stretch, abs(memory.value[i]))
     return stretch

@@ -14,6 +14,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Vector
 
+ROW_REACH = 1.0  # segments; obstacles farther from a node than this have no row in the program
 PUSHING_OUT = 1e-7  # compliance of a contact that has to push a node out
 
 
@@ -62,6 +63,7 @@ class StepSolution:
         status: its own word for the last solve; of a solve that was not at once accepted, if there was one.
         residuals: the largest of each kind over the step's solves.
         solves: number of programs solved.
+        converged: whether the end satisfies the barriers themselves, not only their last linearisation.
     """
 
     state: ThreadState
@@ -69,6 +71,7 @@ class StepSolution:
     status: str
     residuals: Residuals
     solves: int
+    converged: bool
 
 
 class Formulation(Protocol):
@@ -107,7 +110,7 @@ class Memory(NamedTuple):
         upper: shape (r,).
         compliance: shape (r,).
         value: h of each row, shape (r,).
-        multipliers: a guess for the next solve, shape (r,).
+        multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
         chords: length of each segment, shape (n,).
         work: shape (3, n + 1, d).
         node: contacts: as `find_near` writes them, shape (c,).
@@ -163,13 +166,19 @@ class Memory(NamedTuple):
         )
 
     def with_room(self) -> Memory:
-        """Return memory for twice as many contacts, with the same guess."""
+        """Return memory for twice as many contacts, with the same chords and multipliers."""
         nodes, dimension = self.linear.shape
         rows = len(self.first) - len(self.node)
         larger = Memory.of(nodes, dimension, rows, 2 * len(self.node))
         larger.multipliers[:rows] = self.multipliers[:rows]
+        larger.chords[:] = self.chords
         larger.push[:] = self.push
         return larger
+
+    def forget(self) -> None:
+        """Forget the last solve: the next step starts without tension and contacts."""
+        self.multipliers[:] = 0.0
+        self.push[:] = 0.0
 
     def program(self, count: int, known: NDArray[np.bool_]) -> ChainProgram:
         """Return the program with the first rows."""

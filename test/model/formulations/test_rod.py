@@ -10,6 +10,7 @@ import pytest
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
 from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, ThreadState
+from magnetosuture_thread.model.formulations.step import Memory
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.model.thread import Attachment, Thread
@@ -230,6 +231,69 @@ def test_held_nodes_stay_and_driven_nodes_go_where_they_are_told():
         np.testing.assert_allclose(state.positions[[0, 12, 25]], [tail, held, end], atol=1e-15)
         assert done.residuals.largest < TOLERANCE
         assert stretch(thread, state.positions) < 5e-3
+
+
+def test_two_neighbours_that_are_held_do_not_pull_at_the_others():
+    """Nothing can change the length between them, so no tension may try: it would straighten what is near."""
+    thread = polyamide(rest_curvature=300.0)
+    start = bent(thread, 300.0 * thread.segment_length)
+    moved = {}
+    for held in ((12,), (12, 13)):
+        formulation, state = formulated(thread), ThreadState.at_rest(start)
+        drive = Drive((0, *held), start[[0, *held]], east())
+        for _ in range(60):
+            state = formulation.step(state, drive, DT).state
+        moved[held] = np.abs(state.positions - start).max()
+    assert moved[(12, 13)] < 2.0 * moved[(12,)] + 1e-6
+
+
+def test_a_thread_among_hundreds_of_obstacles_keeps_its_length():
+    """More contacts than there is room for at first, and more of them while a step is solved."""
+    thread = polyamide()
+    beads = tuple(
+        Disc((-0.001 - 0.0008 * i, sign * (0.00045 + 0.0001 * k)), 0.0004)
+        for i in range(24) for sign in (-1.0, 1.0) for k in range(3)
+    )  # fmt: skip
+    formulation = formulated(thread, beads)
+    for done in followed(formulation, straight(thread), lambda k: np.array([4e-5 * k, 0.0]), 60):
+        lengths = np.linalg.norm(np.diff(done.state.positions, axis=0), axis=1) / thread.segment_length
+        assert np.abs(lengths - 1.0).max() < 1e-2
+        assert clearance(formulation, done.state.positions) > -1e-6
+
+
+def test_memory_that_grows_keeps_the_chords_and_the_multipliers():
+    memory = Memory.of(6, 2, 5, 3)
+    memory.chords[:], memory.multipliers[:], memory.push[:] = 0.9, 7.0, 3.0
+    larger = memory.with_room()
+    assert len(larger.node) == 6
+    np.testing.assert_array_equal(larger.chords, 0.9)
+    np.testing.assert_array_equal(larger.multipliers[:5], 7.0)
+    np.testing.assert_array_equal(larger.push, 3.0)
+
+
+def test_a_thread_that_starts_anew_knows_nothing_of_the_last():
+    thread = polyamide(Attachment.GLUED)
+    used, fresh = formulated(thread), formulated(thread)
+    state = ThreadState.at_rest(straight(thread))
+    for step in range(1, 20):
+        state = used.step(
+            state, Drive((0, 25), np.array([[1e-4 * step, 0.0], [-thread.length, 0.0]]), east()), DT
+        ).state
+    for formulation in (used, fresh):
+        steps = followed(formulation, bent(thread), lambda k: k * 2e-5 * east(), 5)
+        if formulation is used:
+            again = steps
+    for one, other in zip(again, steps, strict=True):
+        np.testing.assert_array_equal(one.state.positions, other.state.positions)
+
+
+def test_a_step_that_does_not_converge_says_so():
+    """The needle is put half a thread away within one step, through a disc that cannot be passed."""
+    thread = polyamide()
+    formulation = formulated(thread, tuple(Disc((-0.005 + 0.0005 * k, 0.004), 0.001) for k in range(12)))
+    done = formulation.step(ThreadState.at_rest(straight(thread)), lead(np.array([0.0, 0.0185])), 1e-3)
+    assert not done.converged
+    assert "not converged in 8 linearisations" in done.status
 
 
 def test_ends_pulled_apart_by_more_than_the_thread_are_survived():
