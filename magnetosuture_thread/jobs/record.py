@@ -24,7 +24,7 @@ from magnetosuture_thread.interface import (
     TRUE_THREAD,
 )
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.model.thread import MATERIALS, Attachment
+from magnetosuture_thread.model.thread import Attachment
 from magnetosuture_thread.rig.camera import DishCamera, Scene, encode_jpeg
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
@@ -81,7 +81,7 @@ def record(
         dish_diameter=setup.vision.dish_diameter,
         needle_length=setup.vision.needle_length,
         needle_width=setup.vision.needle_width,
-        thread_diameter=MATERIALS[setup.model.material].diameter,
+        thread_diameter=setup.model.thread().diameter,
         posts=reference.discs,
     )
     camera = DishCamera(scene, view, SIZE, seed)

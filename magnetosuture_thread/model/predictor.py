@@ -116,7 +116,8 @@ class ThreadPredictor:
         path = -self.thread.segment_length * np.arange(self.thread.segments + 1)[:, None] * east
         self.start_at(NeedlePose(0.0, np.zeros(dimension), east), path)
         for count in (1, 2):
-            self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
+            prediction = self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
+        assert prediction.margins  # which are worked out by kernels of their own
         self.reset()
 
     def reset(self) -> None:

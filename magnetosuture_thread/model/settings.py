@@ -13,7 +13,7 @@ from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formu
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import ThreadPredictor
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
 
 MEDIA = ("liquid", "air")
 OF_MEDIUM = {
@@ -38,6 +38,10 @@ class ThreadModelSettings(Configuration):
     )
     solver: str = quantity("banded", "what solves a step's program", choices=SOLVERS)
     material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
+    diameter: float = quantity(0.0, "of the thread; 0 takes the material's", unit="m", minimum=0.0, maximum=0.01)
+    elastic_modulus: float = quantity(
+        0.0, "effective modulus of the thread in bending; 0 takes the material's", unit="Pa", minimum=0.0, maximum=1e12
+    )
     length: float = quantity(0.019, "rest length of the thread", unit="m", minimum=0.001, maximum=2.0)
     segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
     attachment: str = quantity(
@@ -163,7 +167,7 @@ class ThreadModelSettings(Configuration):
             if not polygon.has_room_for(least):
                 name, words = f"{self.GROUP}.polygon_obstacles", "polygons with room for a disc of a radius of at least"
                 raise ConfigurationError(name, f"polygon {index}", f"{words} {least:g} m, half of a segment")
-        diameter = MATERIALS[self.material].diameter
+        diameter = self._material().diameter
         if self.length / self.segments <= diameter:
             most = math.ceil(self.length / diameter) - 1
             raise ConfigurationError(
@@ -223,10 +227,18 @@ class ThreadModelSettings(Configuration):
             polygons.append(polygon)
         return tuple(polygons)
 
+    def _material(self) -> Material:
+        material = MATERIALS[self.material]
+        return replace(
+            material,
+            diameter=self.diameter or material.diameter,
+            elastic_modulus=self.elastic_modulus or material.elastic_modulus,
+        )
+
     def thread(self) -> Thread:
         """Return the thread."""
         thread = Thread.of(
-            MATERIALS[self.material],
+            self._material(),
             length=self.length,
             segments=self.segments,
             attachment=Attachment(self.attachment),

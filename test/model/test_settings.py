@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import numpy as np
 import pytest
+from numba.core.registry import CPUDispatcher
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
@@ -108,9 +110,38 @@ def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
     assert prediction.residual < 1e-6
 
 
+def test_a_material_can_be_another_than_those_that_are_known():
+    known, other = made().thread(), made(diameter=1.2e-4, elastic_modulus=1e9).thread()
+    assert other.diameter == 1.2e-4
+    assert other.bending_stiffness == pytest.approx(8.0 * known.bending_stiffness)
+    assert other.medium.drag_across > known.medium.drag_across
+
+
 def test_inertia_and_weight_come_from_the_settings():
     thread = made(medium="air", mass_per_length=1e-5, air_drag=2e-4, gravity=[0.0, -9.81]).thread()
     assert thread.medium.mass_per_length == 1e-5
     assert thread.medium.drag_across == thread.medium.drag_along == 2e-4
     assert thread.medium.gravity == (0.0, -9.81)
     assert made().thread().medium.mass_per_length == 0.0
+
+
+def kernels() -> int:
+    """Return how many kernels of ours are compiled, or loaded from the cache, by now."""
+    ours = (found for found in gc.get_objects() if isinstance(found, CPUDispatcher))
+    return sum(len(found.signatures) for found in ours if found.py_func.__module__.startswith("magnetosuture_thread"))
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+def test_no_kernel_is_compiled_once_the_predictor_is_made(formulation: str):
+    """Else the first callback, or the first contact in the middle of an operation, would wait for a compiler."""
+    obstacles = {"polygon_obstacles": SQUARE, "polygon_sizes": [4], "disc_obstacles": [-0.009, 0.002, 0.0015]}
+    predictor = made(formulation=formulation, **obstacles).predictor()
+    before = kernels()
+    east, tail = np.array([1.0, 0.0]), np.array([-0.001, 0.0])
+    predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
+    touched = False
+    for k in range(1, 200):
+        prediction = predictor.step(NeedlePose(k / 60.0, tail + k * np.array([0.0, 6e-5]), east))
+        touched = touched or bool((prediction.margins[-1].clearance < 1e-5).any())
+    assert touched
+    assert kernels() == before

@@ -111,8 +111,7 @@ class RodFormulation:
             worst, solves, velocities = worst.or_worse(solution.residuals), solves + 1, solution.velocities
             status = status if status != SOLVED else solution.status
             self._memory.multipliers[: segments + contacts] = solution.multipliers
-            if contacts:
-                remember_push(self._memory.node, solution.multipliers[segments:], self._memory.push)
+            remember_push(self._memory.node, solution.multipliers[segments:], self._memory.push)
             about = start + interval * velocities  # known nodes have moved, and have no velocity
         end = ThreadState(about * unit, (about - before) * (unit / interval), interval)
         if off > 1.0:
