@@ -53,7 +53,7 @@ def test_a_thread_that_follows_its_needle_is_predicted(tmp_path: Path, solver: s
     found, courses = scored([write(tmp_path, "straight")], solver=solver)
     case = found.cases[0]
     assert case.mean_error_percent < 1e-3
-    assert case.max_stretch < 1e-6
+    assert case.max_stretch < 1e-4
     assert case.max_residual < 1e-6
     assert case.max_penetration_m == 0.0
     assert case.fallbacks == 0
