@@ -60,6 +60,8 @@ def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFi
         ["evaluate", "dir", "--formulation", "magic"],
         ["evaluate", "dir", "--solver", "magic"],
         ["evaluate", "dir", "--segments", "2"],
+        ["evaluate", "dir", "--json", "/no/such/folder/x.json"],
+        ["bench", "--json", "."],
         ["bench", "--peers", "all"],
     ],
 )

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
-from magnetosuture_thread.compiled import compiled, forget_stale_kernels
+from magnetosuture_thread.compiled import PACKAGE, compiled, forget_stale_kernels
 
 
 def test_a_compiled_function_is_the_same_function():
@@ -44,6 +46,17 @@ def test_kernels_are_forgotten_when_any_file_with_compiled_functions_changes(tmp
     os.utime(callee, (1.0, 1.0))
     assert forget_stale_kernels(tmp_path)
     assert not cached()
+
+
+def test_a_second_start_compiles_nothing():
+    """A kernel that numba cannot find again would be compiled, and kept once more, at every start."""
+    code = "from magnetosuture_thread.model.settings import ThreadModelSettings as S; S().predictor()"
+
+    def started() -> set[Path]:
+        subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+        return set(PACKAGE.rglob("*.nbc"))
+
+    assert started() == started()
 
 
 def test_a_package_that_cannot_be_written_is_left_alone(tmp_path: Path):

@@ -68,7 +68,7 @@ def evaluate(options: argparse.Namespace) -> int:
     console = Console(highlight=False)
     paths = find_references(options.folder)
     if options.pictures:
-        options.pictures.mkdir(parents=True)
+        options.pictures.mkdir(parents=True, exist_ok=True)
 
     def keep(course: Course) -> None:
         if options.pictures:
@@ -84,8 +84,8 @@ def evaluate(options: argparse.Namespace) -> int:
             progress=lambda share: progress.update(task, completed=share),
             keep=keep,
         )
-    _write_json(options.json, json.dumps(evaluation.to_mapping(), indent=2, allow_nan=False))
     console.print(evaluation_table(evaluation))
+    _write_json(options.json, json.dumps(evaluation.to_mapping(), indent=2, allow_nan=False))
     return DONE
 
 
@@ -98,10 +98,10 @@ def bench(options: argparse.Namespace) -> int:
     with _progress(console) as progress:
         task = progress.add_task("bench", total=1.0)
         report = measure(peers=options.peers, progress=lambda share: progress.update(task, completed=share))
-    _write_json(options.json, report.to_json())
     console.print(bench_table(report))
     for line in bench_lines(report):
         console.print(line, soft_wrap=True, markup=False)
+    _write_json(options.json, report.to_json())
     return DONE
 
 

@@ -94,13 +94,13 @@ def make_parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--segments", type=segments, metavar="N", help="number of segments (default: the paper's, as each file says)"
     )
-    evaluate.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file")
-    evaluate.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each case into a folder to make")
+    evaluate.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to a file")
+    evaluate.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each case into a folder")
     bench = _command(subparsers, "bench", "time the model on this machine", BENCH, commands.bench)
     bench.add_argument(
         "--peers", action="store_true", help="time other solvers and simulators too (needs the extra `peers`)"
     )
-    bench.add_argument("--json", type=Path, metavar="FILE", help="write the figures to a file")
+    bench.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to a file")
     return parser
 
 
@@ -150,3 +150,11 @@ def segments(text: str) -> int:
     if not 3 <= count <= 2000:
         raise argparse.ArgumentTypeError(f"{text!r} is no number of segments from 3 to 2000")
     return count
+
+
+def output_file(text: str) -> Path:
+    """Return a file to write, in a folder that exists: an argument type."""
+    path = Path(text)
+    if not path.parent.is_dir() or path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is no file in a folder that exists")
+    return path

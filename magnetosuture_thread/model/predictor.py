@@ -90,7 +90,7 @@ class ThreadPredictor:
         formulation: Formulation,
         thread: Thread,
         *,
-        longest_step: float = 1.0 / 66.0,
+        longest_step: float = 0.02,
         most_substeps: int = 200,
         held: Sequence[int] = (),
     ) -> None:

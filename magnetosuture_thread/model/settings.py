@@ -101,8 +101,8 @@ class ThreadModelSettings(Configuration):
         choices=("seen", "straight"),
     )
     longest_step: float = quantity(
-        1.0 / 60.0,
-        "intervals between poses are divided into steps of at most this",
+        0.02,
+        "intervals between poses are divided into steps of at most this; at 60 Hz and faster each is one step",
         unit="s",
         minimum=1e-4,
         maximum=0.1,
@@ -175,6 +175,10 @@ class ThreadModelSettings(Configuration):
             )
         if len(self.gravity) not in (0, 2):
             raise ConfigurationError(f"{self.GROUP}.gravity", list(self.gravity), "two numbers, x and y, or none")
+        if self.formulation == "paper" and self.medium != "liquid":
+            raise ConfigurationError(
+                f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
+            )
         turn = abs(self.rest_curvature) * self.length / self.segments
         if turn > SHARPEST_TURN:
             sharpest = SHARPEST_TURN * self.segments / self.length
@@ -184,7 +188,9 @@ class ThreadModelSettings(Configuration):
             other = OF_MEDIUM.get(about.name, self.medium)
             if other != self.medium and getattr(self, about.name) != about.default:
                 name, value = f"{self.GROUP}.{about.name}", getattr(self, about.name)
-                raise ConfigurationError(name, value, f"its default, as it counts for the medium {other} only")
+                raise ConfigurationError(
+                    name, value, f"{about.default}, its default: it counts for medium: {other} only"
+                )
         for node in self.held_nodes:
             if node > self.segments:
                 raise ConfigurationError(f"{self.GROUP}.held_nodes", node, f"nodes from 1 to {self.segments}")
@@ -200,7 +206,9 @@ class ThreadModelSettings(Configuration):
     def _polygons(self) -> tuple[Polygon, ...]:
         name, corners = f"{self.GROUP}.polygon_sizes", len(self.polygon_obstacles) // 2
         if sum(abs(size) for size in self.polygon_sizes) != corners:
-            raise ConfigurationError(name, list(self.polygon_sizes), f"sizes that add up to {corners} corners")
+            raise ConfigurationError(
+                name, list(self.polygon_sizes), f"the corners of each outline, {corners} in all without their signs"
+            )
         shapes: list[list[tuple[tuple[float, float], ...]]] = []
         begin = 0
         for size in self.polygon_sizes:

@@ -22,7 +22,7 @@ from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, DIAGNOSTICS, NOD
 from magnetosuture_thread.nodes import topics
 
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
-START_TIMEOUT = 30.0  # s for all nodes to be there
+START_TIMEOUT = 180.0  # s for all nodes to be there
 SETTLE = 0.5  # s after we have found the nodes, for the nodes to have found us
 QUIET = 0.5  # s without any answer, once the tracker has taken all frames: the graph is done
 DRAIN_TIMEOUT = 30.0  # s after the last input at the most

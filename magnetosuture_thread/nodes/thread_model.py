@@ -32,6 +32,7 @@ class ThreadModelNode(Node):
         super().__init__("thread_model", automatically_declare_parameters_from_overrides=True, **options)
         self._settings = declare(self, ThreadModelSettings)
         self._thread = self._settings.thread()
+        self.get_logger().info("loading the model's kernels; the first start on a machine compiles them")
         self._predictor = self._settings.predictor()
         self._health = Health(self)
         self._seen: tuple[float, np.ndarray] | None = None
@@ -45,6 +46,10 @@ class ThreadModelNode(Node):
         topics.SEEN_THREAD.subscribe(self, self.on_seen_thread)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
         self._health.warn("no needle pose yet")
+        self.get_logger().info(
+            f"ready: {self._settings.segments} segments of {self._settings.material}, "
+            f"{len(self._settings.obstacles())} obstacles, {self._settings.formulation} by {self._settings.solver}"
+        )
 
     def on_pose(self, message: PoseStamped) -> None:
         """Step the thread to a needle pose; where that cannot be done, say so.

@@ -23,7 +23,6 @@ from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.study.reference import NOT_ONE, ReferenceTrajectory, read_reference
 
 TOLERANCE = 1e-6  # of the residuals
-SAMPLE = 1.0 / 60.0  # s; samples at 66 Hz are one step each
 NEAR = 3e-3  # m; within this of an obstacle, depths are looked at
 
 
@@ -170,7 +169,7 @@ def score_one(
     thread, paper = thread_of(reference, path, segments)
     surroundings = Surroundings(reference.discs, NEAR)
     chosen = make_formulation(formulation, thread, surroundings, make_solver(solver, TOLERANCE), TOLERANCE, paper)
-    predictor = ThreadPredictor(chosen, thread, longest_step=SAMPLE)
+    predictor = ThreadPredictor(chosen, thread)
     predictor.warm_up()
     truth = np.stack([_resampled(curve, thread.segments) for curve in reference.threads])
     headings = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])

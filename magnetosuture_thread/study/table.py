@@ -25,7 +25,7 @@ def summary_table(summary: Summary) -> Table:
         table.add_row(f"  {stage}", _milliseconds(spread), _tail(spread))
     table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
     table.add_section()
-    table.add_row("least margin", "", "safe at 0 or more, to 1e-9 m")
+    table.add_row("least margin", "", "0 or more is safe; lengths are met to 0.1 %")
     for margin in summary.least_margins:
         where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
         table.add_row(f"  {margin.kind}", f"{_micrometres(margin.clearance)} µm", f"{where}, at {margin.time:.2f} s")

@@ -48,7 +48,7 @@ def test_the_thread_starts_on_the_centreline_with_full_length(thread_arc):
 def test_steps_are_bounded_whatever_the_interval():
     predictor = started()
     assert predictor.step(pose(1.0 / 66.0)).substeps == 1
-    assert predictor.step(pose(1.0 / 66.0 + 1.0 / 30.0, 1e-4)).substeps == 3
+    assert predictor.step(pose(1.0 / 66.0 + 1.0 / 30.0, 1e-4)).substeps == 2
     late = predictor.step(pose(100.0, 2e-3))
     assert late.substeps == 200
     assert late.interval == pytest.approx(100.0 - 1.0 / 66.0 - 1.0 / 30.0)

@@ -52,8 +52,8 @@ def test_sharp_corners_are_rounded():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"polygon_obstacles": SQUARE}, "polygon_sizes: .* add up to 4 corners"),
-        ({"polygon_obstacles": SQUARE, "polygon_sizes": [3]}, "add up to 4 corners"),
+        ({"polygon_obstacles": SQUARE}, "polygon_sizes: .* 4 in all"),
+        ({"polygon_obstacles": SQUARE, "polygon_sizes": [3]}, "4 in all"),
         ({"polygon_obstacles": SQUARE, "polygon_sizes": [-4]}, "an outline before its holes"),
         ({"polygon_obstacles": SQUARE, "polygon_sizes": [4.0]}, "a list of whole numbers"),
         ({"polygon_obstacles": SQUARE[:-1], "polygon_sizes": [4]}, "multiple of 2"),
@@ -73,9 +73,10 @@ def test_sharp_corners_are_rounded():
         ({"medium": "honey"}, "one of liquid, air"),
         ({"gravity": [9.81]}, "multiple of 2"),
         ({"medium": "air", "gravity": [0.0, -9.8, 1.0, 2.0]}, "two numbers"),
-        ({"gravity": [0.0, -9.81]}, "gravity.*medium air only"),
-        ({"medium": "air", "viscosity": 0.5}, "viscosity.*medium liquid only"),
+        ({"gravity": [0.0, -9.81]}, "gravity.*medium: air only"),
+        ({"medium": "air", "viscosity": 0.5}, "viscosity.*medium: liquid only"),
         ({"rest_curvature": 900.0}, "half a radian"),
+        ({"formulation": "paper", "medium": "air"}, "paper has no inertia"),
         ({"segments": 400}, "longer than thick"),
     ],
 )

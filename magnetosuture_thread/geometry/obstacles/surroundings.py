@@ -118,4 +118,4 @@ def _check(name: str, shape: Obstacle, dimension: int) -> None:
     elif isinstance(shape, Polygon) and dimension != 2:
         raise ConfigurationError(name, "a polygon", "a disc or a mesh in space")
     elif isinstance(shape, Mesh) and dimension != 3:
-        raise ConfigurationError(name, "a mesh", "a disc or a polygon in the plane")
+        raise ConfigurationError(name, "a mesh", "a disc or a polygon in the plane; a mesh needs dimension=3")

@@ -20,21 +20,17 @@ QPALM. Deviation: the slacks are folded into the rows as compliances, and the ch
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Vector, compiled_residuals
-from magnetosuture_thread.model.solvers.band import band_functions
+from magnetosuture_thread.model.solvers.band import Axes, assemble, factorise, substitute
 
 STIFFEST = 1e7  # w_max over the scale of P: the least compliance that is exact at once
 SEARCHES = 50  # of the line search
 STALLS = 3  # Newton steps without a gain: rounding allows for no more
-ROUNDING = 1e-6  # scaled imbalance that is still a solution where rounding allows for no less
+ROUNDING = 1e-6  # scaled imbalance that is a solution where rounding allows for no less
 STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "stalled")
 SOLVED, LIMIT, INDEFINITE, NOT_FINITE, STALLED = range(5)
 
@@ -56,245 +52,248 @@ class BandedSolver:
         self._band = np.empty((0, 0))
         self._vectors = np.empty((0, 0))
         self._pushing = np.empty(0, dtype=np.bool_)
-        self._kernel: Callable[..., Any]
 
     def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
         """Solve one program, started from a guess; see `Solver`."""
         nodes, dimension = program.linear.shape
         self._reserve(nodes, dimension, len(program.first))
-        u, found = velocities.copy(), multipliers.copy()
-        status, iterations, residuals = self._kernel(
-            program, u, found, self._tolerance, self._iterations, self._band, self._vectors, self._pushing
+        u, found, axes = velocities.copy(), multipliers.copy(), (0, 1, 2)[:dimension]
+        status, iterations, residuals = solve_and_judge(
+            axes,
+            program,
+            u,
+            found,
+            self._tolerance,
+            self._iterations,
+            self._band,
+            self._vectors,
+            self._pushing,
         )
         return Solution(u, found, self.name, STATUS[status], iterations, Residuals(*residuals))
 
     def _reserve(self, nodes: int, dimension: int, rows: int) -> None:
         """Keep the workspace from step to step, so that no step pays for memory."""
+        width = SPAN * dimension
         if self._size != (nodes, dimension):
-            width = SPAN * dimension
-            self._band = np.empty((nodes * dimension + width, width + 1))
-            self._size = (nodes, dimension)
-            self._kernel = kernel(dimension)
-        wanted = max(nodes * dimension + SPAN * dimension, rows)
+            self._band, self._size = np.empty((nodes * dimension + width, width + 1)), (nodes, dimension)
+        wanted = max(nodes * dimension + width, rows)
         if self._vectors.shape[1] < wanted:
             self._vectors = np.empty((7, 2 * wanted))
             self._pushing = np.empty(2 * wanted, dtype=np.bool_)
 
 
-@lru_cache
-def kernel(dimension: int) -> Callable[..., Any]:
-    """Return the compiled method for a number of dimensions.
+@compiled
+def balance(axes: Axes, program: ChainProgram, u: NDArray[np.float64], smooth: Vector) -> float:
+    """Write P u + q and return its largest term."""
+    d, nodes, largest = len(axes), len(u), 1.0
+    for i in range(nodes):
+        for a in range(d):
+            value = 0.0
+            for b in range(d):
+                value += program.blocks[i, a, b] * u[i, b]
+            for apart in range(1, SPAN + 1):
+                if i >= apart:
+                    value += program.couplings[apart - 1, i - apart] * u[i - apart, a]
+                if i + apart < nodes:
+                    value += program.couplings[apart - 1, i] * u[i + apart, a]
+            largest = max(largest, abs(value), abs(program.linear[i, a]))
+            smooth[i * d + a] = 0.0 if program.known[i] else value + program.linear[i, a]
+    return largest
 
-    The half-width of the band is a constant in it, so that the innermost loops are unrolled.
-    """
-    d = dimension
-    width = SPAN * d
 
-    assemble, factorise, substitute = band_functions(dimension)
+@compiled
+def images(axes: Axes, program: ChainProgram, u: NDArray[np.float64], image: Vector) -> None:
+    """Write a_r' u of every row."""
+    d, width = len(axes), SPAN * len(axes)
+    for r in range(len(program.first)):
+        first, value = program.first[r], 0.0
+        for a in range(width):
+            value += program.gradient[r, a // d, a % d] * u[first + a // d, a % d]
+        image[r] = value
 
-    @compiled
-    def balance(program: ChainProgram, u: NDArray[np.float64], smooth: Vector) -> float:
-        """Write P u + q and return its largest term."""
-        nodes = len(u)
-        largest = 1.0
-        for i in range(nodes):
-            for a in range(d):
-                value = 0.0
-                for b in range(d):
-                    value += program.blocks[i, a, b] * u[i, b]
-                for apart in range(1, SPAN + 1):
-                    if i >= apart:
-                        value += program.couplings[apart - 1, i - apart] * u[i - apart, a]
-                    if i + apart < nodes:
-                        value += program.couplings[apart - 1, i] * u[i + apart, a]
-                largest = max(largest, abs(value), abs(program.linear[i, a]))
-                smooth[i * d + a] = 0.0 if program.known[i] else value + program.linear[i, a]
-        return largest
 
-    @compiled
-    def images(program: ChainProgram, u: NDArray[np.float64], image: Vector) -> None:
-        """Write a_r' u of every row."""
-        for r in range(len(program.first)):
-            first, value = program.first[r], 0.0
+@compiled
+def push_of(program: ChainProgram, r: int, image: float, weight: float, centre: float) -> float:
+    """Return lambda_r(u) for a row's image a_r' u."""
+    pull = (1.0 / weight - program.compliance[r]) * centre - image
+    return float(weight * (max(program.lower[r] + pull, 0.0) + min(program.upper[r] + pull, 0.0)))
+
+
+@compiled
+def forces(
+    axes: Axes, program: ChainProgram, smooth: Vector, multipliers: Vector, force: Vector
+) -> tuple[float, float]:
+    """Write F; return the largest force out of balance on a node that is free, and the largest of all pushes."""
+    d, width = len(axes), SPAN * len(axes)
+    for j in range(len(smooth)):
+        force[j] = smooth[j]
+    for r in range(len(program.first)):
+        if multipliers[r] != 0.0:
+            j = program.first[r] * d
             for a in range(width):
-                value += program.gradient[r, a // d, a % d] * u[first + a // d, a % d]
-            image[r] = value
-
-    @compiled
-    def push_of(program: ChainProgram, r: int, image: float, weight: float, centre: float) -> float:
-        """Return lambda_r(u) for a row's image a_r' u."""
-        pull = (1.0 / weight - program.compliance[r]) * centre - image
-        return float(weight * (max(program.lower[r] + pull, 0.0) + min(program.upper[r] + pull, 0.0)))
-
-    @compiled
-    def forces(program: ChainProgram, smooth: Vector, multipliers: Vector, force: Vector) -> tuple[float, float]:
-        """Write F; return the largest force out of balance on a node that is free, and the largest of all pushes."""
-        for j in range(len(smooth)):
-            force[j] = smooth[j]
-        for r in range(len(program.first)):
-            if multipliers[r] != 0.0:
-                j = program.first[r] * d
-                for a in range(width):
-                    force[j + a] -= program.gradient[r, a // d, a % d] * multipliers[r]
-        worst, largest, total = 0.0, 0.0, 0.0
-        for i in range(len(program.linear)):
-            for j in range(i * d, i * d + d):
-                if program.known[i]:
-                    force[j] = 0.0
-                else:
-                    largest = max(largest, abs(smooth[j] - force[j]))
-                worst = max(worst, abs(force[j]))
-                total += force[j]
-        return worst if np.isfinite(total) else np.inf, largest  # a largest value may pass over a NaN
-
-    @compiled
-    def update(
-        program: ChainProgram,
-        image: Vector,
-        centre: Vector,
-        weights: Vector,
-        multipliers: Vector,
-        pushing: NDArray[np.bool_],
-    ) -> tuple[int, float]:
-        """Write every multiplier; return how many rows began or ceased to push, and how far they are from bounds."""
-        changes, gap = 0, 0.0
-        for r in range(len(program.first)):
-            multiplier = push_of(program, r, image[r], weights[r], centre[r])
-            if (multiplier != 0.0) != pushing[r]:
-                changes += 1
-                pushing[r] = multiplier != 0.0
-            multipliers[r] = multiplier
-            hard = 1.0 / weights[r] - program.compliance[r]
-            if hard > 0.0:
-                gap = max(gap, abs(multiplier - centre[r]) * hard / max(1.0, abs(image[r])))
-        return changes, gap
-
-    @compiled
-    def search(
-        program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
-    ) -> float:
-        """Return where along Newton's step the balance along it is zero, at most 1.
-
-        It is piecewise linear and increasing in the part t taken; `start` and `end` are its smooth part
-        at 0 and 1. A Newton's method of its own, kept within a bracket, finds the zero exactly.
-        """
-        low, high, part = 0.0, 1.0, 1.0
-        for _ in range(SEARCHES):
-            value, slope = start + part * (end - start), end - start
-            for r in range(len(program.first)):
-                change = after[r] - before[r]
-                push = push_of(program, r, before[r] + part * change, weights[r], centre[r])
-                value -= push * change
-                if push != 0.0:
-                    slope += weights[r] * change * change
-            if part == 1.0 and value <= 0.0:
-                return 1.0
-            if value > 0.0:
-                high = part
+                force[j + a] -= program.gradient[r, a // d, a % d] * multipliers[r]
+    worst, largest, total = 0.0, 0.0, 0.0
+    for i in range(len(program.linear)):
+        for j in range(i * d, i * d + d):
+            if program.known[i]:
+                force[j] = 0.0
             else:
-                low = part
-            following = part - value / slope
-            if not low < following < high:
-                following = 0.5 * (low + high)
-            if abs(following - part) <= 1e-12:
-                return following
-            part = following
-        return part
+                largest = max(largest, abs(smooth[j] - force[j]))
+            worst = max(worst, abs(force[j]))
+            total += force[j]
+    return worst if np.isfinite(total) else np.inf, largest  # a largest value may pass over a NaN
 
-    @compiled
-    def solve(
-        program: ChainProgram,
-        u: NDArray[np.float64],
-        multipliers: Vector,
-        tolerance: float,
-        iterations: int,
-        band: NDArray[np.float64],
-        vectors: NDArray[np.float64],
-        pushing: NDArray[np.bool_],
-    ) -> tuple[int, int]:
-        """Improve u and the multipliers in place; return status and iterations."""
-        nodes, rows = len(program.linear), len(program.first)
-        unknowns = nodes * d
-        step, force, smooth = vectors[0], vectors[1, :unknowns], vectors[2, :unknowns]
-        weights, centre, image, before = vectors[3], vectors[4], vectors[5], vectors[6]
-        stiffness = 0.0
-        for i in range(nodes):
-            for a in range(d):
-                stiffness = max(stiffness, program.blocks[i, a, a])
-                if program.known[i]:
-                    u[i, a] = 0.0
-        stiffest = STIFFEST * max(1.0, 1e-4 * stiffness)
-        balance(program, u, smooth)
-        images(program, u, image)
-        for r in range(rows):
-            weights[r] = 1.0 / max(program.compliance[r], 1.0 / stiffest)
-            centre[r] = multipliers[r]
-            multipliers[r] = push_of(program, r, image[r], weights[r], centre[r])
-            # The first guess: what pushed before pushes again, though it may seem to pull.
-            if multipliers[r] == 0.0 and centre[r] != 0.0:
-                bound = program.lower[r] if centre[r] > 0.0 else program.upper[r]
-                if np.isfinite(bound):
-                    hard = 1.0 / weights[r] - program.compliance[r]
-                    multipliers[r] = weights[r] * (bound - image[r] + hard * centre[r])
-            pushing[r] = multipliers[r] != 0.0
-        forces(program, smooth, multipliers, force)
-        changes, stalled, least = 1, 0, np.inf
-        for iteration in range(1, iterations + 1):
-            if changes:
-                assemble(program, weights, pushing, band)
-                if not factorise(band):
-                    return INDEFINITE, iteration
-            start = end = 0.0
-            step[:unknowns], step[unknowns : unknowns + width] = -force, 0.0
-            substitute(band, step)
+
+@compiled
+def update(
+    program: ChainProgram,
+    image: Vector,
+    centre: Vector,
+    weights: Vector,
+    multipliers: Vector,
+    pushing: NDArray[np.bool_],
+) -> tuple[int, float]:
+    """Write every multiplier; return how many rows began or ceased to push, and how far they are from bounds."""
+    changes, gap = 0, 0.0
+    for r in range(len(program.first)):
+        multiplier = push_of(program, r, image[r], weights[r], centre[r])
+        if (multiplier != 0.0) != pushing[r]:
+            changes += 1
+            pushing[r] = multiplier != 0.0
+        multipliers[r] = multiplier
+        hard = 1.0 / weights[r] - program.compliance[r]
+        if hard > 0.0:
+            gap = max(gap, abs(multiplier - centre[r]) * hard / max(1.0, abs(image[r])))
+    return changes, gap
+
+
+@compiled
+def search(
+    program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
+) -> float:
+    """Return where along Newton's step the balance along it is zero, at most 1.
+
+    It is piecewise linear and increasing in the part t taken; `start` and `end` are its smooth part
+    at 0 and 1. A Newton's method of its own, kept within a bracket, finds the zero exactly.
+    """
+    low, high, part = 0.0, 1.0, 1.0
+    for _ in range(SEARCHES):
+        value, slope = start + part * (end - start), end - start
+        for r in range(len(program.first)):
+            change = after[r] - before[r]
+            push = push_of(program, r, before[r] + part * change, weights[r], centre[r])
+            value -= push * change
+            if push != 0.0:
+                slope += weights[r] * change * change
+        if part == 1.0 and value <= 0.0:
+            return 1.0
+        if value > 0.0:
+            high = part
+        else:
+            low = part
+        following = part - value / slope
+        if not low < following < high:
+            following = 0.5 * (low + high)
+        if abs(following - part) <= 1e-12:
+            return following
+        part = following
+    return part
+
+
+@compiled
+def solve(
+    axes: Axes,
+    program: ChainProgram,
+    u: NDArray[np.float64],
+    multipliers: Vector,
+    tolerance: float,
+    iterations: int,
+    band: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    pushing: NDArray[np.bool_],
+) -> tuple[int, int]:
+    """Improve u and the multipliers in place; return status and iterations."""
+    d, width = len(axes), SPAN * len(axes)
+    nodes, rows, unknowns = len(program.linear), len(program.first), program.linear.size
+    step, force, smooth = vectors[0], vectors[1, :unknowns], vectors[2, :unknowns]
+    weights, centre, image, before = vectors[3], vectors[4], vectors[5], vectors[6]
+    stiffness = 0.0
+    for i in range(nodes):
+        for a in range(d):
+            stiffness = max(stiffness, program.blocks[i, a, a])
+            if program.known[i]:
+                u[i, a] = 0.0
+    stiffest = STIFFEST * max(1.0, 1e-4 * stiffness)
+    balance(axes, program, u, smooth)
+    images(axes, program, u, image)
+    for r in range(rows):
+        weights[r] = 1.0 / max(program.compliance[r], 1.0 / stiffest)
+        centre[r] = multipliers[r]
+        multipliers[r] = push_of(program, r, image[r], weights[r], centre[r])
+        # The first guess: what pushed before pushes again, though it may seem to pull.
+        if multipliers[r] == 0.0 and centre[r] != 0.0:
+            bound = program.lower[r] if centre[r] > 0.0 else program.upper[r]
+            if np.isfinite(bound):
+                hard = 1.0 / weights[r] - program.compliance[r]
+                multipliers[r] = weights[r] * (bound - image[r] + hard * centre[r])
+        pushing[r] = multipliers[r] != 0.0
+    forces(axes, program, smooth, multipliers, force)
+    changes, stalled, least = 1, 0, np.inf
+    for iteration in range(1, iterations + 1):
+        if changes:
+            assemble(axes, program, weights, pushing, band)
+            if not factorise(axes, band):
+                return INDEFINITE, iteration
+        start = end = 0.0
+        step[:unknowns], step[unknowns : unknowns + width] = -force, 0.0
+        substitute(axes, band, step)
+        for j in range(unknowns):
+            start += smooth[j] * step[j]
+            u[j // d, j % d] += step[j]
+        before[:rows] = image[:rows]
+        scale = balance(axes, program, u, smooth)
+        images(axes, program, u, image)
+        changes, gap = update(program, image, centre, weights, multipliers, pushing)
+        if changes and iteration > 1:
+            # Newton's step overshot a kink: go back to where the balance along it is zero.
             for j in range(unknowns):
-                start += smooth[j] * step[j]
-                u[j // d, j % d] += step[j]
-            before[:rows] = image[:rows]
-            scale = balance(program, u, smooth)
-            images(program, u, image)
-            changes, gap = update(program, image, centre, weights, multipliers, pushing)
-            if changes and iteration > 1:
-                # Newton's step overshot a kink: go back to where the balance along it is zero.
-                for j in range(unknowns):
-                    end += smooth[j] * step[j]
-                part = search(program, before, image, centre, weights, start, end)
-                for j in range(unknowns):
-                    u[j // d, j % d] += (part - 1.0) * step[j]
-                scale = balance(program, u, smooth)
-                images(program, u, image)
-                _, gap = update(program, image, centre, weights, multipliers, pushing)
-            worst, largest = forces(program, smooth, multipliers, force)
-            if not np.isfinite(worst):
-                return NOT_FINITE, iteration
-            size = max(scale, largest)
-            stalled += changes == 0 and worst > max(0.5 * least, tolerance * size)
-            least = min(least, worst)
-            if worst <= tolerance * size and gap <= tolerance:
-                return SOLVED, iteration
-            if stalled > STALLS:
-                return SOLVED if max(worst / size, gap) <= ROUNDING else STALLED, iteration
-            if worst <= tolerance * size:
-                centre[:rows] = multipliers[:rows]
-                turned, gap = update(program, image, centre, weights, multipliers, pushing)
-                changes += turned
-                forces(program, smooth, multipliers, force)
-        return LIMIT, iterations
+                end += smooth[j] * step[j]
+            part = search(program, before, image, centre, weights, start, end)
+            for j in range(unknowns):
+                u[j // d, j % d] += (part - 1.0) * step[j]
+            scale = balance(axes, program, u, smooth)
+            images(axes, program, u, image)
+            _, gap = update(program, image, centre, weights, multipliers, pushing)
+        worst, largest = forces(axes, program, smooth, multipliers, force)
+        if not np.isfinite(worst):
+            return NOT_FINITE, iteration
+        size = max(scale, largest)
+        stalled += changes == 0 and worst > max(0.5 * least, tolerance * size)
+        least = min(least, worst)
+        if worst <= tolerance * size and gap <= tolerance:
+            return SOLVED, iteration
+        if stalled > STALLS:
+            return SOLVED if max(worst / size, gap) <= ROUNDING else STALLED, iteration
+        if worst <= tolerance * size:
+            centre[:rows] = multipliers[:rows]
+            turned, gap = update(program, image, centre, weights, multipliers, pushing)
+            changes += turned
+            forces(axes, program, smooth, multipliers, force)
+    return LIMIT, iterations
 
-    @compiled
-    def solve_and_judge(
-        program: ChainProgram,
-        u: NDArray[np.float64],
-        multipliers: Vector,
-        tolerance: float,
-        iterations: int,
-        band: NDArray[np.float64],
-        vectors: NDArray[np.float64],
-        pushing: NDArray[np.bool_],
-    ) -> tuple[int, int, tuple[float, float, float]]:
-        """Solve, and judge by code that knows nothing of how it was solved; once into compiled code is cheaper."""
-        status, taken = solve(program, u, multipliers, tolerance, iterations, band, vectors, pushing)
-        return status, taken, compiled_residuals(program, u, multipliers)
 
-    judged: Callable[..., Any] = solve_and_judge
-    return judged
+@compiled
+def solve_and_judge(
+    axes: Axes,
+    program: ChainProgram,
+    u: NDArray[np.float64],
+    multipliers: Vector,
+    tolerance: float,
+    iterations: int,
+    band: NDArray[np.float64],
+    vectors: NDArray[np.float64],
+    pushing: NDArray[np.bool_],
+) -> tuple[int, int, tuple[float, float, float]]:
+    """Solve, and judge by code that knows nothing of how it was solved; once into compiled code is cheaper."""
+    status, taken = solve(axes, program, u, multipliers, tolerance, iterations, band, vectors, pushing)
+    return status, taken, compiled_residuals(program, u, multipliers)
