@@ -2,6 +2,7 @@
 # make test   run all tests
 # make lint   check style and types
 # make colcon build both packages by colcon, into install/
+# make peers  add the solvers and simulators of `magnetosuture bench --peers`
 # make clean  remove all that make made
 #
 # Each sets up .venv the first time, over ROS 2 Jazzy as wheels from PyPI. Needs Python 3.10 to 3.13
@@ -14,7 +15,7 @@ RUN := $(VENV)/bin
 DEMO := output/demo
 MESSAGES := $(wildcard msg_defs/*.* msg_defs/*/*)
 
-.PHONY: demo test lint colcon clean help
+.PHONY: demo test lint colcon peers clean help
 
 demo: $(READY)
 	@rm -rf $(DEMO)
@@ -31,6 +32,10 @@ lint: $(READY)
 # Both packages by colcon, over the wheels in .venv, into install/.
 colcon: $(READY)
 	COLCON_DEFAULTS_FILE=colcon_defaults.yaml PATH="$(CURDIR)/$(RUN):$$PATH" $(RUN)/colcon build
+
+# From the extra `peers`, without building the package again.
+peers: $(READY)
+	PIP_CONSTRAINT=constraints.txt $(RUN)/python -m pip install -qq --disable-pip-version-check clarabel 'mujoco<4' piqp pyelastica
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile

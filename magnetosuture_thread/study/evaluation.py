@@ -39,7 +39,7 @@ class CaseScore:
         step_median_s: of the wall-clock time of a sample's step, without the margins' message [s].
         step_p99_s: of the same [s].
         max_residual: the largest scaled residual of a solve.
-        fallbacks: steps whose first solve did not pass its residual check.
+        fallbacks: steps that needed another solver or a cold start, or did not converge.
     """
 
     name: str
@@ -209,6 +209,8 @@ def score_one(
 
 def thread_of(reference: ReferenceTrajectory, path: Path, segments: int | None = None) -> tuple[Thread, PaperOptions]:
     """Return the thread that a trajectory's metadata describes, and the options of `paper` for its material.
+
+    Those are of silk where the kind says silk, else of polyamide: W_stiff is tuned for these two only.
 
     Raises:
         BagError: the metadata lacks something, or holds what is none.

@@ -49,10 +49,11 @@ def evaluation_table(evaluation: Evaluation) -> Table:
     title = f"formulation {evaluation.formulation}, solver {evaluation.solver}"
     table = Table(title=title, title_justify="left", title_style="bold", caption_justify="left")
     residual = max(case.max_residual for case in evaluation.cases)
+    marked = sum(case.fallbacks for case in evaluation.cases)
     table.caption = (
         "errors in % of the length, mean and greatest over time; stretch in %;\n"
         "deepest node in an obstacle in m; step in µs of wall clock, median and p99;\n"
-        f"largest residual {residual:.0e}, {sum(case.fallbacks for case in evaluation.cases)} steps fell back"
+        f"largest residual {residual:.0e}, {marked} steps fell back or did not converge"
     )
     table.add_column("case", no_wrap=True)
     for name in ("error", "greatest", "stretch", "depth", "step", "p99"):

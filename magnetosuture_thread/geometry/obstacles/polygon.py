@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import shapely  # type: ignore[import-untyped]
+import shapely
 from numpy.typing import NDArray
-from shapely.validation import explain_validity  # type: ignore[import-untyped]
+from shapely.validation import explain_validity
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.smoothing import rounded

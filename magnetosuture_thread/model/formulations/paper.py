@@ -40,6 +40,7 @@ from magnetosuture_thread.model.barriers.connectivity import distance_barrier
 from magnetosuture_thread.model.barriers.obstacle import squared_barrier
 from magnetosuture_thread.model.barriers.stiffness import stiffness_function
 from magnetosuture_thread.model.formulations.step import (
+    DEPTH_REACHED,
     ROW_REACH,
     Drive,
     Memory,
@@ -115,11 +116,11 @@ class PaperFormulation:
         unit, options = self._thread.segment_length, self._options
         before, velocities = state.positions / unit, state.velocities / unit
         moved, known = driven(before, drive, unit)
-        start = moved if options.lead_ahead else before
+        start, gain = moved if options.lead_ahead else before, min(options.gain, 1.0 / interval)
         if state.interval == 0.0:
             self._memory.forget()
         while True:
-            contacts = _assemble(
+            contacts, before_depth = _assemble(
                 self._memory,
                 self._near.data,
                 start,
@@ -129,7 +130,7 @@ class PaperFormulation:
                 unit,
                 0.5 * self._thread.diameter,
                 options.damping,
-                min(options.gain, 1.0 / interval),
+                gain,
                 min(options.stiffness_gain, 1.0 / interval),
                 1.0 / options.connectivity_weight,
                 1.0 / options.stiffness_weight,
@@ -146,7 +147,19 @@ class PaperFormulation:
         remember_push(self._memory.node, solution.multipliers[self._rows :], self._memory.push)
         end = moved + interval * solution.velocities
         after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
-        return StepSolution(after, solution.solver, solution.status, solution.residuals, 1, converged=True)
+        # The hard barriers, h(x + dt u) >= (1 - alpha dt) h(x), where the obstacles themselves are.
+        depth = self._depth(after.positions, known)
+        allowed = (1.0 - gain * interval) * before_depth + DEPTH_REACHED
+        converged, status = depth <= allowed, solution.status
+        if not converged:
+            status = f"not converged, a node is {depth:.1e} m deep and {allowed:.1e} m are allowed; {status}"
+        return StepSolution(after, solution.solver, status, solution.residuals, 1, converged)
+
+    def _depth(self, positions: Points, known: NDArray[np.bool_]) -> float:
+        """Return the greatest depth of a free node in an obstacle [m]."""
+        near = self._near.near(positions)
+        clearance = near.distance[~known[near.node]] - 0.5 * self._thread.diameter
+        return max(0.0, -float(clearance.min(initial=0.0)))
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the segments' length at rest; see `Formulation`."""
@@ -181,8 +194,8 @@ def _assemble(
     stiffness_gain: float,
     connectivity_compliance: float,
     stiffness_compliance: float,
-) -> int:
-    """Write the program; return the number of contacts, -1 if there is no room for them."""
+) -> tuple[int, float]:
+    """Write the program; return contacts, -1 if there is no room for them, and the greatest depth of a node [m]."""
     nodes, dimension = start.shape
     segments = nodes - 1
     memory.couplings[:] = 0.0
@@ -203,11 +216,11 @@ def _assemble(
         memory.lower[r] = -(gain if r < stiff else stiffness_gain) * memory.value[r]
         memory.upper[r] = np.inf
         memory.compliance[r] = connectivity_compliance if r < stiff else stiffness_compliance
-    contacts, _ = contact_rows(memory, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
+    contacts, depth = contact_rows(memory, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
     for r in range(rows, rows + contacts):
         clearance = memory.value[r]
         if clearance > 0.0:
             # grad h' u >= -alpha h, divided by the slope: the row's own size does not matter, it is hard.
             value, slope = squared_barrier(clearance + radius / unit, radius / unit)
             memory.lower[r] = -gain * value / slope
-    return contacts
+    return contacts, depth

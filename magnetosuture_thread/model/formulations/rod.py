@@ -30,7 +30,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
@@ -59,6 +59,9 @@ class RodFormulation:
         surroundings: obstacles [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
+
+    Raises:
+        ConfigurationError: gravity has not one value for each dimension.
     """
 
     name = "rod"
@@ -69,6 +72,8 @@ class RodFormulation:
         self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
         self._near = Surroundings(surroundings.shapes, ROW_REACH * thread.segment_length, dimension)
         medium, glued = thread.medium, thread.attachment is Attachment.GLUED
+        if len(medium.gravity) not in (0, dimension):
+            raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
         gravity = np.zeros(dimension)
         gravity[: len(medium.gravity)] = medium.gravity
         self._rod = Rod(

@@ -12,11 +12,10 @@ from magnetosuture_thread.geometry.obstacles import SurroundingsData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers.connectivity import distance_barrier
-from magnetosuture_thread.model.formulations.step import Memory, contact_rows
+from magnetosuture_thread.model.formulations.step import DEPTH_REACHED, Memory, contact_rows
 from magnetosuture_thread.model.program import Vector
 
 STRETCH_REACHED = 1e-3  # of the segments; beyond it the barriers are linearised once more
-DEPTH_REACHED = 1e-7  # m; the same for a node in an obstacle
 COMPLIANCE = 1e-7  # of a segment
 LONGEST_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
 

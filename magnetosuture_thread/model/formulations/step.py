@@ -15,6 +15,7 @@ from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Vector
 
 ROW_REACH = 1.0  # segments; obstacles farther from a node than this have no row in the program
+DEPTH_REACHED = 1e-7  # m; a node deeper in an obstacle than is asked for is not where its barrier holds
 PUSHING_OUT = 1e-7  # compliance of a contact that has to push a node out
 
 
@@ -63,7 +64,8 @@ class StepSolution:
         status: its own word for the last solve; of a solve that was not at once accepted, if there was one.
         residuals: the largest of each kind over the step's solves.
         solves: number of programs solved.
-        converged: whether the end satisfies the barriers themselves, not only their last linearisation.
+        converged: whether the end satisfies the barriers themselves, not only their last linearisation; of
+            `paper` the hard ones, those of the obstacles.
     """
 
     state: ThreadState
@@ -112,7 +114,7 @@ class Memory(NamedTuple):
         value: h of each row, shape (r,).
         multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
         chords: length of each segment, shape (n,).
-        work: shape (3, n + 1, d).
+        work: shape (2, n + 1, d).
         node: contacts: as `find_near` writes them, shape (c,).
         obstacle: shape (c,).
         distance: shape (c,).
@@ -156,7 +158,7 @@ class Memory(NamedTuple):
             np.zeros(total),
             np.zeros(total),
             np.zeros(nodes - 1),
-            np.zeros((3, nodes, dimension)),
+            np.zeros((2, nodes, dimension)),
             np.zeros(contacts, dtype=np.int64),
             np.zeros(contacts, dtype=np.int64),
             np.zeros(contacts),

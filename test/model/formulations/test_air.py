@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import j0
 
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.formulations import Drive, ThreadState
 from test.model.formulations.scenes import east, formulated, in_air, straight, stretch
 
@@ -114,3 +115,8 @@ def test_a_driven_node_takes_the_damped_bending_with_it():
     for step in range(1, 50):
         state = formulation.step(state, Drive((0,), (step * 1e-3 * velocity)[None], east()), 1e-3).state
     np.testing.assert_allclose(state.positions, straight(thread) + 49e-3 * velocity, atol=1e-9)
+
+
+def test_gravity_must_have_a_value_for_each_dimension():
+    with pytest.raises(ConfigurationError, match="2 values, or none"):
+        formulated(in_air(0.1, 5, (0.0, 0.0, -G)))

@@ -154,6 +154,18 @@ def test_a_long_step_does_not_overshoot_a_barrier(interval: float):
         assert stretch(thread, done.state.positions) < 0.3
 
 
+def test_a_step_that_ends_deep_in_an_obstacle_says_so():
+    """As printed, a step is judged at its start: a leap lands beyond an edge that was not near then."""
+    thread = polyamide()
+    formulation = formulated(thread, (Disc((-0.0007, 0.0025), 0.0006),), name="paper", paper=PaperOptions.tuned(0.01))
+    calm = formulation.step(ThreadState.at_rest(straight(thread)), lead(np.array([1e-5, 0.0])), DT)
+    assert calm.converged
+    assert calm.status == "solved"
+    leap = formulation.step(ThreadState.at_rest(straight(thread)), lead(np.array([0.0, 0.0043])), DT)
+    assert not leap.converged
+    assert "not converged, a node is" in leap.status
+
+
 class Lying(Listening):
     """Says that it solved what it did not."""
 

@@ -137,8 +137,9 @@ def test_a_short_step_and_a_long_one_lead_to_the_same_place():
     thread = polyamide(Attachment.GLUED)
     positions = {}
     for steps in (40, 80, 160):
-        way = lambda k, steps=steps: 4e-3 * np.array([k / steps, math.sin(2.0 * k / steps)])  # noqa: E731
-        positions[steps] = followed(formulated(thread), straight(thread), way, steps, 0.6 / steps)[-1].state.positions
+        path = 4e-3 * np.array([[k / steps, math.sin(2.0 * k / steps)] for k in range(steps + 1)])
+        ends = followed(formulated(thread), straight(thread), path.__getitem__, steps, 0.6 / steps)
+        positions[steps] = ends[-1].state.positions
     coarse = np.abs(positions[40] - positions[160]).max()
     fine = np.abs(positions[80] - positions[160]).max()
     assert fine < 0.4 * coarse  # of second order: a quarter, less what the finest is wrong by
@@ -148,7 +149,10 @@ def test_a_short_step_and_a_long_one_lead_to_the_same_place():
 def test_a_thread_pulled_hard_needs_no_more_than_a_few_solves():
     """Without the constraints' curvature the solves of a taut soft thread swing from side to side."""
     thread = silk()
-    way = lambda k: np.array([5e-3 * math.sin(2.0 * k * DT), 8e-3 * (1.0 - math.cos(2.0 * k * DT))])  # noqa: E731
+
+    def way(k: int) -> np.ndarray:
+        return np.array([5e-3 * math.sin(2.0 * k * DT), 8e-3 * (1.0 - math.cos(2.0 * k * DT))])
+
     steps = followed(formulated(thread), straight(thread), way, 60)
     assert max(done.solves for done in steps) <= 3
     assert np.mean([done.solves for done in steps]) < 1.2
@@ -325,7 +329,10 @@ def test_margins_are_in_si_units():
 def test_both_solvers_step_alike(solver: str):
     thread = polyamide(Attachment.GLUED)
     obstacles = (Disc((-0.009, 0.0025), 0.0015),)
-    way = lambda k: k * 6e-5 * np.array([0.3, 1.0])  # noqa: E731
+
+    def way(k: int) -> np.ndarray:
+        return k * 6e-5 * np.array([0.3, 1.0])
+
     expected = followed(formulated(thread, obstacles), straight(thread), way, 60)[-1]
     found = followed(formulated(thread, obstacles, solver=solver), straight(thread), way, 60)[-1]
     assert found.solver == solver
