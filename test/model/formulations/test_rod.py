@@ -10,6 +10,7 @@ import pytest
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
 from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, ThreadState
+from magnetosuture_thread.model.formulations.rod import _extrapolated
 from magnetosuture_thread.model.formulations.step import Memory
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector
 from magnetosuture_thread.model.solvers import BandedSolver
@@ -144,6 +145,16 @@ def test_a_short_step_and_a_long_one_lead_to_the_same_place():
     fine = np.abs(positions[80] - positions[160]).max()
     assert fine < 0.4 * coarse  # of second order: a quarter, less what the finest is wrong by
     assert coarse < 2e-5
+
+
+def test_the_first_guess_goes_on_as_before_unless_that_is_noise_or_too_far():
+    start, velocities = straight(polyamide()) / polyamide().segment_length, np.full((26, 2), 3.0)
+    known = np.arange(26) == 0
+    onwards = _extrapolated(start, velocities, known, DT, DT)
+    np.testing.assert_allclose(onwards[1:], start[1:] + 3.0 * DT)
+    np.testing.assert_array_equal(onwards[0], start[0])
+    for last_interval, speeds in ((0.0, velocities), (0.1 * DT, velocities), (DT, 100.0 * velocities)):
+        np.testing.assert_array_equal(_extrapolated(start, speeds, known, DT, last_interval), start)
 
 
 def test_a_thread_pulled_hard_needs_no_more_than_a_few_solves():
