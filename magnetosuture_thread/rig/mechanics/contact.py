@@ -1,0 +1,260 @@
+"""What the needle and the thread can touch: discs, polygons and the wall of the dish.
+
+A contact is a gap g, at least 0 where nothing touches, and an energy k / 2 g^2 below: frictionless, stiff, and
+with an exact second derivative, from the gap's gradient and curvature.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
+
+LEAST_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
+
+
+class Shapes(NamedTuple):
+    """A surface as kernels read it.
+
+    Attributes:
+        discs: centre, radius, shape (k, 3) [m].
+        corners: of all polygons, the solid to the left of every edge, shape (c, 2) [m].
+        starts: where each polygon begins in `corners`, and the end, shape (p + 1,).
+        boxes: least x, least y, greatest x, greatest y of each polygon, shape (p, 4) [m].
+        convex: 1 at corners that stick out of the solid, else 0, shape (c,).
+        wall: radius of the dish's wall around the origin, infinite if there is none [m].
+        stiffness: k of every contact [N/m].
+    """
+
+    discs: NDArray[np.float64]
+    corners: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    boxes: NDArray[np.float64]
+    convex: NDArray[np.float64]
+    wall: float
+    stiffness: float
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What stands in the dish, and its wall.
+
+    Attributes:
+        discs: round posts.
+        polygons: corners of simple polygons, solid inside, in either direction, each of shape (m, 2) [m].
+        wall_radius: inner radius of the dish around the origin, None without a wall [m].
+        stiffness: k of a contact; a force f sinks in by f / k [N/m].
+        skin: how far outside a contact begins, so that up to k times this nothing gets in at all [m]. A harder
+            contact without it costs more: nodes that slide then leave and meet the surface at every step.
+
+    Raises:
+        ConfigurationError: a value is not finite, or out of bounds.
+    """
+
+    discs: tuple[Disc, ...] = ()
+    polygons: tuple[NDArray[np.float64], ...] = ()
+    wall_radius: float | None = None
+    stiffness: float = 500.0
+    skin: float = 1.5e-6
+
+    def packed(self) -> Shapes:
+        """Return the arrays that kernels read."""
+        wall = math.inf if self.wall_radius is None else self.wall_radius
+        if not wall > 0.0:
+            raise ConfigurationError("surface.wall_radius", self.wall_radius, "a positive number [m]")
+        if not (math.isfinite(self.stiffness) and self.stiffness > 0.0):
+            raise ConfigurationError("surface.stiffness", self.stiffness, "a positive number [N/m]")
+        if not 0.0 <= self.skin < 1e-3:
+            raise ConfigurationError("surface.skin", self.skin, "from 0 to less than 1e-3 m")
+        discs = np.array([(*disc.centre[:2], disc.radius) for disc in self.discs], dtype=np.float64).reshape(-1, 3)
+        if not (np.isfinite(discs).all() and (discs[:, 2] > 0.0).all()):
+            raise ConfigurationError("surface.discs", discs.tolist(), "finite centres and positive radii [m]")
+        rings = [_directed(ring) for ring in self.polygons]
+        corners = np.concatenate([np.zeros((0, 2)), *rings])
+        starts = np.cumsum([0, *(len(ring) for ring in rings)]).astype(np.int64)
+        boxes = np.array([(*ring.min(axis=0), *ring.max(axis=0)) for ring in rings], dtype=np.float64).reshape(-1, 4)
+        convex = np.concatenate([np.zeros(0), *(_convex(ring) for ring in rings)])
+        return Shapes(discs, corners, starts, boxes, convex, float(wall), float(self.stiffness))
+
+
+def _directed(given: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a ring counter-clockwise and open, once it is known to bound an area."""
+    ring = np.array(given, dtype=np.float64)
+    if ring.ndim != 2 or ring.shape[1] != 2 or not np.isfinite(ring).all():
+        raise ConfigurationError("surface.polygons", ring.shape, "finite corners, shape (m, 2) [m]")
+    ring = ring[:-1] if len(ring) > 1 and (ring[0] == ring[-1]).all() else ring
+    x, y = (ring - ring[:1]).T
+    area = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+    if len(ring) < 3 or area == 0.0 or (ring == np.roll(ring, 1, axis=0)).all(axis=1).any():
+        raise ConfigurationError("surface.polygons", ring.tolist(), "at least three distinct corners around an area")
+    return ring if area > 0.0 else np.ascontiguousarray(ring[::-1])
+
+
+def _convex(ring: NDArray[np.float64]) -> NDArray[np.float64]:
+    before, after = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
+    return np.where(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0.0, 1.0, 0.0)
+
+
+@compiled
+def inside(x: float, y: float, corners: NDArray[np.float64], first: int, end: int) -> bool:
+    """Return whether a point is in a simple polygon: a ray from it crosses the outline an odd number of times."""
+    within = False
+    j = end - 1
+    for i in range(first, end):
+        if (corners[i, 1] > y) != (corners[j, 1] > y):
+            part = (y - corners[i, 1]) / (corners[j, 1] - corners[i, 1])
+            if x < corners[i, 0] + part * (corners[j, 0] - corners[i, 0]):
+                within = not within
+        j = i
+    return within
+
+
+@compiled
+def polygon_gap(
+    x: float, y: float, corners: NDArray[np.float64], first: int, end: int
+) -> tuple[float, float, float, float]:
+    """Return signed distance from a polygon, its gradient (n_x, n_y), and its curvature [m, 1, 1, 1/m]."""
+    least, px, py, corner = np.inf, 0.0, 0.0, False
+    nx, ny = 1.0, 0.0
+    j = end - 1
+    for i in range(first, end):
+        ex, ey = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1]
+        dx, dy = x - corners[j, 0], y - corners[j, 1]
+        s = (dx * ex + dy * ey) / (ex * ex + ey * ey)
+        t = min(max(s, 0.0), 1.0)
+        ox, oy = dx - t * ex, dy - t * ey
+        distance = ox * ox + oy * oy
+        if distance < least:
+            least, px, py, corner = distance, ox, oy, t != s
+            size = math.sqrt(ex * ex + ey * ey)
+            nx, ny = ey / size, -ex / size
+        j = i
+    distance = math.sqrt(least)
+    sign = -1.0 if inside(x, y, corners, first, end) else 1.0
+    if distance < 1e-12:
+        return 0.0, nx, ny, 0.0
+    gap = sign * distance
+    return gap, px / gap, py / gap, 1.0 / gap if corner else 0.0
+
+
+@compiled
+def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: NDArray[np.float64]) -> int:
+    """Write what a round point sinks into; return how many.
+
+    Args:
+        x: of its centre [m].
+        y: the same.
+        radius: of the point [m].
+        shapes: the surface.
+        rows: gets depth, gradient n_x, n_y of the gap and its curvature c, where the gap's second derivative
+            is c (I - n n'); at least as many rows as shapes and wall.
+    """
+    count = 0
+    for i in range(shapes.discs.shape[0]):
+        dx, dy = x - shapes.discs[i, 0], y - shapes.discs[i, 1]
+        reach = shapes.discs[i, 2] + radius
+        square = dx * dx + dy * dy
+        if 0.0 < square < reach * reach:
+            size = math.sqrt(square)
+            rows[count, 0], rows[count, 1], rows[count, 2] = reach - size, dx / size, dy / size
+            rows[count, 3] = 1.0 / size
+            count += 1
+    square = x * x + y * y
+    reach = shapes.wall - radius
+    if square > reach * reach:
+        size = math.sqrt(square)
+        rows[count, 0], rows[count, 1], rows[count, 2] = size - reach, -x / size, -y / size
+        rows[count, 3] = -1.0 / size
+        count += 1
+    for p in range(shapes.boxes.shape[0]):
+        box = shapes.boxes[p]
+        if box[0] - radius < x < box[2] + radius and box[1] - radius < y < box[3] + radius:
+            gap, nx, ny, bend = polygon_gap(x, y, shapes.corners, shapes.starts[p], shapes.starts[p + 1])
+            if gap < radius:
+                rows[count, 0], rows[count, 1], rows[count, 2], rows[count, 3] = radius - gap, nx, ny, bend
+                count += 1
+    return count
+
+
+@compiled
+def _segment_gap(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> tuple[float, float, float, float]:
+    """Return distance of a point c from the line through a and b, its normal away from c, and where (0 at a)."""
+    ex, ey = bx - ax, by - ay
+    size = math.sqrt(ex * ex + ey * ey)
+    nx, ny = -ey / size, ex / size
+    gap = nx * (ax - cx) + ny * (ay - cy)
+    s = -((ax - cx) * ex + (ay - cy) * ey) / (size * size)
+    if gap < 0.0:
+        gap, nx, ny = -gap, -nx, -ny
+    return gap, nx, ny, s
+
+
+@compiled
+def segment_contacts(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    length: float,
+    radius: float,
+    shapes: Shapes,
+    rows: NDArray[np.float64],
+) -> int:
+    """Write what the inner part of a segment sinks into: discs, and corners that stick out; return how many.
+
+    Against a disc of reach r, a chain of chords D that all touch the circle of radius (D / 2) / tan(D / 2 r) from
+    outside turns as a thread of the same length on the disc does. That is the radius a segment keeps, less than
+    r; its end points keep r. A segment on both sides of a corner's solid has a negative gap to the corner.
+
+    Args:
+        ax: first end point [m].
+        ay: the same.
+        bx: second end point.
+        by: the same.
+        length: D, of the segment at rest [m].
+        radius: half the thread's diameter [m].
+        shapes: the surface.
+        rows: gets depth, gradient n_x, n_y at the place s, the gap, and s; see `point_contacts`.
+    """
+    count = 0
+    size = math.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
+    mx, my = 0.5 * (ax + bx), 0.5 * (ay + by)
+    for i in range(shapes.discs.shape[0]):
+        reach = shapes.discs[i, 2] + radius
+        if (mx - shapes.discs[i, 0]) ** 2 + (my - shapes.discs[i, 1]) ** 2 > (reach + 0.5 * size) ** 2:
+            continue
+        half = 0.5 * length / reach
+        reach *= max(half / math.tan(half), LEAST_APOTHEM) if half < 1.5 else LEAST_APOTHEM
+        gap, nx, ny, s = _segment_gap(ax, ay, bx, by, shapes.discs[i, 0], shapes.discs[i, 1])
+        if 0.0 < s < 1.0 and gap < reach and count < rows.shape[0]:
+            rows[count, 0], rows[count, 1], rows[count, 2] = reach - gap, nx, ny
+            rows[count, 3], rows[count, 4] = gap, s
+            count += 1
+    for p in range(shapes.boxes.shape[0]):
+        box = shapes.boxes[p]
+        around = radius + 0.5 * size
+        if not (box[0] - around < mx < box[2] + around and box[1] - around < my < box[3] + around):
+            continue
+        first, end = shapes.starts[p], shapes.starts[p + 1]
+        for i in range(first, end):
+            if shapes.convex[i] == 0.0:
+                continue
+            cx, cy = shapes.corners[i, 0], shapes.corners[i, 1]
+            gap, nx, ny, s = _segment_gap(ax, ay, bx, by, cx, cy)
+            # A chord this deep behind a corner passes beside it, not over it.
+            if not (0.0 < s < 1.0 and gap < max(radius, 0.25 * size)):
+                continue
+            if inside(ax + s * (bx - ax), ay + s * (by - ay), shapes.corners, first, end):
+                gap, nx, ny = -gap, -nx, -ny
+            if gap < radius and count < rows.shape[0]:
+                rows[count, 0], rows[count, 1], rows[count, 2] = radius - gap, nx, ny
+                rows[count, 3], rows[count, 4] = gap, s
+                count += 1
+    return count

@@ -1,0 +1,277 @@
+"""The needle as a magnet in a viscous liquid: its shape, its poles, its resistance, and its terms in a step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts
+
+NODES = 16  # of the integration along the body
+
+
+@dataclass(frozen=True)
+class NeedleBody:
+    """A slender round needle, straight or an arc, magnetised along its body.
+
+    Its frame has the origin at the tail and the x axis along the heading, the tangent at the tail. The
+    thread is tied to the tail; the tip is the other end.
+
+    Attributes:
+        length: along the body [m].
+        diameter: [m].
+        curvature: 0 when straight, positive when it bends to the left on the way from tail to tip [1/m].
+        magnetisation: along the body, from tail to tip [A/m].
+        viscosity: of the liquid [Pa s].
+
+    Raises:
+        ConfigurationError: a value is not finite, or out of bounds.
+    """
+
+    length: float
+    diameter: float
+    curvature: float
+    magnetisation: float
+    viscosity: float
+
+    def __post_init__(self) -> None:
+        """Check what was given."""
+        for name in ("length", "diameter", "viscosity"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ConfigurationError(f"needle.{name}", getattr(self, name), "a positive number")
+        if not math.isfinite(self.magnetisation):
+            raise ConfigurationError("needle.magnetisation", self.magnetisation, "a finite number [A/m]")
+        if not self.length >= 2.0 * self.diameter:
+            raise ConfigurationError("needle.length", self.length, "at least two diameters [m]")
+        if not abs(self.curvature) * self.length < 2.0 * math.pi:
+            raise ConfigurationError("needle.curvature", self.curvature, "less than a full turn over the length [1/m]")
+
+    @property
+    def pole(self) -> float:
+        """The pole at the tip, q = M pi d^2 / 4; the one at the tail is -q [A m]."""
+        return self.magnetisation * math.pi * self.diameter**2 / 4.0
+
+    @cached_property
+    def tip(self) -> NDArray[np.float64]:
+        """The tip in the needle's frame, shape (2,) [m]."""
+        return np.asarray(self.points(np.array([self.length]))[0])
+
+    def points(self, along: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points of the body in its frame.
+
+            x = s sinc(c s),    y = c s^2 / 2 sinc(c s / 2)^2,    sinc(u) = sin(u) / u
+
+        Args:
+            along: arc lengths s from the tail, shape (m,) [m].
+
+        Returns:
+            Shape (m, 2) [m].
+        """
+        turn = self.curvature * along / math.pi
+        return np.column_stack([along * np.sinc(turn), 0.5 * math.pi * turn * along * np.sinc(0.5 * turn) ** 2])
+
+    def outline(self, count: int) -> NDArray[np.float64]:
+        """Return equally spaced points of the body in its frame, tail first, shape (count, 2) [m]."""
+        return self.points(np.linspace(0.0, self.length, count))
+
+    @cached_property
+    def drag(self) -> tuple[float, float, float]:
+        """Drag of the straight needle: along [N s/m], across [N s/m], and turning about the middle [N m s].
+
+            along  = 2 pi eta L / (ln p - 0.207 + 0.980 / p - 0.133 / p^2),    p = L / d
+            across = 4 pi eta L / (ln p + 0.839 + 0.185 / p + 0.233 / p^2)
+            turn   = pi eta L^3 / (3 (ln p - 0.662 + 0.917 / p - 0.050 / p^2))
+
+        Source: Tirado and Garcia de la Torre, J. Chem. Phys. 71 (1979) 2581 and 73 (1980) 1986, for
+        2 <= p <= 30. Deviation: none.
+        """
+        p = self.length / self.diameter
+        unit = math.pi * self.viscosity * self.length
+        along = 2.0 * unit / (math.log(p) - 0.207 + 0.980 / p - 0.133 / p**2)
+        across = 4.0 * unit / (math.log(p) + 0.839 + 0.185 / p + 0.233 / p**2)
+        turn = unit * self.length**2 / (3.0 * (math.log(p) - 0.662 + 0.917 / p - 0.050 / p**2))
+        return along, across, turn
+
+    @cached_property
+    def resistance(self) -> NDArray[np.float64]:
+        """Resistance to (v_x, v_y, omega) of the tail in the needle's frame, shape (3, 3).
+
+            R = integral over s of J' (along / L t t' + across / L n n') J,    J = [1, 0, -y; 0, 1, x]
+
+        Force (f_x, f_y) and torque about the tail that move the needle are R (v_x, v_y, omega) [N s/m, N s,
+        N m s]. What the ends add to the turning, turn - across L^2 / 12, is a couple beside it, so that a
+        straight needle has exactly the values of `drag`.
+        """
+        along, across, turn = self.drag
+        nodes, weights = np.polynomial.legendre.leggauss(NODES)
+        s = 0.5 * self.length * (nodes + 1.0)
+        angle = self.curvature * s
+        tangent = np.column_stack([np.cos(angle), np.sin(angle)])
+        local = (along - across) * tangent[:, :, None] * tangent[:, None, :] + across * np.eye(2)
+        jacobian = np.zeros((NODES, 2, 3))
+        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+        jacobian[:, 0, 2], jacobian[:, 1, 2] = -self.points(s)[:, 1], self.points(s)[:, 0]
+        total = np.einsum("s,sia,sij,sjb->ab", 0.5 * weights, jacobian, local, jacobian)
+        total[2, 2] += turn - across * self.length**2 / 12.0
+        return np.asarray(total)
+
+    def wrench(
+        self, field_tail: NDArray[np.float64], field_tip: NDArray[np.float64], heading: float
+    ) -> tuple[NDArray[np.float64], float]:
+        """Return force and torque about the tail of the field on the poles.
+
+            F = q (B_tip - B_tail),    T = q (x_tip - x_tail) x B_tip
+
+        Args:
+            field_tail: flux density at the tail in the plane, shape (2,) [T].
+            field_tip: the same at the tip.
+            heading: [rad].
+
+        Returns:
+            Force, shape (2,) [N]; torque, positive to the left [N m].
+        """
+        c, s = math.cos(heading), math.sin(heading)
+        x, y = c * self.tip[0] - s * self.tip[1], s * self.tip[0] + c * self.tip[1]
+        return self.pole * (field_tip - field_tail), float(self.pole * (x * field_tip[1] - y * field_tip[0]))
+
+
+class Needle(NamedTuple):
+    """A needle as kernels read it.
+
+    Attributes:
+        resistance: to (omega, v_x, v_y) of the tail in the needle's frame, shape (3, 3).
+        tip: in the needle's frame, shape (2,) [m].
+        pole: at the tip [A m].
+        outline: points that touch, in the needle's frame, shape (m, 2) [m].
+        radius: of these [m].
+        clamp: (d, c) of the stiffness d |x_1 - x_0 + R (D, c)|^2 of a glued thread, d = 0 when pinned [N/m, m].
+    """
+
+    resistance: NDArray[np.float64]
+    tip: NDArray[np.float64]
+    pole: float
+    outline: NDArray[np.float64]
+    radius: float
+    clamp: tuple[float, float]
+
+
+@compiled
+def turn_resistance(needle: Needle, heading: float, scale: float, turned: NDArray[np.float64]) -> None:
+    """Write the resistance to (omega, v_x, v_y) in the dish's frame, times a factor, shape (3, 3)."""
+    c, s = math.cos(heading), math.sin(heading)
+    r = needle.resistance
+    turned[0, 0] = scale * r[0, 0]
+    turned[1, 0] = scale * (c * r[1, 0] - s * r[2, 0])
+    turned[2, 0] = scale * (s * r[1, 0] + c * r[2, 0])
+    turned[1, 1] = scale * (c * c * r[1, 1] - 2.0 * c * s * r[1, 2] + s * s * r[2, 2])
+    turned[2, 2] = scale * (s * s * r[1, 1] + 2.0 * c * s * r[1, 2] + c * c * r[2, 2])
+    turned[2, 1] = scale * (c * s * (r[1, 1] - r[2, 2]) + (c * c - s * s) * r[1, 2])
+    turned[0, 1], turned[0, 2], turned[1, 2] = turned[1, 0], turned[2, 0], turned[2, 1]
+
+
+@compiled
+def add_needle(
+    q: NDArray[np.float64],
+    field: NDArray[np.float64],
+    needle: Needle,
+    shapes: Shapes,
+    rest: NDArray[np.float64],
+    turned: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
+    """Add the needle's terms: drag, poles in a given field, contact of its outline.
+
+    E = q_m B_tail . x_tail - q_m B_tip . x_tip,    x_tip = x_0 + R(theta) tip
+    """
+    energy = 0.0
+    for i in range(3):
+        force = 0.0
+        for j in range(3):
+            force += turned[i, j] * (q[j] - rest[j])
+            if j <= i:
+                band[i, i - j] += turned[i, j]
+        energy += 0.5 * force * (q[i] - rest[i])
+        gradient[i] += force
+    c, s = math.cos(q[0]), math.sin(q[0])
+    tx, ty = c * needle.tip[0] - s * needle.tip[1], s * needle.tip[0] + c * needle.tip[1]
+    fx, fy = needle.pole * field[1, 0], needle.pole * field[1, 1]
+    lx, ly = fx - needle.pole * field[0, 0], fy - needle.pole * field[0, 1]
+    # From where the step began, so that the sum keeps its digits.
+    energy -= lx * (q[1] - rest[1]) + ly * (q[2] - rest[2]) + fx * tx + fy * ty
+    gradient[0] -= fy * tx - fx * ty
+    gradient[1] -= lx
+    gradient[2] -= ly
+    band[0, 0] += max(fx * tx + fy * ty, 0.0) if convex else fx * tx + fy * ty
+    k = shapes.stiffness
+    for i in range(needle.outline.shape[0]):
+        ox = c * needle.outline[i, 0] - s * needle.outline[i, 1]
+        oy = s * needle.outline[i, 0] + c * needle.outline[i, 1]
+        for row in range(point_contacts(q[1] + ox, q[2] + oy, needle.radius, shapes, rows)):
+            depth, nx, ny = rows[row, 0], rows[row, 1], rows[row, 2]
+            bend = -rows[row, 3] * depth
+            arm = nx * ox + ny * oy
+            if convex:
+                bend, arm = max(bend, 0.0), max(arm, 0.0)
+            energy += 0.5 * k * depth * depth
+            turn = ny * ox - nx * oy
+            xx, xy, yy = bend + (1.0 - bend) * nx * nx, (1.0 - bend) * nx * ny, bend + (1.0 - bend) * ny * ny
+            gradient[0] -= k * depth * turn
+            gradient[1] -= k * depth * nx
+            gradient[2] -= k * depth * ny
+            band[0, 0] += k * (oy * oy * xx - 2.0 * ox * oy * xy + ox * ox * yy + depth * arm)
+            band[1, 1] += k * (ox * xy - oy * xx)
+            band[2, 2] += k * (ox * yy - oy * xy)
+            band[1, 0] += k * xx
+            band[2, 1] += k * xy
+            band[2, 0] += k * yy
+    return float(energy)
+
+
+@compiled
+def add_clamp(
+    q: NDArray[np.float64],
+    needle: Needle,
+    segment: float,
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
+    """Add d |x_1 - x_0 + R (D, c)|^2, the half cell of bending at a glued tail.
+
+    With d = EI / D^3 and c = D^2 rest_curvature / 2 that is EI D / 4 (curvature - rest)^2, the curvature from a
+    mirrored node before the tail: of second order in D.
+    """
+    d = needle.clamp[0]
+    if d == 0.0:
+        return 0.0
+    c, s = math.cos(q[0]), math.sin(q[0])
+    hx, hy = c * segment - s * needle.clamp[1], s * segment + c * needle.clamp[1]
+    ux, uy = q[3] - q[1] + hx, q[4] - q[2] + hy
+    along = ux * hx + uy * hy
+    if convex:
+        along = min(along, 0.0)
+    gradient[0] += 2.0 * d * (uy * hx - ux * hy)
+    gradient[1] -= 2.0 * d * ux
+    gradient[2] -= 2.0 * d * uy
+    gradient[3] += 2.0 * d * ux
+    gradient[4] += 2.0 * d * uy
+    band[0, 0] += 2.0 * d * (hx * hx + hy * hy - along)
+    band[1, 1] += 2.0 * d * hy
+    band[2, 2] -= 2.0 * d * hx
+    band[3, 3] -= 2.0 * d * hy
+    band[4, 4] += 2.0 * d * hx
+    for i in range(1, 5):
+        band[i, 0] += 2.0 * d
+    band[3, 2] -= 2.0 * d
+    band[4, 2] -= 2.0 * d
+    return float(d * (ux * ux + uy * uy))

@@ -1,0 +1,225 @@
+"""One implicit step of needle and thread together: a minimum of energy and work against the liquid."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.rig.mechanics.contact import Shapes
+from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle, turn_resistance
+from magnetosuture_thread.rig.mechanics.rod import (
+    WIDTH,
+    Rod,
+    add_bending,
+    add_contact,
+    add_drag,
+    add_stretching,
+    back_substitute,
+    drag_matrices,
+    factor,
+)
+
+MOST_ITERATIONS = 60
+MOST_FREE = 12  # without a line search
+SHORTEST_SEARCH = 1e-6
+DESCENT = 1e-4  # of the decrease that the slope promises
+ROUNDING = 1e-10  # of the energy, which is a sum of larger terms
+LEAST_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
+FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere else
+
+
+class Memory(NamedTuple):
+    """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows."""
+
+    trial: NDArray[np.float64]
+    step: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    band: NDArray[np.float64]
+    chol: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    drag: NDArray[np.float64]
+    turned: NDArray[np.float64]
+    rows: NDArray[np.float64]
+
+
+def make_memory(segments: int, contacts: int) -> Memory:
+    """Return memory for a thread of n segments and for so many contacts of one point or segment."""
+    size = 2 * segments + 3
+    return Memory(
+        trial=np.zeros(size),
+        step=np.zeros(size),
+        gradient=np.zeros(size),
+        band=np.zeros((size, WIDTH)),
+        chol=np.zeros((size, WIDTH)),
+        rest=np.zeros(size),
+        drag=np.zeros((segments + 1, 3)),
+        turned=np.zeros((3, 3)),
+        rows=np.zeros((contacts, 5)),
+    )
+
+
+@compiled
+def assemble(
+    q: NDArray[np.float64],
+    field: NDArray[np.float64],
+    needle: Needle,
+    rod: Rod,
+    shapes: Shapes,
+    memory: Memory,
+    driven: bool,
+    convex: bool,
+) -> float:
+    """Write gradient and band of what a step makes least, and return its value [J].
+
+    Where the needle is driven, its three unknowns are known: they get no force and no coupling.
+    """
+    memory.gradient[:] = 0.0
+    memory.band[:, :] = 0.0
+    g, band = memory.gradient, memory.band
+    energy = add_drag(q, memory.rest, memory.drag, g, band)
+    energy += add_stretching(q, rod, g, band, convex) + add_bending(q, rod, g, band, convex)
+    energy += add_contact(q, rod, shapes, memory.rows, g, band, convex)
+    energy += add_clamp(q, needle, rod.segment, g, band, convex)
+    if not driven:
+        rest, turned, rows = memory.rest, memory.turned, memory.rows
+        energy += add_needle(q, field, needle, shapes, rest, turned, rows, g, band, convex)
+        return energy
+    for i in range(3):
+        g[i] = 0.0
+        band[i, :] = 0.0
+        band[i, 0] = 1.0
+        for j in range(3, 9):
+            if j - i < band.shape[1] and j < band.shape[0]:
+                band[j, j - i] = 0.0
+    return energy
+
+
+@compiled
+def _largest(gradient: NDArray[np.float64], arm: float) -> float:
+    """Return the largest force, the needle's torque as one at its tip [N]."""
+    largest = abs(gradient[0]) / arm
+    for i in range(1, gradient.shape[0]):
+        largest = max(largest, abs(gradient[i]))
+    return float(largest)
+
+
+@compiled
+def _minimise(
+    start: NDArray[np.float64],
+    field: NDArray[np.float64],
+    needle: Needle,
+    rod: Rod,
+    shapes: Shapes,
+    memory: Memory,
+    driven: bool,
+    tolerance: float,
+    search: bool,
+) -> tuple[int, float, float]:
+    """Find in `memory.trial` where a step's value is least; see `advance`.
+
+    Newton, with the convex part of the second derivatives where they are not positive definite. Without a line
+    search a contact is found in one or two steps; with one, steps end short of every new contact. So the first way is
+    given few steps of at most half a segment, and must end below where it started.
+    """
+    trial, size = memory.trial, start.shape[0]
+    arm = math.sqrt(needle.tip[0] ** 2 + needle.tip[1] ** 2)
+    current = start.copy()
+    first = energy = assemble(start, field, needle, rod, shapes, memory, driven, False)
+    move, force = np.inf, _largest(memory.gradient, arm)
+    for iteration in range(1, (MOST_ITERATIONS if search else MOST_FREE) + 1):
+        memory.chol[:, :] = memory.band
+        if not factor(memory.chol):
+            assemble(current, field, needle, rod, shapes, memory, driven, True)
+            memory.chol[:, :] = memory.band
+            if not factor(memory.chol):
+                return -1, np.inf, force
+        for i in range(size):
+            memory.step[i] = -memory.gradient[i]
+        back_substitute(memory.chol, memory.step)
+        slope = 0.0
+        move = abs(memory.step[0]) * arm
+        for i in range(size):
+            slope += memory.gradient[i] * memory.step[i]
+            if i > 0:
+                move = max(move, abs(memory.step[i]))
+        if not move < (np.inf if search else 0.5 * rod.segment):
+            return -1, move, force
+        part = 1.0
+        while True:
+            for i in range(size):
+                trial[i] = current[i] + part * memory.step[i]
+            new = assemble(trial, field, needle, rod, shapes, memory, driven, False)
+            force = _largest(memory.gradient, arm)
+            if move <= tolerance:
+                lower = search or new <= first + FALSE_RISE * abs(first) + LEAST_ENERGY
+                return iteration if lower else -1, move, force
+            if not search or new <= energy + DESCENT * part * slope + ROUNDING * abs(energy) + LEAST_ENERGY:
+                break
+            part *= 0.5
+            if part < SHORTEST_SEARCH:
+                return -1, move, force
+        current[:] = trial
+        energy = new
+    return -1, move, force
+
+
+@compiled
+def advance(
+    q: NDArray[np.float64],
+    before: NDArray[np.float64],
+    dt: float,
+    ratio: float,
+    field: NDArray[np.float64],
+    needle: Needle,
+    rod: Rod,
+    shapes: Shapes,
+    memory: Memory,
+    driven: bool,
+    tolerance: float,
+) -> tuple[int, float, float]:
+    """Find the state after a step of the second backward difference formula with variable steps.
+
+        Z(q*) (q - rest) / (beta dt) + dE/dq = 0,    w = dt / dt_before
+        rest = ((1 + w)^2 q_0 - w^2 q_-1) / (1 + 2 w),    beta = (1 + w) / (1 + 2 w),    q* = q_0 + w (q_0 - q_-1)
+
+    which is where E + (q - rest)' Z (q - rest) / (2 beta dt) is least. Newton's whole steps find it fast, also where
+    contacts begin and end. Where they do not, the search starts again with a line search.
+
+    Args:
+        q: state at the start, shape (N,); replaced by the state at the end. Of a driven needle its first three
+            values are in `memory.trial` [rad, m].
+        before: the state one step earlier.
+        dt: step [s].
+        ratio: w, 0 for a first step, which is backward Euler.
+        field: flux density at tail and tip at q*, shape (2, 2) [T].
+        needle: the needle.
+        rod: the thread.
+        shapes: what can be touched.
+        memory: to work in.
+        driven: whether the needle's motion is given.
+        tolerance: the largest last move of a node [m].
+
+    Returns:
+        Iterations, or -1 if it did not converge; the last move [m]; the largest force that is left [N].
+
+    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section III.5. Deviation: none.
+    """
+    trial, size = memory.trial, q.shape[0]
+    beta = (1.0 + ratio) / (1.0 + 2.0 * ratio)
+    for i in range(size):
+        memory.rest[i] = ((1.0 + ratio) ** 2 * q[i] - ratio**2 * before[i]) / (1.0 + 2.0 * ratio)
+        if not driven or i > 2:
+            trial[i] = q[i] + ratio * (q[i] - before[i])
+    drag_matrices(trial, rod, 1.0 / (beta * dt), memory.drag)
+    turn_resistance(needle, trial[0], 1.0 / (beta * dt), memory.turned)
+    start = trial.copy()
+    done, move, force = _minimise(start, field, needle, rod, shapes, memory, driven, tolerance, False)
+    if done < 0:
+        done, move, force = _minimise(start, field, needle, rod, shapes, memory, driven, tolerance, True)
+    if done > 0:
+        q[:] = trial
+    return done, move, force

@@ -1,0 +1,257 @@
+"""The thread as a discrete elastic rod: energies with gradient and band of second derivatives.
+
+Unknowns are q = [theta, x_0, y_0, x_1, y_1, ... x_n, y_n]: the needle's heading, its tail, which is node 0, and the
+thread's nodes. Every term touches three nodes in a row at most, so second derivatives have the half-width 5. They
+are kept as B[i, k] = d2E / dq_i dq_{i-k}, shape (2n + 3, 6).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts, segment_contacts
+
+WIDTH = 6  # of the band: half-width and diagonal
+
+
+class Rod(NamedTuple):
+    """A thread as kernels read it.
+
+    Attributes:
+        segment: length D of a segment [m].
+        stretching: EA [N].
+        bending: EI [N m^2].
+        across: drag per length across the thread [Pa s].
+        along: the same along it.
+        rest_turn: angle between two segments at rest, positive to the left from node 0 on [rad].
+        radius: half the diameter [m].
+    """
+
+    segment: float
+    stretching: float
+    bending: float
+    across: float
+    along: float
+    rest_turn: float
+    radius: float
+
+
+@compiled
+def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float, drag: NDArray[np.float64]) -> None:
+    """Write each node's drag: half of each segment beside it, so that a free end carries half a cell.
+
+        Z_i = scale sum D / 2 (across I - (across - along) t t')
+
+    Args:
+        q: where tangents t are taken.
+        rod: the thread.
+        scale: factor, 1 / (beta dt) in a step.
+        drag: gets Z_xx, Z_xy, Z_yy, shape (n + 1, 3).
+    """
+    drag[:, :] = 0.0
+    half = 0.5 * rod.segment * scale
+    for i in range(drag.shape[0] - 1):
+        a = 1 + 2 * i
+        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
+        square = ex * ex + ey * ey
+        less = (rod.across - rod.along) / square
+        xx, xy, yy = half * (rod.across - less * ex * ex), -half * less * ex * ey, half * (rod.across - less * ey * ey)
+        for j in range(i, i + 2):
+            drag[j, 0] += xx
+            drag[j, 1] += xy
+            drag[j, 2] += yy
+
+
+@compiled
+def add_drag(
+    q: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    drag: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+) -> float:
+    """Add sum (x_i - rest_i)' Z_i (x_i - rest_i) / 2, the work of a step against the liquid."""
+    energy = 0.0
+    for i in range(drag.shape[0]):
+        a = 1 + 2 * i
+        dx, dy = q[a] - rest[a], q[a + 1] - rest[a + 1]
+        fx, fy = drag[i, 0] * dx + drag[i, 1] * dy, drag[i, 1] * dx + drag[i, 2] * dy
+        energy += 0.5 * (fx * dx + fy * dy)
+        gradient[a] += fx
+        gradient[a + 1] += fy
+        band[a, 0] += drag[i, 0]
+        band[a + 1, 1] += drag[i, 1]
+        band[a + 1, 0] += drag[i, 2]
+    return energy
+
+
+@compiled
+def add_stretching(
+    q: NDArray[np.float64],
+    rod: Rod,
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
+    """Add sum EA / (2 D) (l_i - D)^2; `convex` leaves out what makes second derivatives indefinite."""
+    energy = 0.0
+    k = rod.stretching / rod.segment
+    for a in range(1, q.shape[0] - 2, 2):
+        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
+        size = math.sqrt(ex * ex + ey * ey)
+        tx, ty = ex / size, ey / size
+        force = k * (size - rod.segment)
+        energy += 0.5 * force * (size - rod.segment)
+        gradient[a] -= force * tx
+        gradient[a + 1] -= force * ty
+        gradient[a + 2] += force * tx
+        gradient[a + 3] += force * ty
+        turn = force / size
+        if convex:
+            turn = max(turn, 0.0)
+        xx, xy, yy = turn + (k - turn) * tx * tx, (k - turn) * tx * ty, turn + (k - turn) * ty * ty
+        for b in (a, a + 2):
+            band[b, 0] += xx
+            band[b + 1, 1] += xy
+            band[b + 1, 0] += yy
+        band[a + 2, 2] -= xx
+        band[a + 2, 1] -= xy
+        band[a + 3, 3] -= xy
+        band[a + 3, 2] -= yy
+    return energy
+
+
+@compiled
+def add_bending(
+    q: NDArray[np.float64],
+    rod: Rod,
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
+    """Add sum EI / D (1 - cos(phi_i - rest)) at inner nodes, phi_i the turn from segment to segment.
+
+        = EI / D^3 sum (cos(rest) |x_{i+1} - 2 x_i + x_{i-1}|^2 / 2 - sin(rest) e_i x e_{i+1}) + const
+
+    at the length D, which stretching holds: quadratic, and EI (curvature - rest curvature)^2 D / 2 to second order.
+    """
+    energy = 0.0
+    k = rod.bending / rod.segment**3
+    c, s = k * math.cos(rod.rest_turn), k * math.sin(rod.rest_turn)
+    for a in range(1, q.shape[0] - 4, 2):
+        ax, ay, bx, by = q[a + 2] - q[a], q[a + 3] - q[a + 1], q[a + 4] - q[a + 2], q[a + 5] - q[a + 3]
+        ux, uy = bx - ax, by - ay
+        energy += 0.5 * c * (ux * ux + uy * uy) - s * (ax * by - ay * bx)
+        gradient[a] += c * ux + s * by
+        gradient[a + 1] += c * uy - s * bx
+        gradient[a + 2] -= 2.0 * c * ux + s * (by + ay)
+        gradient[a + 3] -= 2.0 * c * uy - s * (bx + ax)
+        gradient[a + 4] += c * ux + s * ay
+        gradient[a + 5] += c * uy - s * ax
+        for r in range(2):
+            band[a + r, 0] += c
+            band[a + 2 + r, 0] += 4.0 * c
+            band[a + 4 + r, 0] += c
+            band[a + 2 + r, 2] -= 2.0 * c
+            band[a + 4 + r, 2] -= 2.0 * c
+            band[a + 4 + r, 4] += c
+        if s != 0.0 and not convex:
+            for b in (a + 2, a + 4):
+                band[b + 1, 3] -= s
+                band[b, 1] += s
+            band[a + 5, 5] += s
+            band[a + 4, 3] -= s
+    return energy
+
+
+@compiled
+def add_contact(
+    q: NDArray[np.float64],
+    rod: Rod,
+    shapes: Shapes,
+    rows: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
+    """Add k / 2 depth^2 of every contact of nodes 1 ... n and of segments.
+
+    For a segment the gap's second derivative is that of the distance between a point and a line.
+    """
+    energy = 0.0
+    k = shapes.stiffness
+    w = np.empty(4)
+    v = np.empty(4)
+    z = np.empty(4)
+    for a in range(3, q.shape[0] - 1, 2):
+        for row in range(point_contacts(q[a], q[a + 1], rod.radius, shapes, rows)):
+            depth, nx, ny, bend = rows[row, 0], rows[row, 1], rows[row, 2], -rows[row, 3] * rows[row, 0]
+            if convex:
+                bend = max(bend, 0.0)
+            energy += 0.5 * k * depth * depth
+            gradient[a] -= k * depth * nx
+            gradient[a + 1] -= k * depth * ny
+            band[a, 0] += k * (bend + (1.0 - bend) * nx * nx)
+            band[a + 1, 1] += k * (1.0 - bend) * nx * ny
+            band[a + 1, 0] += k * (bend + (1.0 - bend) * ny * ny)
+    if shapes.discs.shape[0] + shapes.boxes.shape[0] == 0:
+        return energy
+    for a in range(1, q.shape[0] - 2, 2):
+        count = segment_contacts(q[a], q[a + 1], q[a + 2], q[a + 3], rod.segment, rod.radius, shapes, rows)
+        for row in range(count):
+            depth, nx, ny, gap, s = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
+            energy += 0.5 * k * depth * depth
+            ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
+            size = math.sqrt(ex * ex + ey * ey)
+            w[0], w[1], w[2], w[3] = (1.0 - s) * nx, (1.0 - s) * ny, s * nx, s * ny
+            v[0], v[1], v[2], v[3] = -nx, -ny, nx, ny
+            tx, ty = ex / size, ey / size
+            z[0], z[1], z[2], z[3] = (1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty
+            for r in range(4):
+                gradient[a + r] -= k * depth * w[r]
+                for c in range(r + 1):
+                    second = 0.0
+                    if not convex:
+                        second = (z[r] * v[c] + v[r] * z[c]) / size + gap * v[r] * v[c] / (size * size)
+                    band[a + r, r - c] += k * (w[r] * w[c] + depth * second)
+    return energy
+
+
+@compiled
+def factor(band: NDArray[np.float64]) -> bool:
+    """Replace a band by its Cholesky factor, row by row; return whether it was positive definite."""
+    for i in range(band.shape[0]):
+        low = max(0, i - WIDTH + 1)
+        for j in range(low, i + 1):
+            total = band[i, i - j]
+            for k in range(low, j):
+                if j - k < WIDTH:
+                    total -= band[i, i - k] * band[j, j - k]
+            if j < i:
+                band[i, i - j] = total / band[j, 0]
+            elif total > 0.0:
+                band[i, 0] = math.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@compiled
+def back_substitute(band: NDArray[np.float64], right: NDArray[np.float64]) -> None:
+    """Solve in place with the factor that `factor` left."""
+    size = band.shape[0]
+    for i in range(size):
+        total = right[i]
+        for j in range(max(0, i - WIDTH + 1), i):
+            total -= band[i, i - j] * right[j]
+        right[i] = total / band[i, 0]
+    for i in range(size - 1, -1, -1):
+        total = right[i]
+        for j in range(i + 1, min(size, i + WIDTH)):
+            total -= band[j, j - i] * right[j]
+        right[i] = total / band[i, 0]

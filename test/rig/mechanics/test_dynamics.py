@@ -1,0 +1,339 @@
+"""Needle and thread in motion, against closed forms and against themselves at a finer resolution."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.rig.mechanics.dynamics import Attachment, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
+from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.mechanics.newton import advance
+
+Vector = NDArray[np.float64]
+NEEDLE = NeedleBody(7e-3, 4e-4, 0.0, 1e6, 1.0)
+POLYAMIDE = ThreadProperties(19e-3, 60, 1.2723e-9, 5.65, 0.974, 0.487, Attachment.PINNED, diameter=60e-6)
+GLUED = replace(POLYAMIDE, attachment=Attachment.GLUED)
+SLIGHT = ThreadProperties(1e-3, 4, 1e-14, 1e-3, 1e-7, 5e-8, Attachment.PINNED)
+OPEN = Surface()
+FRAME = 1.0 / 60.0
+SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def coils(turn: float = 0.0) -> CoilField:
+    angles = turn + 0.5 * math.pi * np.arange(4)
+    return CoilField(
+        [
+            Coil((0.05 * math.cos(a), 0.05 * math.sin(a), 0.0), (math.cos(a), math.sin(a), 0.0), 0.025, 0.03, 480.0)
+            for a in angles
+        ]
+    )
+
+
+class PlainField(CoilField):
+    """A field that is not of coils: B = I (b + g (x, -y)), for closed forms."""
+
+    def __init__(self, constant: tuple[float, float], gradient: float) -> None:
+        super().__init__([Coil((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1.0, 0.0, 1.0)])
+        self._constant, self._gradient = constant, gradient
+
+    def per_current(self, points: Vector) -> Vector:
+        field = np.zeros((1, len(points), 3))
+        field[0, :, :2] = self._constant + self._gradient * points[:, :2] * [1.0, -1.0]
+        return field
+
+
+def behind(properties: ThreadProperties, curvature: float = 0.0, turn: float = 0.0, count: int = 400) -> Vector:
+    """Return an arc that leaves the origin against a heading."""
+    s = np.linspace(0.0, properties.length, count)
+    x = s * np.sinc(curvature * s / math.pi)
+    y = 0.5 * curvature * s**2 * np.sinc(0.5 * curvature * s / math.pi) ** 2
+    c, n = math.cos(turn + math.pi), math.sin(turn + math.pi)
+    return np.column_stack([c * x - n * y, n * x + c * y])
+
+
+def rig(
+    thread: ThreadProperties = POLYAMIDE,
+    *,
+    needle: NeedleBody = NEEDLE,
+    surface: Surface = OPEN,
+    field: CoilField | None = None,
+    heading: float = 0.0,
+    curvature: float = 0.0,
+    points: Vector | None = None,
+    largest_step: float = 2e-3,
+) -> RigDynamics:
+    points = behind(thread, curvature, heading) if points is None else points
+    return RigDynamics(needle, thread, surface, field or coils(), points[0], heading, points, largest_step=largest_step)
+
+
+def steered(made: RigDynamics, seconds: float, strength: float = 1.0) -> RigDynamics:
+    """Let smoothly changing currents move a rig."""
+    for k in range(round(seconds / FRAME)):
+        t = k * FRAME
+        made.step(strength * np.array([math.cos(t), math.sin(2.0 * t), 0.5 * math.sin(t), -0.4]), FRAME)
+    return made
+
+
+@pytest.mark.parametrize(("attachment", "root"), [(Attachment.PINNED, 3.926602), (Attachment.GLUED, 1.875104)])
+def test_a_bent_thread_relaxes_as_its_slowest_mode(attachment: Attachment, root: float):
+    # Against a needle that is held: EI k^4 / drag, with tan kL = tanh kL, or cos kL cosh kL = -1.
+    thread = replace(POLYAMIDE, attachment=attachment)
+    k, s = root / thread.length, np.linspace(0.0, thread.length, 800)
+    if attachment is Attachment.PINNED:
+        shape = np.sin(k * s) / math.sin(root) + np.sinh(k * s) / math.sinh(root)
+    else:
+        ratio = (math.cosh(root) + math.cos(root)) / (math.sinh(root) + math.sin(root))
+        shape = np.cosh(k * s) - np.cos(k * s) - ratio * (np.sinh(k * s) - np.sin(k * s))
+    made = rig(thread, points=np.column_stack([-s, 2e-4 * shape / np.abs(shape).max()]))
+    rate = thread.bending_stiffness * k**4 / thread.drag_across
+    heights = []
+    for _ in range(6):
+        made.drive((0.0, 0.0), 0.0, 0.2 / rate)
+        heights.append(made.thread[-1, 1])
+    decay = -np.log(np.array(heights[1:]) / np.array(heights[:-1]))
+    np.testing.assert_allclose(decay[1:], 0.2, rtol=4e-3)
+
+
+def test_a_thread_that_is_pulled_lengthwise():
+    made, speed = rig(), 5e-3
+    for k in range(1, 31):
+        made.drive((k * FRAME * speed, 0.0), 0.0, FRAME)
+    # Half a segment at the tail is carried by the needle.
+    along = POLYAMIDE.length * (1.0 - (np.arange(60) + 0.5) / 60.0)
+    expected = POLYAMIDE.drag_along * speed * along
+    np.testing.assert_allclose(made.tension, expected, atol=1e-4 * expected[0])
+    assert np.abs(made.thread[:, 1]).max() < 1e-12
+    np.testing.assert_allclose(made.thread[-1, 0], 30 * FRAME * speed - 19e-3, atol=2e-7)
+
+
+def test_a_turn_does_not_stretch_the_thread_and_leaves_what_it_was_told():
+    made = rig(GLUED)
+    for k in range(1, 121):
+        a = math.pi * k / 120.0
+        tail = (5e-3 * math.sin(a), 5e-3 * (1.0 - math.cos(a)))
+        made.drive(tail, a, FRAME)
+        assert np.abs(made.tension).max() / GLUED.stretching_stiffness < 1e-4
+    np.testing.assert_allclose(made.tail, [0.0, 1e-2], atol=1e-15)
+    assert made.heading == pytest.approx(math.pi)
+    np.testing.assert_allclose(made.thread[0], made.tail)
+    np.testing.assert_allclose(made.tip, [-7e-3, 1e-2], atol=1e-15)
+    assert made.time == pytest.approx(2.0)
+    assert made.converged
+
+
+def test_a_glued_thread_keeps_the_tangent_and_a_pinned_one_does_not():
+    turns = []
+    for thread in (GLUED, POLYAMIDE):
+        made = rig(thread)
+        for k in range(1, 31):
+            made.drive((0.0, 0.0), k / 30.0, FRAME)
+        first, second = np.diff(made.thread[:3], axis=0)
+        # The tangent at the tail, of second order.
+        tangent = 1.5 * math.atan2(-first[1], -first[0]) - 0.5 * math.atan2(-second[1], -second[0])
+        turns.append(math.remainder(made.heading - tangent, 2.0 * math.pi))
+    assert abs(turns[0]) < 5e-3
+    assert abs(turns[1]) > 0.5
+
+
+def test_a_curved_thread_comes_to_rest_in_its_own_shape():
+    curved = replace(GLUED, rest_curvature=60.0)
+    made = rig(curved, curvature=30.0)
+    for _ in range(10):
+        made.drive((0.0, 0.0), 0.0, 8.0)
+    expected = behind(curved, 60.0, count=61)
+    assert np.abs(made.thread - expected).max() < 1e-3 * curved.length
+    assert made.energy < 1e-5 * rig(curved, curvature=30.0).energy
+
+
+@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.GLUED])
+def test_without_currents_the_energy_only_falls(attachment: Attachment):
+    made = rig(
+        replace(POLYAMIDE, attachment=attachment), curvature=120.0, surface=Surface((Disc((-5e-3, 1e-3), 1e-3),))
+    )
+    energies = [made.energy]
+    for _ in range(60):
+        made.step(np.zeros(4), FRAME)
+        energies.append(made.energy)
+    assert (np.diff(energies) < 0.0).all()
+    assert energies[-1] < 0.7 * energies[0]
+
+
+def test_the_world_can_be_turned():
+    turn, thread = 0.8, replace(GLUED, segments=30)
+    plain = steered(rig(thread, curvature=40.0, heading=0.2), 1.0, 2.0)
+    turned = rig(thread, curvature=40.0, heading=0.2 + turn, field=coils(turn))
+    steered(turned, 1.0, 2.0)
+    c, s = math.cos(turn), math.sin(turn)
+    back = turned.thread @ np.array([[c, -s], [s, c]])
+    assert np.linalg.norm(plain.tail) > 1e-3
+    np.testing.assert_allclose(back, plain.thread, atol=1e-9)
+    assert turned.heading - turn == pytest.approx(plain.heading, abs=1e-7)
+
+
+@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.GLUED])
+def test_it_converges_in_space(attachment: Attachment):
+    def at(segments: int) -> RigDynamics:
+        thread = replace(POLYAMIDE, attachment=attachment, segments=segments)
+        return steered(rig(thread, curvature=60.0), 1.0, 2.0)
+
+    fine = at(160)
+    errors = [float(np.linalg.norm(made.thread - fine.thread[:: 160 // n], axis=1).mean()) / 19e-3
+              for n, made in ((n, at(n)) for n in (20, 40, 80))]  # fmt: skip
+    assert errors[0] / errors[1] > 3.3
+    assert errors[2] < 5e-4
+
+
+def test_it_converges_in_time():
+    def at(step: float) -> RigDynamics:
+        return steered(rig(replace(GLUED, segments=30), curvature=60.0, largest_step=step), 0.5, 2.0)
+
+    fine = at(FRAME / 64)
+    errors = [float(np.linalg.norm(at(FRAME / parts).thread - fine.thread, axis=1).mean()) / 19e-3
+              for parts in (2, 4, 8)]  # fmt: skip
+    # Of second order, though currents jump at every frame.
+    assert errors[0] / errors[1] > 3.0
+    assert errors[2] < 5e-5
+
+
+def test_a_needle_in_a_uniform_gradient_moves_at_its_mobility():
+    made = rig(SLIGHT, field=PlainField((0.1, 0.0), 0.5))
+    for _ in range(60):
+        made.step([1.0], FRAME)
+    speed = NEEDLE.pole * 0.5 * NEEDLE.length / NEEDLE.drag[0]
+    assert made.tail[0] == pytest.approx(speed, rel=1e-4)
+    assert abs(made.tail[1]) < 1e-9
+    assert abs(made.heading) < 1e-9
+
+
+def test_a_needle_turns_into_a_uniform_field():
+    made = rig(SLIGHT, field=PlainField((0.005, 0.0), 0.0), heading=2.0, largest_step=5e-4)
+    middle = made.tail + 0.5 * (made.tip - made.tail)
+    # d angle / dt = -rate sin angle, and no force: the middle stays.
+    rate = NEEDLE.pole * NEEDLE.length * 0.005 / NEEDLE.drag[2]
+    for _ in range(6):
+        made.step([1.0], FRAME)
+    expected = 2.0 * math.atan(math.tan(1.0) * math.exp(-rate * made.time))
+    assert made.heading == pytest.approx(expected, rel=2e-4)
+    np.testing.assert_allclose(made.tail + 0.5 * (made.tip - made.tail), middle, atol=1e-6)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.6])
+def test_the_wall_stops_the_needle(heading: float):
+    surface = Surface(wall_radius=17.5e-3)
+    made = rig(surface=surface, heading=heading, field=PlainField((0.05, 0.0), 1.0))
+    for _ in range(120):
+        made.step([1.0], FRAME)
+    assert np.hypot(*made.tip) == pytest.approx(17.3e-3, abs=2e-6)
+    before = made.tip
+    made.step([1.0], FRAME)
+    # Nothing rubs, so one that does not stand upright on the wall creeps along it.
+    assert np.linalg.norm(made.tip - before) < (1e-9 if heading == 0.0 else 1e-5)
+    assert np.hypot(*made.thread.T).max() < 17.5e-3
+
+
+@pytest.mark.parametrize("kind", ["disc", "square"])
+def test_the_thread_goes_round_an_obstacle(kind: str):
+    square = 2e-3 * SQUARE
+    surface = Surface((Disc((0.0, 0.0), 2e-3),)) if kind == "disc" else Surface(polygons=(square,))
+    start = np.array([[-1e-3, 2.5e-3], [-20e-3, 2.5e-3]])
+    made = rig(surface=surface, points=start)
+    # Once around and off to the left below, so that the thread is pulled over two corners.
+    path = 3.2e-3 * np.array([[-0.3, 0.8], [1.2, 1.0], [1.2, -1.2], [-4.0, -1.2]])
+    path[0] = start[0]
+    corners = np.concatenate([np.linspace(a, b, 60)[1:] for a, b in pairwise(path)])
+    radius, deepest, touched = 0.5 * POLYAMIDE.diameter, 0.0, 0
+    for place in corners:
+        made.drive(place, 0.0, float(np.linalg.norm(place - made.tail)) / 4e-3)
+        if kind == "disc":
+            gap = np.hypot(*made.thread[1:].T) - 2e-3
+        else:
+            outside = np.abs(made.thread[1:]) - 2e-3
+            gap = np.hypot(*np.maximum(outside, 0.0).T) + np.minimum(outside.max(axis=1), 0.0)
+            # Corners do not cut the thread between its nodes either.
+            for corner in square:
+                a, b = made.thread[:-1], made.thread[1:]
+                part = np.clip(np.sum((corner - a) * (b - a), axis=1) / np.sum((b - a) ** 2, axis=1), 0.0, 1.0)
+                near = a + part[:, None] * (b - a)
+                gap = np.append(gap, np.linalg.norm(near - corner, axis=1))
+                assert not (np.abs(near) < 2e-3).all(axis=1).any()
+        deepest, touched = max(deepest, radius - float(gap.min())), touched + int(gap.min() < radius + 2e-6)
+    assert touched > 60
+    assert deepest < 1e-6
+    assert np.abs(made.tension).max() / POLYAMIDE.stretching_stiffness < 1e-3
+    # It hangs over the far side.
+    assert made.thread[:, 0].max() > 2e-3
+
+
+def test_what_a_needle_lies_against_pushes_it_away():
+    post = Surface((Disc((4e-3, -1.3e-3), 1e-3),))
+    made = rig(SLIGHT, surface=post, field=PlainField((0.0, -0.02), 0.0))
+    for _ in range(60):
+        made.step([1.0], FRAME)
+    body = made.tail + np.linspace(0.0, 1.0, 400)[:, None] * (made.tip - made.tail)
+    gap = np.linalg.norm(body - [4e-3, -1.3e-3], axis=1).min() - 1e-3 - 2e-4
+    # Discs along the body, half a radius apart, are its side.
+    assert -1.5e-5 < gap < 2e-6
+    assert abs(made.heading) > 0.1
+
+
+@pytest.mark.parametrize("wrong", [[math.nan, 0.0, 0.0, 0.0], [math.inf, 0.0, 0.0, 0.0], [1.0], [[1.0] * 4]])
+def test_currents_that_are_none_are_refused(wrong: list):
+    made = rig(replace(POLYAMIDE, segments=8))
+    before = made.thread
+    with pytest.raises(InvalidInputError, match="currents"):
+        made.step(wrong, FRAME)
+    np.testing.assert_array_equal(made.thread, before)
+    assert made.time == 0.0
+
+
+def test_other_wrong_input_is_refused():
+    made = rig(replace(POLYAMIDE, segments=8))
+    for dt in (0.0, -1.0, math.nan):
+        with pytest.raises(InvalidInputError, match="dt"):
+            made.step(np.zeros(4), dt)
+    with pytest.raises(InvalidInputError, match="heading"):
+        made.drive((0.0, 0.0), math.nan, FRAME)
+    with pytest.raises(InvalidInputError, match="tail"):
+        made.drive((0.0, math.inf), 0.0, FRAME)
+    with pytest.raises(InvalidInputError, match="first point at the tail"):
+        RigDynamics(NEEDLE, POLYAMIDE, OPEN, None, (1e-2, 0.0), 0.0, behind(POLYAMIDE))
+    with pytest.raises(InvalidInputError, match="currents"):
+        RigDynamics(NEEDLE, POLYAMIDE, OPEN, None, (0.0, 0.0), 0.0, behind(POLYAMIDE)).step(np.zeros(4), FRAME)
+    for wrong in ({"length": 0.0}, {"segments": 2}, {"bending_stiffness": -1.0}, {"drag_along": math.nan}):
+        with pytest.raises(ConfigurationError, match=next(iter(wrong))):
+            replace(POLYAMIDE, **wrong)
+
+
+def test_a_step_that_fails_is_halved_and_the_time_is_kept(monkeypatch: pytest.MonkeyPatch):
+    made, plain, calls = rig(), rig(), [0]
+
+    def sometimes(*arguments: Any) -> tuple[int, float, float]:
+        calls[0] += 1
+        return (-1, 1.0, 1.0) if calls[0] in (3, 4) else advance(*arguments)
+
+    steered(plain, 2.0 * FRAME)
+    monkeypatch.setattr("magnetosuture_thread.rig.mechanics.dynamics.advance", sometimes)
+    steered(made, FRAME)
+    assert made.halvings == 2
+    steered(made, FRAME)
+    assert made.time == pytest.approx(2.0 * FRAME)
+    np.testing.assert_allclose(made.thread, plain.thread, atol=1e-4)
+
+
+def test_a_step_that_never_converges_is_an_error(monkeypatch: pytest.MonkeyPatch):
+    made = rig()
+    monkeypatch.setattr("magnetosuture_thread.rig.mechanics.dynamics.advance", lambda *arguments: (-1, 1.0, 1.0))
+    before = made.thread
+    with pytest.raises(SolverError, match="no convergence"):
+        made.step(np.zeros(4), FRAME)
+    assert not made.converged
+    np.testing.assert_array_equal(made.thread, before)

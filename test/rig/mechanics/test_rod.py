@@ -1,0 +1,234 @@
+"""The terms of the discrete rod, its contacts and its banded solver."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, point_contacts, polygon_gap, segment_contacts
+from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle, turn_resistance
+from magnetosuture_thread.rig.mechanics.rod import (
+    WIDTH,
+    Rod,
+    add_bending,
+    add_contact,
+    add_drag,
+    add_stretching,
+    back_substitute,
+    drag_matrices,
+    factor,
+)
+
+Vector = NDArray[np.float64]
+Term = Callable[[Vector, Vector, Vector, bool], float]
+SEGMENTS, D = 7, 1e-3
+ROD = Rod(D, 5.0, 1.3e-9, 0.97, 0.48, 0.2, 3e-5)
+L_SHAPE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]) * 1e-3
+
+
+def bent_state(seed: int = 0, turn: float = 0.3) -> Vector:
+    """Return a heading and nodes of segments near the length D, each turned from the one before."""
+    random = np.random.default_rng(seed)
+    angle = math.pi + np.cumsum(random.normal(turn, 0.2, SEGMENTS))
+    steps = D * (1.0 + random.normal(0.0, 1e-3, SEGMENTS))[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    nodes = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+    return np.concatenate([[0.1], nodes.ravel()])
+
+
+def full(band: Vector) -> Vector:
+    """Return the symmetric matrix of a band."""
+    size = len(band)
+    matrix = np.zeros((size, size))
+    for i in range(size):
+        for k in range(min(WIDTH, i + 1)):
+            matrix[i, i - k] = matrix[i - k, i] = band[i, k]
+    return matrix
+
+
+def evaluated(term: Term, q: Vector, convex: bool = False) -> tuple[float, Vector, Vector]:
+    gradient, band = np.zeros(len(q)), np.zeros((len(q), WIDTH))
+    energy = term(q, gradient, band, convex)
+    return energy, gradient, full(band)
+
+
+def check_derivatives(term: Term, q: Vector, step: float = 1e-9) -> None:
+    """Compare gradient and second derivatives with central differences; the convex part with its definiteness."""
+    _, gradient, second = evaluated(term, q)
+    assert gradient.any()
+    steps = step * np.concatenate([[1e2], np.ones(len(q) - 1)])
+    slope, slopes = np.zeros(len(q)), np.zeros((len(q), len(q)))
+    for i in range(len(q)):
+        move = np.zeros(len(q))
+        move[i] = steps[i]
+        (e1, g1, _), (e0, g0, _) = evaluated(term, q + move), evaluated(term, q - move)
+        slope[i], slopes[i] = (e1 - e0) / (2.0 * steps[i]), (g1 - g0) / (2.0 * steps[i])
+    # The heading's row is a torque; scale it to compare.
+    scale = np.concatenate([[D], np.ones(len(q) - 1)])
+    np.testing.assert_allclose(gradient / scale, slope / scale, atol=2e-5 * np.abs(gradient / scale).max())
+    size = np.abs(second / np.outer(scale, scale)).max()
+    np.testing.assert_allclose(second / np.outer(scale, scale), slopes / np.outer(scale, scale), atol=2e-5 * size)
+    _, same, convex = evaluated(term, q, convex=True)
+    np.testing.assert_array_equal(same, gradient)
+    assert np.linalg.eigvalsh(convex / np.outer(scale, scale)).min() > -1e-9 * size
+
+
+def contact_term(shapes: Shapes) -> Term:
+    rows = np.zeros((len(shapes.discs) + len(shapes.corners) + 2, 5))
+    return lambda q, gradient, band, convex: add_contact(q, ROD, shapes, rows, gradient, band, convex)
+
+
+def test_stretching_has_its_derivatives():
+    check_derivatives(lambda q, g, b, convex: add_stretching(q, ROD, g, b, convex), bent_state())
+
+
+@pytest.mark.parametrize("rest_turn", [0.0, 0.2, -0.4])
+def test_bending_has_its_derivatives(rest_turn: float):
+    rod = ROD._replace(rest_turn=rest_turn)
+    check_derivatives(lambda q, g, b, convex: add_bending(q, rod, g, b, convex), bent_state(), 1e-7)
+
+
+def test_bending_is_least_at_the_rest_curvature_and_measures_curvature():
+    def at(turn: float, rest: float) -> float:
+        angle = turn * np.arange(SEGMENTS)
+        nodes = np.vstack([np.zeros(2), np.cumsum(D * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)])
+        q = np.concatenate([[0.0], nodes.ravel()])
+        return evaluated(lambda q, g, b, c: add_bending(q, ROD._replace(rest_turn=rest), g, b, c), q)[0]
+
+    energies = [at(turn, 0.2) for turn in (0.19, 0.2, 0.21)]
+    assert energies[1] == min(energies)
+    joints = SEGMENTS - 1
+    assert at(0.01, 0.0) == pytest.approx(0.5 * ROD.bending / D * joints * 0.01**2, rel=1e-4)
+    assert at(-0.2, 0.2) > at(0.2, 0.2)
+
+
+def test_drag_of_a_straight_thread():
+    nodes = np.column_stack([D * np.arange(SEGMENTS + 1), np.zeros(SEGMENTS + 1)])
+    drag = np.zeros((SEGMENTS + 1, 3))
+    drag_matrices(np.concatenate([[0.0], nodes.ravel()]), ROD, 1.0, drag)
+    np.testing.assert_allclose(drag.sum(axis=0), [ROD.along * 7e-3, 0.0, ROD.across * 7e-3], rtol=1e-12)
+    np.testing.assert_allclose(drag[0], 0.5 * drag[1])
+    np.testing.assert_allclose(drag[-1], 0.5 * drag[1])
+
+
+def test_drag_has_its_derivatives():
+    q, rest = bent_state(), bent_state() + 1e-5
+    drag = np.zeros((SEGMENTS + 1, 3))
+    drag_matrices(q, ROD, 500.0, drag)
+    check_derivatives(lambda q, g, b, convex: add_drag(q, rest, drag, g, b), q, 1e-7)
+
+
+def test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives():
+    q = bent_state()
+    nodes = q[1:].reshape(-1, 2)
+    away = np.array([nodes[2, 1] - nodes[3, 1], nodes[3, 0] - nodes[2, 0]]) / D
+    middle = 0.4 * nodes[2] + 0.6 * nodes[3]
+    beside = Disc(tuple(middle + 1.95e-3 * away), 2e-3)
+    check_derivatives(contact_term(Surface((beside,)).packed()), q)
+    on_node = Disc(tuple(nodes[4] + [1e-3, 1e-3]), 1.43e-3)
+    check_derivatives(contact_term(Surface((on_node,)).packed()), q)
+    check_derivatives(contact_term(Surface(wall_radius=float(np.hypot(*nodes.T).max()) - 2e-5).packed()), q)
+    # A corner that has cut through the segment, and one that is just within the thread's radius.
+    for depth in (4e-5, -1e-5):
+        corner = middle - depth * away
+        wedge = np.array([corner, corner + 2e-3 * away + 5e-4 * away[::-1], corner + 2e-3 * away - 5e-4 * away[::-1]])
+        check_derivatives(contact_term(Surface(polygons=(wedge,)).packed()), q)
+
+
+@pytest.mark.parametrize("wall", [7.1e-3, None])
+def test_the_needles_terms_have_their_derivatives(wall: float | None):
+    resistance = np.array([[3e-7, 2e-6, 4e-5], [2e-6, 2e-2, 1e-3], [4e-5, 1e-3, 3e-2]])
+    outline = np.column_stack([np.linspace(0.0, 7e-3, 9), np.zeros(9)])
+    needle = Needle(resistance, np.array([7e-3, 1e-4]), 0.13, outline, 2e-4, (1.3, 2e-4))
+    shapes = Surface((Disc((4e-3, 1.6e-3), 1.1e-3),), wall_radius=wall).packed()
+    rows, turned = np.zeros((4, 5)), np.zeros((3, 3))
+    q, field = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]])
+    rest = q - np.concatenate([[1e-2], np.full(len(q) - 1, 1e-5)])
+    turn_resistance(needle, 0.3, 500.0, turned)
+    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, turned, rows, g, b, c), q)
+    check_derivatives(lambda q, g, b, c: add_clamp(q, needle, D, g, b, c), q, 1e-7)
+
+
+def test_the_needles_drag_turns_with_it():
+    resistance = np.array([[3e-7, 2e-6, 4e-5], [2e-6, 2e-2, 1e-3], [4e-5, 1e-3, 3e-2]])
+    needle = Needle(resistance, np.zeros(2), 0.0, np.zeros((0, 2)), 0.0, (0.0, 0.0))
+    turned, angle = np.zeros((3, 3)), 0.7
+    turn_resistance(needle, angle, 2.0, turned)
+    turn = np.eye(3)
+    turn[1:, 1:] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    np.testing.assert_allclose(turned, 2.0 * turn @ resistance @ turn.T, rtol=1e-12)
+
+
+def test_the_distance_from_a_polygon():
+    shapes = Surface(polygons=(L_SHAPE[::-1],)).packed()
+    cases = [
+        ((2e-3, -1e-3), 1e-3, (0.0, -1.0), 0.0),
+        ((5e-3, -1e-3), math.sqrt(2.0) * 1e-3, (math.sqrt(0.5), -math.sqrt(0.5)), math.sqrt(0.5) * 1e3),
+        ((3e-3, 0.8e-3), -0.2e-3, (0.0, 1.0), 0.0),
+        ((1.3e-3, 1.2e-3), 0.2e-3, (0.0, 1.0), 0.0),
+        ((0.9e-3, 0.8e-3), -math.hypot(0.1e-3, 0.2e-3), (0.1 / math.hypot(0.1, 0.2), 0.2 / math.hypot(0.1, 0.2)), None),
+    ]
+    for point, gap, normal, curvature in cases:
+        found = polygon_gap(*point, shapes.corners, 0, 6)
+        assert found[0] == pytest.approx(gap, rel=1e-12)
+        assert found[1:3] == pytest.approx(normal, abs=1e-12)
+        assert found[3] == pytest.approx(1.0 / gap if curvature is None else curvature, abs=1e-9)
+    assert polygon_gap(2e-3, 0.0, shapes.corners, 0, 6)[:3] == pytest.approx((0.0, 0.0, -1.0))
+    np.testing.assert_array_equal(np.flatnonzero(shapes.convex == 0.0), [np.argmin(abs(shapes.corners - 1e-3).sum(1))])
+
+
+def test_a_segment_touches_only_corners_that_stick_out():
+    shapes, rows = Surface(polygons=(L_SHAPE,)).packed(), np.zeros((9, 5))
+    # Across the corner at (4, 1) mm, at 45 degrees, 10 um off; and the same beside the reflex corner (1, 1) mm.
+    off = 1e-5 * math.sqrt(0.5)
+    assert segment_contacts(3.7e-3 + off, 1.3e-3 + off, 4.3e-3 + off, 0.7e-3 + off, 8.5e-4, 3e-5, shapes, rows) == 1
+    np.testing.assert_allclose(rows[0], [2e-5, math.sqrt(0.5), math.sqrt(0.5), 1e-5, 0.5], rtol=1e-9)
+    assert segment_contacts(3.7e-3 - off, 1.3e-3 - off, 4.3e-3 - off, 0.7e-3 - off, 8.5e-4, 3e-5, shapes, rows) == 1
+    np.testing.assert_allclose(rows[0], [4e-5, math.sqrt(0.5), math.sqrt(0.5), -1e-5, 0.5], rtol=1e-9)
+    assert segment_contacts(1.005e-3, 1.3e-3, 1.3e-3, 1.005e-3, 4.2e-4, 3e-5, shapes, rows) == 0
+
+
+def test_what_a_point_touches():
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 1e-3
+    shapes = Surface((Disc((5e-3, 0.0), 1e-3),), (square,), 8e-3).packed()
+    rows = np.zeros((8, 5))
+    assert point_contacts(2e-3, 0.0, 1e-4, shapes, rows) == 0
+    assert point_contacts(3.95e-3, 0.0, 1e-4, shapes, rows) == 1
+    np.testing.assert_allclose(rows[0, :4], [5e-5, -1.0, 0.0, 1.0 / 1.05e-3], rtol=1e-9)
+    assert point_contacts(0.0, 7.95e-3, 1e-4, shapes, rows) == 1
+    np.testing.assert_allclose(rows[0, :4], [5e-5, 0.0, -1.0, -1.0 / 7.95e-3], atol=1e-15)
+    assert point_contacts(0.0, 1.05e-3, 1e-4, shapes, rows) == 1
+    np.testing.assert_allclose(rows[0, :4], [5e-5, 0.0, 1.0, 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        Surface(wall_radius=0.0),
+        Surface((Disc((0.0, 0.0), -1.0),)),
+        Surface(polygons=(np.zeros((4, 2)),)),
+        Surface(polygons=(np.array([[0.0, 0.0], [1.0, 0.0], [math.nan, 1.0]]),)),
+        Surface(stiffness=math.inf),
+    ],
+)
+def test_a_wrong_surface_is_refused(wrong: Surface):
+    with pytest.raises(ConfigurationError, match="surface"):
+        wrong.packed()
+
+
+def test_the_banded_solver():
+    random = np.random.default_rng(4)
+    band = random.normal(size=(31, WIDTH))
+    band[:, 0] += 12.0
+    matrix, right = full(band), random.normal(size=31)
+    solution, factored = right.copy(), band.copy()
+    assert factor(factored)
+    back_substitute(factored, solution)
+    np.testing.assert_allclose(matrix @ solution, right, atol=1e-12)
+    band[20, 0] = -1.0
+    assert not factor(band)
