@@ -11,7 +11,8 @@ import pytest
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.jobs.record import record
-from magnetosuture_thread.rig.camera import DishCamera, Scene
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.rig.camera.scene import Scene
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
@@ -44,7 +45,7 @@ def camera() -> DishCamera:
 @pytest.fixture(scope="session")
 def camera_with_post() -> DishCamera:
     """A camera over a dish with a post."""
-    return DishCamera(Scene(posts=[POST]), VIEW, seed=6)
+    return DishCamera(Scene(obstacles=[POST]), VIEW, seed=6)
 
 
 @pytest.fixture

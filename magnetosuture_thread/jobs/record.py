@@ -25,7 +25,8 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.thread import Attachment
-from magnetosuture_thread.rig.camera import DishCamera, Scene, encode_jpeg
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
+from magnetosuture_thread.rig.camera.scene import Scene
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
@@ -82,7 +83,7 @@ def record(
         needle_length=setup.vision.needle_length,
         needle_width=setup.vision.needle_width,
         thread_diameter=setup.model.thread().diameter,
-        posts=reference.discs,
+        obstacles=reference.discs,
     )
     camera = DishCamera(scene, view, SIZE, seed)
     notes = {
@@ -182,8 +183,7 @@ class _Topics:
         return self._make("geometry_msgs/msg/TwistStamped", header=header, twist=twist)
 
     def _camera_info(self, header: Any, camera: DishCamera) -> Any:
-        focal = CAMERA_HEIGHT / camera.view.metres_per_pixel
-        u, v = camera.view.centre_px
+        matrix = camera.view.intrinsics(CAMERA_HEIGHT)
         whole = self._make(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
@@ -194,9 +194,9 @@ class _Topics:
             width=camera.size[0],
             distortion_model="plumb_bob",
             d=np.zeros(5),
-            k=np.array([focal, 0.0, u, 0.0, focal, v, 0.0, 0.0, 1.0]),
+            k=matrix.ravel(),
             r=np.eye(3).ravel(),
-            p=np.array([focal, 0.0, u, 0.0, 0.0, focal, v, 0.0, 0.0, 0.0, 1.0, 0.0]),
+            p=np.column_stack([matrix, np.zeros(3)]).ravel(),
             binning_x=0,
             binning_y=0,
             roi=whole,

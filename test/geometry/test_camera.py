@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from magnetosuture_thread.geometry.camera import DishView
 
@@ -13,7 +14,25 @@ def test_axes_and_scale():
     np.testing.assert_allclose(view.to_dish(np.array([332.0, 228.0])), [8e-4, 8e-4])
 
 
-def test_there_and_back():
-    view = DishView((300.5, 200.25), 1.3e-4)
+def test_a_turned_dish_has_its_x_axis_counter_clockwise_as_seen():
+    view = DishView((320.0, 240.0), 1e-4, np.radians(90.0))
+    np.testing.assert_allclose(view.to_pixels(np.array([1e-3, 0.0])), [320.0, 230.0], atol=1e-9)  # up in the image
+    np.testing.assert_allclose(view.to_pixels(np.array([0.0, 1e-3])), [310.0, 240.0], atol=1e-9)
+    np.testing.assert_allclose(view.directions_to_dish(np.array([0.0, -1.0])), [1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.4, -2.9])
+def test_there_and_back(rotation: float):
+    view = DishView((300.5, 200.25), 1.3e-4, rotation)
     points = np.random.default_rng(1).uniform(-0.02, 0.02, (20, 2))
     np.testing.assert_allclose(view.to_dish(view.to_pixels(points)), points, atol=1e-15)
+    directions = points / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(view.directions_to_dish(view.directions_to_pixels(directions)), directions, atol=1e-15)
+
+
+def test_without_a_rotation_it_is_as_it_always_was():
+    view = DishView((300.5, 200.25), 1.3e-4)
+    points = np.random.default_rng(1).uniform(-0.02, 0.02, (20, 2))
+    np.testing.assert_array_equal(view.to_pixels(points), points / 1.3e-4 * (1.0, -1.0) + (300.5, 200.25))
+    matrix = view.intrinsics(0.3)
+    np.testing.assert_allclose(matrix @ [0.001, -0.002, 0.3] / 0.3, [*view.to_pixels(np.array([0.001, 0.002])), 1.0])

@@ -1,0 +1,128 @@
+"""The simulated rig: currents in, frames out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.rig.camera.dish_camera import Image
+from magnetosuture_thread.rig.faults import COIL_STUCK
+from magnetosuture_thread.rig.settings import RigSettings
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame and the truth of its moment.
+
+    Attributes:
+        time: since the start [s].
+        image: BGR, shape (height, width, 3); None if the frame got lost.
+        lateness: how long it is held back before anybody gets it [s].
+        tail: the needle's true tail, shape (2,) [m].
+        heading: its true angle at the tail [rad].
+        thread: the thread's true centreline from the tail on, shape (n + 1, 2) [m].
+    """
+
+    time: float
+    image: Image | None
+    lateness: float
+    tail: Vector
+    heading: float
+    thread: Vector
+
+
+class Rig:
+    """Needle and thread in the coils' field, under a camera. Time comes in as seconds since the start.
+
+    A power stage that gets no new currents for `coil_timeout` switches off, as real ones do. The times of
+    faults count from the first current that is not zero, so that they do not depend on how long the other
+    nodes take to start.
+
+    Args:
+        settings: of the rig.
+
+    Attributes:
+        time: up to which needle and thread have moved [s].
+        currents: in force, shape (m,) [A].
+        began: time of the first current that was not zero, inf before [s].
+    """
+
+    def __init__(self, settings: RigSettings) -> None:
+        self._settings = settings
+        self._dynamics = settings.dynamics()
+        self.camera = settings.camera()
+        self.faults = settings.schedule()
+        self._random = np.random.default_rng(settings.seed + 1)
+        self.time = 0.0
+        self.began = math.inf
+        self.currents = np.zeros(len(settings.coil_angles))
+        self._applied_at = 0.0
+
+    def warm_up(self) -> None:
+        """Compile what a frame takes, on a needle and thread that are thrown away.
+
+        OpenCV gets one core for itself: the others belong to the nodes that are looked at.
+        """
+        cv2.setNumThreads(1)
+        spare = self._settings.dynamics()
+        spare.step(self.currents, 1e-3)
+        self.camera.render(spare.tail, spare.heading, spare.thread)
+
+    def apply(self, currents: Vector, time: float) -> None:
+        """Set the coils' currents from a time on; until then the last ones are in force.
+
+        Args:
+            currents: of each coil, shape (m,) [A].
+            time: since the start [s].
+
+        Raises:
+            InvalidInputError: of the wrong number, or not finite.
+        """
+        if currents.shape != self.currents.shape or not np.all(np.isfinite(currents)):
+            expected = f"{len(self.currents)} finite numbers [A]"
+            raise InvalidInputError("coils/currents.current", currents.tolist(), expected)
+        self.advance(time)
+        if np.any(currents):
+            self.began = min(self.began, self.time)
+        stuck = self.currents[0]
+        self.currents = currents.copy()
+        if COIL_STUCK in self.faults.kinds(self.running):
+            self.currents[0] = stuck
+        self._applied_at = time
+
+    def advance(self, time: float) -> None:
+        """Let needle and thread move up to a time since the start [s]; nothing happens for one that is past."""
+        off_at = max(self.time, self._applied_at + self._settings.coil_timeout)
+        if off_at < time and COIL_STUCK not in self.faults.kinds(off_at - self.began):
+            self._move(off_at)
+            self.currents = np.zeros_like(self.currents)
+        self._move(time)
+
+    def _move(self, time: float) -> None:
+        if time > self.time:
+            self._dynamics.step(self.currents, time - self.time)
+            self.time = time
+
+    @property
+    def running(self) -> float:
+        """Time since the first current that was not zero, -inf before [s]."""
+        return self.time - self.began
+
+    def look(self, time: float) -> Frame:
+        """Take a frame at a time since the start [s]."""
+        self.advance(time)
+        faults, dynamics, running = self.faults, self._dynamics, self.running
+        away = faults.lifted(running, dynamics.tail)
+        tail, thread = dynamics.tail + away, dynamics.thread + away
+        image = None
+        if not faults.drops(running, float(self._random.uniform())):
+            covers = faults.covers(running, tail, dynamics.tip + away)
+            image = self.camera.render(tail, dynamics.heading, thread, covers, faults.gain(running))
+        return Frame(self.time, image, faults.lateness(running), tail, dynamics.heading, thread)

@@ -1,0 +1,207 @@
+"""Settings of the simulated rig."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.rig.camera.scene import Lighting, Scene, needle_axis
+from magnetosuture_thread.rig.faults import Fault, FaultSchedule
+from magnetosuture_thread.rig.mechanics.contact import Surface
+from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
+from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
+from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
+
+LARGEST_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
+
+
+@dataclass(frozen=True)
+class RigSettings(Configuration):
+    """The rig that is simulated: its dish, coils, needle, thread and camera, and what goes wrong.
+
+    These are the truth of the simulation. What the other nodes believe is in their own sections.
+    """
+
+    GROUP: ClassVar[str] = "rig_simulator"
+
+    clock: str = quantity(
+        "real", "whose time the rig runs in; simulated publishes /clock", choices=("real", "simulated")
+    )
+    pace: float = quantity(1.0, "how much faster than real time a simulated clock runs", minimum=0.05, maximum=20.0)
+    seed: int = quantity(0, "of dust, sensor noise and faults", minimum=0, maximum=2**31 - 1)
+    faults: tuple[str, ...] = quantity((), "what goes wrong: KIND START DURATION each, in seconds since the start")
+
+    dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
+    viscosity: float = quantity(1.0, "of the liquid around the needle", unit="Pa s", minimum=1e-4, maximum=100.0)
+    disc_obstacles: tuple[float, ...] = quantity(
+        (), "x, y and radius of each round obstacle", unit="m", minimum=-0.5, maximum=0.5, multiple=3
+    )
+    polygon_obstacles: tuple[float, ...] = quantity(
+        (), "x and y of each corner of all polygons", unit="m", minimum=-0.5, maximum=0.5, multiple=2
+    )
+    polygon_sizes: tuple[int, ...] = quantity((), "number of corners of each polygon", minimum=3, maximum=10000)
+
+    coil_angles: tuple[float, ...] = quantity(
+        (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi),
+        "direction of each coil from the dish's centre, against the x axis",
+        unit="rad",
+        minimum=-2.0 * math.pi,
+        maximum=2.0 * math.pi,
+    )
+    coil_distance: float = quantity(
+        0.05, "from the dish's centre to the middle of a coil", unit="m", minimum=0.01, maximum=1.0
+    )
+    coil_radius: float = quantity(0.025, "mean radius of the windings", unit="m", minimum=0.002, maximum=0.5)
+    coil_length: float = quantity(0.03, "of the winding along its axis", unit="m", minimum=0.0, maximum=0.5)
+    coil_turns: float = quantity(480.0, "of a coil", minimum=1.0, maximum=1e5)
+    coil_timeout: float = quantity(
+        0.25, "without new currents for this long the power stage switches off", unit="s", minimum=0.01, maximum=10.0
+    )
+
+    needle_length: float = quantity(0.007, "along the body", unit="m", minimum=0.001, maximum=0.05)
+    needle_width: float = quantity(0.0004, "diameter of the body", unit="m", minimum=5e-5, maximum=0.005)
+    needle_curvature: float = quantity(
+        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
+    )
+    needle_magnetisation: float = quantity(
+        1.0e6, "of the needle, NdFeB, along its body", unit="A/m", minimum=1e3, maximum=2e6
+    )
+    needle_start: tuple[float, ...] = quantity(
+        (0.0, 0.0, 0.0),
+        "x [m], y [m] of the tail and heading [rad] at the start",
+        minimum=-7.0,
+        maximum=7.0,
+        multiple=3,
+    )
+
+    thread_length: float = quantity(0.019, "of the thread", unit="m", minimum=0.001, maximum=2.0)
+    thread_diameter: float = quantity(60e-6, "of the thread", unit="m", minimum=1e-6, maximum=0.005)
+    thread_segments: int = quantity(60, "that the simulated thread is cut into", minimum=8, maximum=400)
+    thread_attachment: str = quantity("pinned", "to the needle", choices=("pinned", "glued"))
+    thread_bending_stiffness: float = quantity(1.2723e-9, "E I of the thread", unit="N m^2", minimum=0.0, maximum=1e-3)
+    thread_stretching_stiffness: float = quantity(5.65, "E A of the thread", unit="N", minimum=1e-3, maximum=1e6)
+    thread_drag_across: float = quantity(
+        0.974, "force across a length of thread for each speed", unit="Pa s", minimum=1e-6, maximum=1e3
+    )
+    thread_drag_along: float = quantity(0.487, "the same along it", unit="Pa s", minimum=1e-6, maximum=1e3)
+    thread_start_curvature: float = quantity(
+        0.0, "of the arc in which the thread lies behind the needle at the start", unit="1/m", minimum=-1e4, maximum=1e4
+    )
+
+    camera_width: int = quantity(640, "of a frame", unit="px", minimum=64, maximum=4096)
+    camera_height: int = quantity(480, "of a frame", unit="px", minimum=64, maximum=4096)
+    camera_height_share: float = quantity(0.9115, "of a frame's height that the dish fills", minimum=0.1, maximum=2.0)
+    camera_distance: float = quantity(0.3, "of the camera from the dish", unit="m", minimum=0.01, maximum=10.0)
+    frame_rate: float = quantity(60.0, "frames a second", unit="Hz", minimum=1.0, maximum=240.0)
+    jpeg_quality: int = quantity(85, "of the compressed frames", minimum=1, maximum=100)
+    light_gain: float = quantity(1.0, "of the exposure, 1 is well exposed", minimum=0.05, maximum=5.0)
+    noise: float = quantity(1.0, "of the sensor, in units of the usual", minimum=0.0, maximum=20.0)
+
+    def check(self) -> None:
+        """Refuse what does not fit together."""
+        if len(self.needle_start) != 3:
+            raise ConfigurationError(f"{self.GROUP}.needle_start", list(self.needle_start), "x, y and heading")
+        x, y, heading = self.needle_start
+        ends, _ = needle_axis(
+            np.array([x, y]), heading, self.needle_length, self.needle_curvature, np.array([0.0, 1.0])
+        )
+        if np.linalg.norm(ends, axis=1).max() >= 0.5 * self.dish_diameter:
+            raise ConfigurationError(f"{self.GROUP}.needle_start", list(self.needle_start), "a needle in the dish")
+        if sum(self.polygon_sizes) * 2 != len(self.polygon_obstacles):
+            raise ConfigurationError(
+                f"{self.GROUP}.polygon_sizes", list(self.polygon_sizes), "corners of all polygon_obstacles in sum"
+            )
+        if len(self.coil_angles) < 1:
+            raise ConfigurationError(f"{self.GROUP}.coil_angles", [], "at least one coil's angle [rad]")
+        for fault in self.faults:
+            Fault.parse(fault)
+
+    def obstacles(self) -> tuple[Disc | Polygon, ...]:
+        """Return discs, then polygons."""
+        discs = [Disc((x, y), radius) for x, y, radius in np.reshape(self.disc_obstacles, (-1, 3)).tolist()]
+        corners = np.reshape(self.polygon_obstacles, (-1, 2))
+        pieces = np.split(corners, np.cumsum(self.polygon_sizes)[:-1]) if self.polygon_sizes else []
+        return (*discs, *(Polygon(tuple(map(tuple, piece.tolist()))) for piece in pieces))
+
+    def view(self) -> DishView:
+        """Return where the dish is in the image: a little off the middle, as in a real rig."""
+        scale = self.dish_diameter / (self.camera_height_share * self.camera_height)
+        return DishView((0.5 * self.camera_width + 2.0, 0.5 * self.camera_height - 2.0), scale)
+
+    def camera(self) -> DishCamera:
+        """Return the camera over the dish."""
+        scene = Scene(
+            dish_diameter=self.dish_diameter,
+            needle_length=self.needle_length,
+            needle_width=self.needle_width,
+            needle_curvature=self.needle_curvature,
+            thread_diameter=self.thread_diameter,
+            obstacles=self.obstacles(),
+        )
+        lighting = Lighting(gain=self.light_gain, noise=self.noise)
+        return DishCamera(scene, self.view(), (self.camera_width, self.camera_height), self.seed, lighting)
+
+    def schedule(self) -> FaultSchedule:
+        """Return what goes wrong and when."""
+        faults = [Fault.parse(text) for text in self.faults]
+        return FaultSchedule(faults, self.dish_diameter, self.needle_length, self.seed)
+
+    def field(self) -> CoilField:
+        """Return the coils' field."""
+        coils = [
+            Coil(
+                centre=(self.coil_distance * math.cos(a), self.coil_distance * math.sin(a), 0.0),
+                axis=(math.cos(a), math.sin(a), 0.0),
+                radius=self.coil_radius,
+                length=self.coil_length,
+                turns=self.coil_turns,
+            )
+            for a in self.coil_angles
+        ]
+        return CoilField(coils)
+
+    def dynamics(self) -> RigDynamics:
+        """Return needle and thread at their start, in the field of the coils."""
+        x, y, heading = self.needle_start
+        tail = np.array([x, y])
+        at = np.linspace(0.0, 1.0, self.thread_segments + 1)
+        behind, _ = needle_axis(tail, heading + math.pi, self.thread_length, self.thread_start_curvature, at)
+        obstacles = self.obstacles()
+        return RigDynamics(
+            needle=NeedleBody(
+                length=self.needle_length,
+                diameter=self.needle_width,
+                curvature=self.needle_curvature,
+                magnetisation=self.needle_magnetisation,
+                viscosity=self.viscosity,
+            ),
+            thread=ThreadProperties(
+                length=self.thread_length,
+                segments=self.thread_segments,
+                bending_stiffness=self.thread_bending_stiffness,
+                stretching_stiffness=self.thread_stretching_stiffness,
+                drag_across=self.thread_drag_across,
+                drag_along=self.thread_drag_along,
+                attachment=Attachment(self.thread_attachment),
+                diameter=self.thread_diameter,
+            ),
+            surface=Surface(
+                discs=tuple(o for o in obstacles if isinstance(o, Disc)),
+                polygons=tuple(o.rings[0] for o in obstacles if isinstance(o, Polygon)),
+                wall_radius=0.5 * self.dish_diameter,
+            ),
+            field=self.field(),
+            tail=tail,
+            heading=heading,
+            thread_points=behind,
+            largest_step=LARGEST_STEP,
+        )

@@ -1,0 +1,81 @@
+"""Faults of the simulated rig."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.rig.faults import KINDS, Fault, FaultSchedule
+
+TAIL, TIP = np.array([0.002, 0.001]), np.array([0.009, 0.001])
+
+
+def schedule(*faults: str) -> FaultSchedule:
+    """Return a schedule of faults in words."""
+    return FaultSchedule([Fault.parse(text) for text in faults], 0.035, 0.007, seed=3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_holds_from_its_start_for_its_duration(kind: str):
+    faults = schedule(f"{kind} 2.0 1.5")
+    assert [kind in faults.kinds(time) for time in (1.99, 2.0, 3.49, 3.5)] == [False, True, True, False]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "glare", "glare 1", "glare 1 2 3", "sun 1 2", "glare -1 2", "glare 1 0", "glare 1 nan", "glare x 1"]
+)
+def test_what_is_no_fault_is_refused_in_words(text: str):
+    with pytest.raises(ConfigurationError, match="KIND START DURATION"):
+        Fault.parse(text)
+
+
+def test_only_its_own_effect_is_seen():
+    calm = schedule("coil_stuck 0 9")
+    assert calm.gain(1.0) == 1.0
+    assert not calm.drops(1.0, 0.0)
+    assert calm.lateness(1.0) == 0.0
+    assert calm.lifted(1.0, TAIL).tolist() == [0.0, 0.0]
+    assert calm.covers(1.0, TAIL, TIP) == ()
+
+
+def test_exposure():
+    assert schedule("dim 0 1").gain(0.5) < 0.5
+    assert schedule("overexposed 0 1").gain(0.5) > 1.5
+
+
+def test_frames_get_lost_or_come_late():
+    assert all(schedule("camera_stopped 0 1").drops(0.5, chance) for chance in (0.0, 0.99))
+    half = [schedule("dropped_frames 0 1").drops(0.5, chance) for chance in np.linspace(0.0, 0.99, 100)]
+    assert 0.4 < np.mean(half) < 0.6
+    assert schedule("late_frames 0 1").lateness(0.5) > 0.05
+
+
+def test_the_needle_is_carried_over_the_rim_and_back():
+    faults = schedule("needle_out 1 3")
+    away = [float(np.linalg.norm(faults.lifted(time, TAIL))) for time in (0.9, 1.1, 2.5, 3.9, 4.1)]
+    assert away[0] == away[4] == 0.0
+    assert 0.0 < away[1] < 0.02
+    assert away[2] > 0.035
+    assert 0.0 < away[3] < 0.02
+    outwards = faults.lifted(2.5, TAIL)
+    assert outwards @ TAIL > 0.0
+
+
+@pytest.mark.parametrize("kind", ["glare", "hand", "tool"])
+def test_what_covers_lies_on_the_needle(kind: str):
+    (cover,) = schedule(f"{kind} 0 2").covers(0.3, TAIL, TIP)
+    line = TAIL + np.linspace(0.0, 1.0, 50)[:, None] * (TIP - TAIL)
+    crossed = [inside(point, cover.outline) for point in line]
+    assert any(crossed)
+
+
+def inside(point: np.ndarray, outline: np.ndarray) -> bool:
+    """Return whether a point is inside of a closed outline, by the winding of its corners around it."""
+    angles = np.unwrap(np.arctan2(*(np.vstack([outline, outline[:1]]) - point).T[::-1]))
+    return bool(abs(angles[-1] - angles[0]) > np.pi)
+
+
+def test_the_same_seed_lies_in_the_same_place():
+    first, second = (schedule("hand 0 2").covers(0.3, TAIL, TIP)[0].outline for _ in range(2))
+    assert (first == second).all()

@@ -1,0 +1,141 @@
+"""The simulated rig: currents in, frames out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.rig.rig import Rig
+from magnetosuture_thread.rig.settings import RigSettings
+
+EASTWARDS = np.array([4.0, 0.0, -2.0, 0.0])
+
+
+def rig(**changes: object) -> Rig:
+    """Return a rig whose needle points east, with a straight thread behind it."""
+    return Rig(RigSettings(**{"needle_start": (0.003, 0.0, 0.0), "thread_segments": 20, **changes}))  # type: ignore[arg-type]
+
+
+def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
+    made = rig()
+    before = made.look(0.0)
+    made.apply(EASTWARDS, 0.1)
+    for time in np.arange(0.2, 0.7, 0.1):
+        made.apply(EASTWARDS, time)
+    after = made.look(0.7)
+    assert after.tail[0] > before.tail[0] + 1e-3
+    assert abs(after.tail[1]) < 1e-5
+    np.testing.assert_allclose(after.thread[0], after.tail)
+    assert before.image is not None
+    assert after.image is not None
+    where = made.camera.view.to_pixels(after.tail + 0.0035 * np.array([np.cos(after.heading), np.sin(after.heading)]))
+    assert after.image[round(where[1]), round(where[0])].max() < 120
+    assert before.image[round(where[1]), round(where[0])].max() < 255
+
+
+def test_without_current_nothing_moves():
+    made = rig()
+    before, after = made.look(0.0), made.look(2.0)
+    np.testing.assert_allclose(after.tail, before.tail, atol=1e-7)
+
+
+def test_a_power_stage_that_hears_nothing_switches_off():
+    made = rig(coil_timeout=0.2)
+    made.apply(EASTWARDS, 0.0)
+    made.advance(0.2)
+    there = made.look(0.2).tail
+    made.advance(0.21)
+    assert made.currents.tolist() == [0.0] * 4
+    np.testing.assert_allclose(made.look(2.0).tail, there, atol=2e-5)
+
+
+def test_the_time_of_switching_off_does_not_depend_on_when_one_looks():
+    often, once = rig(coil_timeout=0.2), rig(coil_timeout=0.2)
+    for made in (often, once):
+        made.apply(EASTWARDS, 0.0)
+    for time in np.arange(0.01, 1.0, 0.01):
+        often.advance(float(time))
+    np.testing.assert_allclose(often.look(1.0).tail, once.look(1.0).tail, atol=1e-6)
+
+
+def test_a_stuck_coil_keeps_its_current_whatever_it_is_told():
+    made = rig(faults=("coil_stuck 0.1 1.0",))
+    made.apply(EASTWARDS, 0.4)
+    made.apply(np.zeros(4), 0.6)
+    assert made.currents.tolist() == [4.0, 0.0, 0.0, 0.0]
+    made.advance(1.4)
+    assert made.currents[0] == 4.0
+    made.apply(np.zeros(4), 1.6)
+    assert made.currents.tolist() == [0.0] * 4
+
+
+def test_a_stopped_camera_gives_no_image_but_the_truth():
+    made = rig(faults=("camera_stopped 0 1",))
+    made.apply(EASTWARDS, 0.0)
+    frame = made.look(0.5)
+    assert frame.image is None
+    assert frame.tail.shape == (2,)
+    assert made.look(1.5).image is not None
+
+
+def test_the_times_of_faults_count_from_the_first_current():
+    made = rig(faults=("camera_stopped 1 1",))
+    assert made.look(1.5).image is not None
+    made.apply(EASTWARDS, 2.0)
+    assert [made.look(time).image is None for time in (2.5, 3.5, 4.5)] == [False, True, False]
+
+
+def test_a_lifted_needle_is_out_of_the_dish_in_picture_and_truth():
+    made = rig(faults=("needle_out 0 4",))
+    made.apply(1e-9 * EASTWARDS, 0.0)
+    frame = made.look(2.0)
+    assert np.linalg.norm(frame.tail) > 0.03
+    np.testing.assert_allclose(frame.thread[0], frame.tail)
+
+
+@pytest.mark.parametrize(
+    "currents", [np.zeros(3), np.array([np.nan, 0.0, 0.0, 0.0]), np.array([0.0, np.inf, 0.0, 0.0])]
+)
+def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
+    made = rig()
+    made.apply(EASTWARDS, 0.0)
+    with pytest.raises(InvalidInputError, match="4 finite numbers"):
+        made.apply(currents, 0.1)
+    assert made.currents.tolist() == EASTWARDS.tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"needle_start": (0.0, 0.0)}, "a multiple of 3"),
+        ({"needle_start": ()}, "x, y"),
+        ({"needle_start": (0.012, 0.0, 0.0)}, "a needle in the dish"),
+        ({"faults": ("sun 1 2",)}, "KIND START DURATION"),
+        ({"faults": (3,)}, "a list of texts"),
+        ({"polygon_sizes": (3,)}, "corners of all"),
+        ({"thread_attachment": "sewn"}, "pinned, glued"),
+        ({"viscosity": 0.0}, "from 0.0001"),
+    ],
+)
+def test_settings_that_make_no_rig_are_refused(changes: dict[str, object], words: str):
+    with pytest.raises(ConfigurationError, match=words):
+        RigSettings(**changes)  # type: ignore[arg-type]
+
+
+def test_obstacles_are_drawn_and_felt():
+    made = rig(
+        disc_obstacles=(0.013, 0.0, 0.002),
+        polygon_obstacles=(-0.01, 0.005, 0.0, 0.005, -0.005, 0.01),
+        polygon_sizes=(3,),
+    )
+    for time in np.arange(0.0, 3.0, 0.1):
+        made.apply(EASTWARDS, float(time))
+    frame = made.look(3.0)
+    tip = frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)])
+    assert np.linalg.norm(tip - (0.013, 0.0)) > 0.002 - 1e-5
+    assert frame.image is not None
+    plain = rig().look(0.0).image
+    assert plain is not None
+    inside = made.camera.view.to_pixels(np.array([-0.005, 0.007])).round().astype(int)
+    assert frame.image[inside[1], inside[0], 0] < plain[inside[1], inside[0], 0] - 15
