@@ -24,7 +24,8 @@ from magnetosuture_thread.study.replayed import (
     error_figures,
     stage_latencies,
 )
-from magnetosuture_thread.vision.tracker import VisionTracker, decode_image, unpack_image
+from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.tracker import VisionTracker
 
 DEFAULT_SETUP = "petri_35mm_polyamide"
 Say = Callable[[str], None]
@@ -181,7 +182,7 @@ def _draw(path: Path, bag: Bag, setup: Setup, camera: Channel, instants: list[In
             image = decode_image(message.data)
         else:
             image = unpack_image(message.data, message.height, message.width, message.step, message.encoding)
-        view = view or VisionTracker(setup.vision).track(image).view
+        view = view or VisionTracker(setup.vision).look(image).view
         if is_chosen:
             frame = image
         if view is not None and frame is not None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.camera import DishView
 
 
 @dataclass(frozen=True)
@@ -21,3 +24,41 @@ class VisionTrackerSettings(Configuration):
     needle_length: float = quantity(0.007, "length of the needle", unit="m", minimum=0.001, maximum=0.05)
     needle_width: float = quantity(0.0004, "width of the needle's body", unit="m", minimum=5e-5, maximum=0.005)
     thread_length: float = quantity(0.019, "length of the thread", unit="m", minimum=0.001, maximum=2.0)
+    dish_centre_px: tuple[float, ...] = quantity(
+        (), "the dish's centre in the image, u and v; not given: found", unit="px", minimum=0.0, maximum=1e5, multiple=2
+    )
+    metres_per_pixel: float = quantity(
+        0.0, "the image's scale; 0: from the dish's diameter", unit="m", minimum=0.0, maximum=0.01
+    )
+    camera_rotation: float = quantity(
+        0.0,
+        "angle of the dish's x axis in the image, counter-clockwise as seen",
+        unit="rad",
+        minimum=-math.pi,
+        maximum=math.pi,
+    )
+    max_needle_speed: float = quantity(
+        0.05, "greatest speed of the needle; what is faster is not it", unit="m/s", minimum=1e-4, maximum=1.0
+    )
+    max_turn_rate: float = quantity(
+        6.0, "greatest turn rate of the needle; what is faster is not it", unit="rad/s", minimum=0.1, maximum=100.0
+    )
+    confirm_frames: int = quantity(
+        3, "frames in a row that must agree before a needle found anew is tracked", minimum=1, maximum=30
+    )
+    forget_after: float = quantity(
+        1.0, "time without the needle after which it is found anew", unit="s", minimum=0.05, maximum=60.0
+    )
+
+    def check(self) -> None:
+        """Refuse more than one centre."""
+        if len(self.dish_centre_px) > 2:
+            name = f"{self.GROUP}.dish_centre_px"
+            raise ConfigurationError(name, self.dish_centre_px, "u and v [px], or no entries to find the dish")
+
+    def fixed_view(self) -> DishView | None:
+        """Return the view if all of it is given; None if the dish must be found."""
+        if len(self.dish_centre_px) == 2 and self.metres_per_pixel:
+            u, v = self.dish_centre_px
+            return DishView((u, v), self.metres_per_pixel, self.camera_rotation)
+        return None

@@ -1,48 +1,57 @@
-"""From a camera frame to the needle's pose and the thread's centreline, in the dish frame."""
+"""Follows the needle over time: what fits its motion is taken, all else is refused."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.centreline import find_centreline
-from magnetosuture_thread.vision.dish import find_dish
-from magnetosuture_thread.vision.needle import INSIDE, find_needle
+from magnetosuture_thread.vision.dish.watch import DishWatch
+from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_image, measured_channel
+from magnetosuture_thread.vision.look import (
+    State,
+    Track,
+    look_once,
+    needles_in,
+    no_pose,
+    picture_of,
+    tracked,
+    why_none,
+)
+from magnetosuture_thread.vision.needle.body import SeenNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-SEEN_SHARE = 1.1  # a walk longer than this share of the thread has left it
+JUMP_BACK = 1.0  # s; time that goes back by more begins anew, as a bag that was wound back
+GATE_PX = 3.0  # that a needle may be off its prediction, beside what its greatest speed allows
+GATE_ANGLE = math.radians(6.0)
+LONGEST_PREDICTION = 0.2  # s; a motion is not extrapolated farther
+MEMORY = 0.5  # weight of the newest velocity
+MARGIN_PX = 32.0  # around the needle and the thread, that is looked at
+BORDER_PX = 20.0  # a thread that ends so near to the region's border may go on
+LEAST_SHARE = 0.9  # of the thread seen before; if less is seen in the region, the whole frame is looked at
 
 
 @dataclass(frozen=True)
-class Track:
-    """What one frame shows.
+class _Pose:
+    """A needle that was seen, in the dish frame."""
 
-    Attributes:
-        lost: why nothing was found; empty when the needle is tracked.
-        tail: the needle's blunt end, shape (2,) [m]; empty when lost.
-        tip: its point, shape (2,) [m]; empty when lost.
-        heading: unit vector from tail to tip, shape (2,); empty when lost.
-        centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
-        view: where the dish is in the image; None when it is not found.
-    """
-
-    lost: str
+    time: float
     tail: np.ndarray
-    tip: np.ndarray
-    heading: np.ndarray
-    centreline: np.ndarray
-    view: DishView | None
+    angle: float
+    velocity: np.ndarray
+    turn_rate: float
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        """Return tail and heading angle predicted with constant velocity."""
+        after = min(time - self.time, LONGEST_PREDICTION)
+        return self.tail + after * self.velocity, self.angle + after * self.turn_rate
 
 
 class VisionTracker:
-    """Tracks the needle and the thread, frame by frame.
-
-    The dish is searched until it is found and then taken to stand still, until a frame of another
-    size comes.
+    """Tracks the needle and the thread.
 
     Args:
         settings: what to look for.
@@ -50,11 +59,20 @@ class VisionTracker:
 
     def __init__(self, settings: VisionTrackerSettings) -> None:
         self._settings = settings
-        self._view: DishView | None = None
+        self._dish = DishWatch(settings)
         self._shape: tuple[int, ...] = ()
+        self.reset()
 
-    def track(self, image: np.ndarray) -> Track:
-        """Look at one frame.
+    def reset(self) -> None:
+        """Forget the needle and the dish."""
+        self._dish.forget()
+        self._time: float | None = None
+        self._last: _Pose | None = None
+        self._anew: list[_Pose] = []
+        self._thread: np.ndarray = np.empty((0, 2))  # in pixels, with the needle's ends
+
+    def look(self, image: np.ndarray) -> Track:
+        """Look at one frame alone; what other frames showed doesn't matter.
 
         Args:
             image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.
@@ -62,82 +80,150 @@ class VisionTracker:
         Raises:
             InvalidInputError: the image is not of this kind.
         """
-        gray = _measured_channel(image)
+        check_image(image)
+        return look_once(measured_channel(image), self._settings)
+
+    def track(self, image: np.ndarray, time_s: float) -> Track:
+        """Look at the next frame.
+
+        A needle near enough to where the last ones predict it is tracked at once. One found elsewhere
+        is tracked only after `confirm_frames` frames in a row that agree. Time that goes back by more
+        than a second begins anew.
+
+        Args:
+            image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.
+            time_s: when the frame was taken [s], on any clock.
+
+        Raises:
+            InvalidInputError: the image is not of this kind, or the frame is not newer than the last one.
+        """
+        check_image(image)
+        self._advance(time_s)
+        gray = measured_channel(image)
         if gray.shape != self._shape:
-            self._view, self._shape = None, gray.shape
-        settings = self._settings
-        if self._view is None:
-            self._view = find_dish(gray, settings.dish_diameter)
-        view = self._view
-        if view is None:
-            return _lost("no dish in the image", None)
-        needle = find_needle(gray, view, 0.5 * settings.dish_diameter, settings.needle_length, settings.needle_width)
-        if needle is None:
-            return _lost("no single needle in the dish", view)
-        longest = SEEN_SHARE * settings.thread_length / view.metres_per_pixel
-        reach = INSIDE * 0.5 * settings.dish_diameter / view.metres_per_pixel
-        walk = find_centreline(gray, needle, longest, view.centre_px, reach)
-        return Track(
-            lost="",
-            tail=view.to_dish(needle.tail_px),
-            tip=view.to_dish(needle.tip_px),
-            heading=needle.direction_px * (1.0, -1.0),
-            centreline=view.to_dish(walk),
-            view=view,
-        )
+            self.reset()
+            self._shape, self._time = gray.shape, time_s
+        if self._last is not None and time_s - self._last.time > self._settings.forget_after:
+            self._last = None
+        before = self._dish.view
+        reason = self._dish.look(gray)
+        view = self._dish.view
+        if reason or view is None:
+            self._anew = []
+            return no_pose(self._missing(), reason, view)
+        if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
+            self._last, self._anew = None, []
+        chosen, picture, reason = self._choose(gray, view, time_s)
+        if chosen is None or picture is None:
+            return no_pose(self._missing(), reason, view)
+        found = tracked(picture, view, self._settings, chosen)
+        if picture.gray.shape != gray.shape and self._is_cut(found, picture):
+            picture, chosen = _in_whole(picture, chosen, picture_of(gray, view, self._settings))
+            found = tracked(picture, view, self._settings, chosen)
+        ends = np.array([found.tail, found.tip])
+        self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
+        return found
+
+    def _advance(self, time_s: float) -> None:
+        """Take the time of the next frame."""
+        if not math.isfinite(time_s):
+            raise InvalidInputError("image.stamp", time_s, "a time [s]")
+        if self._time is not None and time_s <= self._time:
+            if time_s > self._time - JUMP_BACK:
+                raise InvalidInputError("image.stamp", f"{time_s:.6f} s", f"a time after {self._time:.6f} s")
+            self.reset()
+        self._time = time_s
+
+    def _is_cut(self, found: Track, picture: Picture) -> bool:
+        """Say whether the thread may go on beyond the part of the frame that was looked at."""
+        assert found.view is not None
+        line = found.view.to_pixels(found.centreline)
+        if _length(line) < LEAST_SHARE * _length(self._thread[2:]):
+            return True
+        u, v = line[-1] - picture.origin
+        rows, columns = picture.gray.shape
+        return bool(min(u, v, columns - 1 - u, rows - 1 - v) < BORDER_PX)
+
+    def _missing(self) -> State:
+        return State.LOST if self._last is not None else State.SEARCHING
+
+    def _choose(self, gray: np.ndarray, view: DishView, time: float) -> tuple[SeenNeedle | None, Picture | None, str]:
+        """Return the needle of this frame and the picture it is in, or why there is none."""
+        if self._last is not None:
+            _, angle = self._last.at(time)
+            toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
+            picture = picture_of(gray, view, self._settings, self._region(gray, view, time))
+            needles, _ = needles_in(picture, view, self._settings, toward)
+            within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
+            if len(within) == 1:
+                self._take(_pose(within[0], picture, view, time), self._last)
+                return within[0], picture, ""
+        picture = picture_of(gray, view, self._settings)
+        needles, refused = needles_in(picture, view, self._settings)
+        if self._last is not None and len(needles) > 1:
+            within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
+            needles = within if len(within) == 1 else needles
+        if len(needles) != 1:
+            self._anew = []
+            return None, None, f"{len(needles)} needles in the dish" if needles else why_none(refused)
+        pose = _pose(needles[0], picture, view, time)
+        if self._last is not None and self._fits(pose, self._last):
+            self._take(pose, self._last)
+            return needles[0], picture, ""
+        if self._anew and not self._fits(pose, self._anew[-1]):
+            self._anew = []
+        self._anew.append(pose)
+        if len(self._anew) >= self._settings.confirm_frames:
+            self._take(pose, self._anew[-2] if len(self._anew) > 1 else None)
+            return needles[0], picture, ""
+        if self._last is not None:
+            return None, None, "a needle farther from the last one than it can move"
+        return None, None, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
+
+    def _fits(self, pose: _Pose, last: _Pose) -> bool:
+        """Say whether a needle can have come from where it was last."""
+        after = pose.time - last.time
+        tail, angle = last.at(pose.time)
+        assert self._dish.view is not None
+        reach = self._settings.max_needle_speed * after + GATE_PX * self._dish.view.metres_per_pixel
+        turn = abs((pose.angle - angle + math.pi) % (2.0 * math.pi) - math.pi)
+        most = min(self._settings.max_turn_rate * after + GATE_ANGLE, 0.5 * math.pi)
+        return math.dist(pose.tail, tail) < reach and turn < most
+
+    def _take(self, pose: _Pose, before: _Pose | None) -> None:
+        """Keep a pose, with the velocity that the one before gives it."""
+        velocity, turn_rate = np.zeros(2), 0.0
+        if before is not None:
+            after = pose.time - before.time
+            velocity = before.velocity + MEMORY * ((pose.tail - before.tail) / after - before.velocity)
+            turned = (pose.angle - before.angle + math.pi) % (2.0 * math.pi) - math.pi
+            turn_rate = before.turn_rate + MEMORY * (turned / after - before.turn_rate)
+        self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate)
+        self._anew = []
+
+    def _region(self, gray: np.ndarray, view: DishView, time: float) -> tuple[int, int, int, int]:
+        """Return the box in which needle and thread should be: left, top, right, bottom [px]."""
+        assert self._last is not None
+        moved = self._last.at(time)[0] - self._last.tail
+        reach = MARGIN_PX + self._settings.max_needle_speed * (time - self._last.time) / view.metres_per_pixel
+        corners = np.vstack([self._thread, self._thread[:2] + view.directions_to_pixels(moved / view.metres_per_pixel)])
+        low, high = corners.min(axis=0) - reach, corners.max(axis=0) + reach
+        left, top = (max(0, int(value) // FLOOR_FACTOR * FLOOR_FACTOR) for value in low)
+        right = min(gray.shape[1], (int(high[0]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
+        bottom = min(gray.shape[0], (int(high[1]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
+        return left, top, right, bottom
 
 
-def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
-    """Decode a JPEG or PNG image to BGR.
-
-    Raises:
-        InvalidInputError: the bytes are no image that can be decoded.
-    """
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    image = cv2.imdecode(buffer, cv2.IMREAD_COLOR) if buffer.size else None
-    if image is None:
-        raise InvalidInputError("image.data", f"{buffer.size} bytes", "a JPEG or PNG image")
-    return image
+def _pose(needle: SeenNeedle, picture: Picture, view: DishView, time: float) -> _Pose:
+    heading = view.directions_to_dish(needle.direction_px)
+    tail = view.to_dish(needle.tail_px + picture.origin)
+    return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0)
 
 
-def unpack_image(
-    data: bytes | bytearray | memoryview | np.ndarray, height: int, width: int, step: int, encoding: str
-) -> np.ndarray:
-    """Return a raw image as BGR or grey array.
-
-    Args:
-        data: rows of `step` bytes each.
-        height: rows.
-        width: columns.
-        step: bytes in a row, padding included.
-        encoding: bgr8, rgb8 or mono8.
-
-    Raises:
-        InvalidInputError: the encoding is another, or the sizes don't fit the data.
-    """
-    channels = {"bgr8": 3, "rgb8": 3, "mono8": 1}.get(encoding)
-    if channels is None:
-        raise InvalidInputError("image.encoding", repr(encoding), "bgr8, rgb8 or mono8")
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    if height < 1 or width < 1 or step < width * channels or buffer.size != height * step:
-        sizes = f"{buffer.size} bytes for {width} x {height}, step {step}"
-        raise InvalidInputError("image.data", sizes, f"height times step bytes, {channels} for each pixel")
-    rows = buffer.reshape(height, step)[:, : width * channels]
-    if channels == 1:
-        return rows
-    image = rows.reshape(height, width, 3)
-    return image[:, :, ::-1] if encoding == "rgb8" else image
+def _in_whole(part: Picture, needle: SeenNeedle, whole: Picture) -> tuple[Picture, SeenNeedle]:
+    """Return the whole frame, and a needle of a part of it in the whole frame's pixels."""
+    return whole, needle.shifted(part.origin)
 
 
-def _measured_channel(image: np.ndarray) -> np.ndarray:
-    """Return the channel to measure on: green, which a colour sensor samples twice as densely."""
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise InvalidInputError("image", f"{image.dtype} of shape {image.shape}", "8-bit grey or BGR pixels")
-    if min(image.shape[:2]) < 64:
-        raise InvalidInputError("image", f"{image.shape[1]} x {image.shape[0]} pixels", "at least 64 x 64 pixels")
-    return image if image.ndim == 2 else np.ascontiguousarray(image[:, :, 1])
-
-
-def _lost(reason: str, view: DishView | None) -> Track:
-    nothing = np.empty(0)
-    return Track(reason, nothing, nothing, nothing, np.empty((0, 2)), view)
+def _length(points: np.ndarray) -> float:
+    return float(np.hypot(*np.diff(points, axis=0).T).sum()) if len(points) > 1 else 0.0

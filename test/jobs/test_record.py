@@ -15,7 +15,7 @@ from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
-from magnetosuture_thread.vision.tracker import decode_image
+from magnetosuture_thread.vision.images import decode_image
 
 
 def test_the_bag_holds_frames_commands_and_truth_and_says_that_it_is_simulated(short_bag: Path):

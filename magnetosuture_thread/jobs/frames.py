@@ -1,0 +1,115 @@
+"""Camera frames from wherever they are: picture files, a folder of them, or a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.interface import CAMERA
+from magnetosuture_thread.vision.images import decode_image, unpack_image
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame.
+
+    Attributes:
+        name: the file's name, or topic and stamp.
+        image: None if it is broken.
+        problem: why it is; else empty.
+        stamp: when it was taken [s]; None where nothing tells.
+    """
+
+    name: str
+    image: np.ndarray | None
+    problem: str = ""
+    stamp: float | None = None
+
+
+class FrameSource:
+    """The frames at given paths.
+
+    Args:
+        paths: picture files, one folder of pictures, or one bag.
+
+    Attributes:
+        count: number of frames.
+        is_sequence: whether the frames follow one another in time, as in a bag.
+        notes: what a bag's writer says of it.
+
+    Raises:
+        BagError: a path does not exist, a folder holds no pictures, or a bag cannot be used.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._files: list[Path] = []
+        self._bag: Bag | None = None
+        self._topic = ""
+        self.notes: dict[str, str] = {}
+        for path in paths:
+            self._add(path, alone=len(paths) == 1)
+        self.is_sequence = self._bag is not None
+        self.count = self._bag.counts[self._topic] if self._bag is not None else len(self._files)
+
+    def _add(self, path: Path, alone: bool) -> None:
+        try:
+            path.stat()
+            is_folder = path.is_dir()
+            inside = sorted(path.iterdir()) if is_folder else []
+        except FileNotFoundError:
+            raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
+        except (OSError, ValueError) as error:
+            raise BagError(path, f"cannot be read: {error}") from None
+        if path.suffix == ".mcap" or any(file.suffix == ".mcap" for file in inside):
+            if not alone:
+                raise BagError(path, "is a bag; expected it alone, without other frames")
+            bag = self._bag = Bag(path)
+            self.notes = bag.notes
+            channels = [c for c in CAMERA.values() if bag.topics.get(c.recorded) == c.type_name]
+            channel = max(channels, key=lambda c: bag.counts[c.recorded], default=None)
+            if channel is None or not bag.counts[channel.recorded]:
+                topics = " or ".join(c.recorded for c in CAMERA.values())
+                raise BagError(path, f"holds no camera frames; expected some on {topics}")
+            self._topic = channel.recorded
+        elif is_folder:
+            pictures = [file for file in inside if file.suffix.lower() in PICTURES and file.is_file()]
+            if not pictures:
+                raise BagError(path, f"holds no pictures; expected files that end in {', '.join(PICTURES)}, or a bag")
+            self._files += pictures
+        else:
+            self._files.append(path)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Go through the frames: files in the order given, a folder by name, a bag by time."""
+        if self._bag is not None:
+            for record in self._bag.records({self._topic}):
+                yield self._recorded(record)
+            return
+        for file in self._files:
+            try:
+                yield Frame(file.name, decode_image(file.read_bytes()))
+            except OSError as error:
+                yield Frame(file.name, None, f"cannot be read: {error.strerror}")
+            except InvalidInputError as error:
+                yield Frame(file.name, None, str(error))
+
+    def _recorded(self, record: Record) -> Frame:
+        """Return a recorded frame; it is broken where message or picture are."""
+        stamp = record.time * 1e-9
+        try:
+            message = record.decode()
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            if record.type_name == CAMERA["compressed"].type_name:
+                image = decode_image(message.data)
+            else:
+                image = unpack_image(message.data, message.height, message.width, message.step, message.encoding)
+        except (BagError, InvalidInputError) as error:
+            return Frame(f"{record.topic} {stamp:.6f}", None, str(error), stamp)
+        return Frame(f"{record.topic} {stamp:.6f}", np.asarray(image), "", stamp)

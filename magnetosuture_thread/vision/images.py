@@ -1,0 +1,113 @@
+"""Images: from bytes to pixels, and what of them is measured on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from magnetosuture_thread.errors import InvalidInputError
+
+CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
+FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
+FLOOR_CELLS = 9  # side of the median window on that grid: wider than a needle, a thread, a speck
+GLARE = 1.07  # of the floor's brightness: above, a pixel shows the lamp
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame or a part of it, made ready to measure on.
+
+    Attributes:
+        gray: the measured channel, shape (rows, columns), uint8.
+        factor: how much smaller `small` is.
+        small: the same, shrunk by area.
+        floor: brightness of what is behind all slender things, in the pixels of `small`.
+        origin: (u, v) of the first pixel in the whole frame.
+    """
+
+    gray: np.ndarray
+    factor: int
+    small: np.ndarray
+    floor: np.ndarray
+    origin: tuple[int, int] = (0, 0)
+
+
+def prepare(gray: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0)) -> Picture:
+    """Shrink a grey image and estimate the floor behind what lies on it.
+
+    The floor is the median over a window that all slender things fill by less than half, so that light
+    that changes over the dish doesn't matter.
+    """
+    small = gray
+    if factor > 1:
+        small = cv2.resize(gray, None, fx=1.0 / factor, fy=1.0 / factor, interpolation=cv2.INTER_AREA)
+    cells = (max(2, gray.shape[1] // FLOOR_FACTOR), max(2, gray.shape[0] // FLOOR_FACTOR))
+    rough = cv2.medianBlur(cv2.resize(small, cells, interpolation=cv2.INTER_AREA), FLOOR_CELLS)
+    floor = cv2.resize(rough, small.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return Picture(gray, factor, small, floor, origin)
+
+
+def glare_mask(picture: Picture) -> np.ndarray:
+    """Return where the lamp is reflected, in the pixels of `small`, uint8: 255 there."""
+    bound = cv2.convertScaleAbs(picture.floor, alpha=GLARE, beta=2.0)
+    return cv2.compare(cv2.medianBlur(picture.small, 3), bound, cv2.CMP_GT)
+
+
+def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
+    """Decode a JPEG or PNG image to BGR.
+
+    Raises:
+        InvalidInputError: the bytes are no image that can be decoded.
+    """
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    try:
+        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR) if buffer.size else None
+    except cv2.error:  # some headers promise more than can be made
+        image = None
+    if image is None:
+        raise InvalidInputError("image.data", f"{buffer.size} bytes", "a JPEG or PNG image")
+    return image
+
+
+def unpack_image(
+    data: bytes | bytearray | memoryview | np.ndarray, height: int, width: int, step: int, encoding: str
+) -> np.ndarray:
+    """Return a raw image as BGR or grey array.
+
+    Args:
+        data: rows of `step` bytes each.
+        height: rows.
+        width: columns.
+        step: bytes in a row, padding included.
+        encoding: bgr8, rgb8 or mono8.
+
+    Raises:
+        InvalidInputError: the encoding is another, or the sizes don't fit the data.
+    """
+    channels = CHANNELS.get(encoding)
+    if channels is None:
+        raise InvalidInputError("image.encoding", repr(encoding), "bgr8, rgb8 or mono8")
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    if height < 1 or width < 1 or step < width * channels or buffer.size != height * step:
+        sizes = f"{buffer.size} bytes for {width} x {height}, step {step}"
+        raise InvalidInputError("image.data", sizes, f"height times step bytes, {channels} for each pixel")
+    rows = buffer.reshape(height, step)[:, : width * channels]
+    if channels == 1:
+        return rows
+    image = rows.reshape(height, width, 3)
+    return image[:, :, ::-1] if encoding == "rgb8" else image
+
+
+def check_image(image: np.ndarray) -> None:
+    """Raise `InvalidInputError` unless an array is an image to look at."""
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise InvalidInputError("image", f"{image.dtype} of shape {image.shape}", "8-bit grey or BGR pixels")
+    if min(image.shape[:2]) < 64:
+        raise InvalidInputError("image", f"{image.shape[1]} x {image.shape[0]} pixels", "at least 64 x 64 pixels")
+
+
+def measured_channel(image: np.ndarray) -> np.ndarray:
+    """Return the channel to measure on: green, which a colour sensor samples twice as densely."""
+    return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, 1])

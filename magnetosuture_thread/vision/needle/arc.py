@@ -1,0 +1,103 @@
+"""Circular arcs in the image: what a needle, straight or curved, lies along.
+
+The tangent of an arc with curvature k, after a length s, is its first direction turned by k s; positive
+turns u towards v, clockwise as seen. A straight line is k = 0, without a special case.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Arc:
+    """An arc that goes on from a point.
+
+    Attributes:
+        start: point of length 0, shape (2,) [px].
+        angle: direction there, from u towards v [rad].
+        curvature: [1/px]
+    """
+
+    start: np.ndarray
+    angle: float
+    curvature: float
+
+    def at(self, along: np.ndarray | float, aside: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return the points at lengths along the arc and distances aside of it, shape (..., 2) [px].
+
+        p = start + s sinc(k s / 2) (cos b, sin b) + d (-sin c, cos c),  b = angle + k s / 2,  c = angle + k s
+        """
+        s = np.asarray(along, dtype=float)
+        chord = s * np.sinc(self.curvature * s / (2.0 * math.pi))
+        middle, turned = self.angle + 0.5 * self.curvature * s, self.angle + self.curvature * s
+        return np.stack(
+            [
+                self.start[0] + chord * np.cos(middle) - aside * np.sin(turned),
+                self.start[1] + chord * np.sin(middle) + aside * np.cos(turned),
+            ],
+            axis=-1,
+        )
+
+    def direction(self, along: float = 0.0) -> np.ndarray:
+        """Return the unit tangent after a length, shape (2,)."""
+        turned = self.angle + self.curvature * along
+        return np.array([math.cos(turned), math.sin(turned)])
+
+    def coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return lengths along the arc and distances aside of it of points, the inverse of `at` [px]."""
+        along, across = self.direction(), np.array([-math.sin(self.angle), math.cos(self.angle)])
+        offset = points - self.start
+        forward, side = offset @ along, offset @ across
+        if abs(self.curvature) < 1e-6:
+            return forward, side
+        turned = np.arctan2(self.curvature * forward, 1.0 - self.curvature * side)
+        radius = 1.0 / self.curvature
+        return turned * radius, radius - math.copysign(1.0, radius) * np.hypot(forward, radius - side)
+
+    def moved(self, along: float, aside: float, slope: float, bend: float) -> Arc:
+        """Return the arc that leaves at a length, with an offset, a slope and a second derivative of it."""
+        stretch = 1.0 - self.curvature * aside
+        angle = self.angle + self.curvature * along + math.atan2(slope, stretch)
+        return Arc(self.at(along, aside), angle, self.curvature / stretch + bend)
+
+    def reversed_at(self, along: float) -> Arc:
+        """Return the same arc, walked back from a length."""
+        return Arc(self.at(along), self.angle + self.curvature * along + math.pi, -self.curvature)
+
+
+def fit_arc(points: np.ndarray) -> Arc:
+    """Fit a circle or a line to points; the arc starts at its point nearest to their mean.
+
+    Minimises sum (A z + B x + C y + D)^2 over sum of its squared gradients, z = x^2 + y^2, by a singular
+    value decomposition, in which a line is the case A = 0.
+
+    Args:
+        points: shape (m, 2), m >= 3 [px].
+
+    Source: [Taubin1991] G. Taubin, "Estimation of planar curves, surfaces, and nonplanar space curves defined by
+    implicit equations", IEEE T-PAMI 13(11). Deviation: none.
+    """
+    mean = points.mean(axis=0)
+    x, y = (points - mean).T
+    z = x * x + y * y
+    spread = max(float(z.mean()), 1e-12)
+    system = np.column_stack([(z - spread) / (2.0 * math.sqrt(spread)), x, y])
+    _, axes = np.linalg.eigh(system.T @ system)
+    a, b, c = axes[:, 0]
+    a /= 2.0 * math.sqrt(spread)
+    d = -spread * a
+    size = math.sqrt(max(b * b + c * c - 4.0 * a * d, 1e-24))
+    a, b, c, d = (float(value) / size for value in (a, b, c, d))
+    gradient = math.hypot(b, c)
+    if gradient < 1e-9:  # The mean is the centre: any point is as near as another.
+        b, c, gradient = 1.0, 0.0, 1.0
+    normal = np.array([b, c]) / gradient
+    # Along the normal through the mean: a t^2 + gradient t + d = 0, the root of smaller size.
+    root = math.sqrt(max(gradient * gradient - 4.0 * a * d, 0.0))
+    foot = mean + normal * (-2.0 * d / (gradient + root))
+    # Across the tangent (n_v, -n_u) lies the normal itself, and the circle's centre lies against it where a > 0.
+    return Arc(foot, math.atan2(-normal[0], normal[1]), -2.0 * a)

@@ -1,0 +1,117 @@
+"""Finds the needle: the one dark, slender thing in the dish whose two ends are a tail and a tip."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.vision.images import Picture
+from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
+from magnetosuture_thread.vision.needle.body import SeenNeedle, measure_body
+
+DARK = 0.55  # of the floor's brightness
+INSIDE = 0.985  # part of the dish's radius that is looked at, to stay off the rim
+WIDE_PX = 4.0  # a needle at least this wide is searched at half the size
+LEAST_AREA = 0.33  # of the needle's own
+ON_AXIS = 0.85  # of a needle's dark pixels lie along one arc; more beside it belong to what touches it
+MOST_CANDIDATES = 6  # beyond which the image is no dish with a needle
+
+
+def search_factor(width_px: float) -> int:
+    """Return by how much an image may be shrunk to search for a needle of a width [px]."""
+    return 2 if width_px >= WIDE_PX else 1
+
+
+def find_needles(
+    picture: Picture, view: DishView, dish_radius: float, length: float, width: float, toward: np.ndarray | None = None
+) -> tuple[list[SeenNeedle], list[str]]:
+    """Find all that may be the needle.
+
+    Dark pixels in the dish form components; each of about the right area is measured.
+
+    Args:
+        picture: the frame or a part of it.
+        view: where the dish is in the picture, whose first pixel is (0, 0).
+        dish_radius: [m]
+        length: of the needle [m].
+        width: of the needle's body [m].
+        toward: where the needle must point, u right and v down; settles which end is which where both look
+            alike, as when the tip is blurred.
+
+    Returns:
+        The needles, and in words why each of the other candidates is none.
+    """
+    expected, thickness = length / view.metres_per_pixel, width / view.metres_per_pixel
+    needles: list[SeenNeedle] = []
+    refused: list[str] = []
+    candidates = _dark_components(picture, view, dish_radius, expected * thickness)
+    if len(candidates) > MOST_CANDIDATES:
+        return [], [f"{len(candidates)} dark things"]
+    for points in candidates:
+        guess = _rough_axis(points, thickness)
+        if guess is None:
+            refused.append("no arc")
+            continue
+        arc, first, last = guess
+        if not 0.6 * expected < last - first < 1.4 * expected:
+            refused.append(f"{last - first:.0f} px long")
+            continue
+        if abs(arc.curvature) * expected > 1.25 * np.pi:
+            refused.append("bent beyond a half circle")
+            continue
+        found = measure_body(picture.gray, arc, first, last, expected, thickness, toward)
+        if isinstance(found, SeenNeedle):
+            needles.append(found)
+        else:
+            refused.append(found)
+    return needles, refused
+
+
+def _dark_components(picture: Picture, view: DishView, dish_radius: float, area: float) -> list[np.ndarray]:
+    """Return the pixels of each dark component of at least a part `LEAST_AREA` of an area [px^2], shape (m, 2)."""
+    factor = picture.factor
+    shift = 0.5 * (factor - 1)
+    u, v = ((c - shift) / factor for c in view.centre_px)
+    radius = INSIDE * dish_radius / view.metres_per_pixel / factor
+    left, top = (max(0, int(c - radius)) for c in (u, v))
+    window = slice(top, max(top, int(v + radius) + 2)), slice(left, max(left, int(u + radius) + 2))
+    dark = cv2.compare(picture.small[window], cv2.convertScaleAbs(picture.floor[window], alpha=DARK), cv2.CMP_LT)
+    if dark is None or dark.size == 0:
+        return []
+    mask = np.zeros(dark.shape, np.uint8)
+    cv2.circle(mask, (round((u - left) * 16), round((v - top) * 16)), round(radius * 16), 255, -1, cv2.LINE_8, 4)
+    cv2.bitwise_and(dark, mask, dark)
+    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    result = []
+    for outline in outlines:
+        # A component is no larger than its box, so most are passed over at once.
+        x, y, wide, high = cv2.boundingRect(outline)
+        if wide * high * factor**2 < LEAST_AREA * area:
+            continue
+        own = np.zeros((high, wide), np.uint8)
+        cv2.drawContours(own, [outline], -1, 255, -1, cv2.LINE_8, offset=(-x, -y))
+        rows, columns = np.nonzero(own & dark[y : y + high, x : x + wide])
+        if len(rows) * factor**2 < LEAST_AREA * area:
+            continue
+        at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
+        result.append(at * factor + shift)
+    return result
+
+
+def _rough_axis(points: np.ndarray, width: float) -> tuple[Arc, float, float] | None:
+    """Return an arc through a component, and the lengths along it between which it lies; None if it is no arc."""
+    kept = points
+    for _ in range(3):
+        if len(kept) < 8:
+            return None
+        arc = fit_arc(kept)
+        along, aside = arc.coordinates(points)
+        near = np.abs(aside) < 0.5 * width + 1.5
+        before, kept = len(kept), points[near]
+        if len(kept) == before:
+            break
+    inner = np.abs(aside) < 0.5 * width + 2.0
+    if inner.mean() < ON_AXIS:
+        return None
+    return arc, float(along[inner].min()) - 0.5, float(along[inner].max()) + 0.5

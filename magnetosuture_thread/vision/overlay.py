@@ -1,0 +1,157 @@
+"""Draws what was seen over the frame, for a person to judge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.vision.look import State, Track
+
+VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
+SHIFT = 4  # binary places of a coordinate
+NEEDLE, TIP, THREAD, DISH = (40, 140, 255), (40, 200, 255), (70, 190, 60), (200, 170, 60)
+PLATES = {State.TRACKED: (70, 150, 50), State.LOST: (50, 50, 200), State.SEARCHING: (160, 120, 40)}
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: str = "") -> np.ndarray:
+    """Draw dish, thread and needle over a frame, and the state in words.
+
+    Args:
+        image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.
+        track: what was seen in it.
+        needle_length: [m]
+        title: written at the top.
+
+    Returns:
+        A new BGR image of the same size.
+    """
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    unit = max(1, round(min(drawn.shape[:2]) / 480))
+    view = track.view
+    if view is not None:
+        _circle(drawn, np.asarray(view.centre_px), 2.5 * unit, DISH, -1)
+    if view is not None and not track.reason:
+        if len(track.centreline) > 1:
+            line = view.to_pixels(track.centreline)
+            _line(drawn, line, THREAD, unit)
+            _circle(drawn, line[-1], 2.5 * unit, THREAD, -1)
+        axis = view.to_pixels(_needle_axis(track, needle_length))
+        _line(drawn, axis, NEEDLE, unit)
+        _circle(drawn, axis[0], 4.0 * unit, NEEDLE, unit)
+        _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, TIP, -1)
+    _plate(drawn, track, title, unit)
+    return drawn
+
+
+def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: float) -> None:
+    """Draw the dish's circle into a BGR image."""
+    _circle(image, np.asarray(centre_px), radius_px, DISH, 1)
+
+
+class OverlayWriter:
+    """Writes overlays as a video or as PNG files in a folder.
+
+    Args:
+        path: a video's file if it ends like one, else a folder.
+        rate: frames a second, of a video.
+
+    Raises:
+        BagError: the folder or the video cannot be written.
+    """
+
+    def __init__(self, path: Path, rate: float = 30.0) -> None:
+        self._path, self._rate = path, rate
+        self._video: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+        if path.suffix.lower() in VIDEOS:
+            if not path.parent.is_dir():
+                raise BagError(path, "is in no folder that exists")
+            return
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BagError(path, f"cannot be made: {error.strerror}") from None
+
+    def write(self, name: str, image: np.ndarray) -> None:
+        """Write one picture.
+
+        Args:
+            name: of its file in a folder, without its ending.
+            image: BGR, uint8; in a video, a picture of another size than the first is fitted into it.
+        """
+        if self._path.suffix.lower() not in VIDEOS:
+            file = self._path / f"{name}.png"
+            if not cv2.imwrite(str(file), image):
+                raise BagError(file, "cannot be written")
+            return
+        if self._video is None:
+            self._size = (image.shape[1] // 2 * 2, image.shape[0] // 2 * 2)  # which every codec takes
+            code = cv2.VideoWriter.fourcc(*VIDEOS[self._path.suffix.lower()])
+            self._video = cv2.VideoWriter(str(self._path), code, self._rate, self._size)
+            if not self._video.isOpened():
+                raise BagError(self._path, "cannot be written as a video here; name a folder for PNG files")
+        if image.shape[1::-1] != self._size:
+            image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        self._video.write(image)
+
+    def __enter__(self) -> OverlayWriter:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the video."""
+        if self._video is not None:
+            self._video.release()
+
+
+def _needle_axis(track: Track, length: float) -> Points:
+    """Return the needle's axis from tail to tip, shape (25, 2) [m]."""
+    s = np.linspace(0.0, length, 25)
+    half = 0.5 * track.curvature * s
+    chord = s * np.sinc(half / np.pi)
+    cosine, sine = np.cos(half), np.sin(half)
+    x, y = track.heading
+    return np.asarray(track.tail + chord[:, None] * np.column_stack([cosine * x - sine * y, cosine * y + sine * x]))
+
+
+def _plate(image: np.ndarray, track: Track, title: str, unit: int) -> None:
+    """Write the state on a half-transparent plate along the lower border."""
+    text = track.state.value
+    if track.reason:
+        text += f": {track.reason}"
+    else:
+        angle = np.degrees(np.arctan2(track.heading[1], track.heading[0]))
+        x, y = track.tail * 1e3
+        text += f"   tail {x:+.2f} {y:+.2f} mm   heading {angle:+.1f} deg   confidence {track.confidence:.2f}"
+    high = 22 * unit
+    band = image[-high:]
+    band[:] = cv2.addWeighted(band, 0.25, np.full_like(band, PLATES[track.state]), 0.75, 0.0)
+    scale = 0.42 * unit
+    widest = image.shape[1] - 16 * unit
+    while len(text) > 8 and cv2.getTextSize(text, FONT, scale, unit)[0][0] > widest:
+        text = text[:-4] + "..."
+    at = (8 * unit, image.shape[0] - 7 * unit)
+    cv2.putText(image, text, at, FONT, scale, (255, 255, 255), unit, cv2.LINE_AA)
+    if title:
+        cv2.putText(image, title, (8 * unit, 16 * unit), FONT, scale, (60, 60, 60), unit, cv2.LINE_AA)
+
+
+def _fixed(points: np.ndarray) -> np.ndarray:
+    return np.round(points * 2**SHIFT).astype(np.int32)
+
+
+def _line(image: np.ndarray, points: np.ndarray, colour: tuple[int, int, int], thickness: int) -> None:
+    cv2.polylines(image, [_fixed(points)], False, colour, thickness, cv2.LINE_AA, SHIFT)
+
+
+def _circle(image: np.ndarray, at: np.ndarray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
+    u, v = (int(value) for value in _fixed(at))
+    cv2.circle(image, (u, v), round(radius * 2**SHIFT), colour, thickness, cv2.LINE_AA, SHIFT)

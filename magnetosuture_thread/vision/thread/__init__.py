@@ -1,0 +1,1 @@
+"""The thread in a camera frame."""

@@ -1,0 +1,222 @@
+"""The walk along a dark ridge, in compiled code: hundreds of steps, each along the best of many arcs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.vision.sampling import sample
+
+STEP_PX = 2.0
+GAP_PX = 13.0  # the walk goes on over a gap of this length
+HIDDEN_GAP = 0.25  # as much a hidden pixel counts as a gap
+WEAK = 0.3  # of the ridge's usual strength: below, there is no thread
+STRONGEST = 1.25  # of the usual strength: a stronger ridge counts no more
+UNKNOWN = 0.45  # of the usual strength, as which a hidden pixel counts
+AHEAD = 9  # steps looked ahead
+NEAR = 5  # of these that count in full; the others by FAR
+FAR = 0.6
+BENDS = 31  # curvatures tried at each step ...
+SHARPEST = 0.21  # ... up to this [1/px], closer around the present one's
+BEND_COST = 1.1  # of the usual strength, for a change of curvature by 1 / px, along the way looked ahead
+MEMORY = 0.05  # weight of the newest strength in the usual one
+WAYS = 90  # directions tried at the tail
+START_BENDS = (-0.08, -0.04, 0.0, 0.04, 0.08)
+START_PX = 3.0  # the first sample's distance from the tail
+START_STEPS = 8
+FOLD = math.cos(math.radians(28.0))  # nearer to the needle's own direction the thread doesn't leave
+ASIDE_PX = 0.5
+APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
+FORK = 0.75  # of the usual strength, at least, along the other way
+FORCED = 4  # steps that a walk is held to the other way
+
+
+@compiled
+def is_hidden(hidden, factor, u, v):
+    """Say whether a point is hidden."""
+    c, r = int(u + 0.5) // factor, int(v + 0.5) // factor
+    if c < 0 or r < 0 or c >= hidden.shape[1] or r >= hidden.shape[0]:
+        return False
+    return hidden[r, c] != 0
+
+
+@compiled
+def leave(ridge, hidden, factor, noise, faintest, u, v, heading):
+    """Find the arc along which the thread leaves the tail.
+
+    Returns:
+        Its angle, its curvature, and its mean strength in grey levels; 0 if there is none.
+    """
+    best, best_angle, best_bend = 0.0, 0.0, 0.0
+    for way in range(WAYS):
+        angle = 2.0 * math.pi * way / WAYS
+        if math.cos(angle - heading) > FOLD:
+            continue
+        for bend in START_BENDS:
+            total, seen = 0.0, 0
+            for step in range(START_STEPS):
+                s = START_PX + STEP_PX * step
+                middle = angle + 0.5 * bend * s
+                value = sample(ridge, u + s * math.cos(middle), v + s * math.sin(middle)) - noise
+                total += min(value, 80.0)
+                if value > faintest:
+                    seen += 1
+            if seen >= START_STEPS - 3 and total / START_STEPS > best:
+                best, best_angle, best_bend = total / START_STEPS, angle, bend
+    return best_angle, best_bend, best
+
+
+@compiled
+def arc_scores(ridge, hidden, factor, noise, usual, state, bends, scores):
+    """Fill in the strength of the ridge along each of many arcs ahead, as a share of the usual, less its price."""
+    u, v, angle, bend = state
+    for index in range(len(bends)):
+        tried = bends[index]
+        # The arc as chords: each is the last one turned by the same angle.
+        x, y = u, v
+        across, down = (
+            STEP_PX * math.cos(angle + 0.5 * tried * STEP_PX),
+            STEP_PX * math.sin(angle + 0.5 * tried * STEP_PX),
+        )
+        cosine, sine = math.cos(tried * STEP_PX), math.sin(tried * STEP_PX)
+        score, weight = 0.0, 0.0
+        for step in range(AHEAD):
+            x, y = x + across, y + down
+            across, down = across * cosine - down * sine, across * sine + down * cosine
+            value = min((sample(ridge, x, y) - noise) / usual, STRONGEST)
+            if value < UNKNOWN and is_hidden(hidden, factor, x, y):
+                value = UNKNOWN
+            share = 1.0 if step < NEAR else FAR
+            score += share * value
+            weight += share
+        scores[index] = score / weight - BEND_COST * abs(tried - bend) - 0.15 * abs(tried)
+
+
+@compiled
+def best_arcs(ridge, hidden, factor, noise, usual, state, bends, scores):
+    """Return the curvature of the arc ahead that follows the ridge best, and of another, with its score.
+
+    The other's score is -1 if there is none: it must be the best of its neighbours, apart from the first, and
+    lie on a ridge by itself.
+    """
+    bend = state[3]
+    for index in range(BENDS):
+        part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
+        bends[index] = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
+    arc_scores(ridge, hidden, factor, noise, usual, state, bends, scores)
+    first = scores.argmax()
+    second, score = first, -1.0
+    for index in range(1, BENDS - 1):
+        apart = abs(bends[index] - bends[first])
+        if apart > APART and scores[index] > scores[index - 1] and scores[index] >= scores[index + 1]:
+            plain = scores[index] + BEND_COST * abs(bends[index] - bend)
+            if plain > FORK and plain > score:
+                second, score = index, plain
+    return bends[first], bends[second], score
+
+
+@compiled
+def centred(ridge, noise, u, v, angle, most):
+    """Return how far aside the ridge's middle lies, at most `most`, and the strength there."""
+    x, y = -math.sin(angle), math.cos(angle)
+    peak = 0.0
+    for index in range(-4, 5):
+        peak = max(peak, sample(ridge, u + index * ASIDE_PX * x, v + index * ASIDE_PX * y))
+    total, moment = 0.0, 0.0
+    for index in range(-4, 5):
+        aside = index * ASIDE_PX
+        weight = sample(ridge, u + aside * x, v + aside * y) - noise - 0.3 * (peak - noise)
+        if weight > 0.0:
+            total += weight
+            moment += weight * aside
+    shift = 0.0 if total <= 0.0 else min(most, max(-most, moment / total))
+    return shift, sample(ridge, u + shift * x, v + shift * y) - noise
+
+
+@compiled
+def walk_on(ridge, hidden, factor, noise, faintest, dish, longest, path, strong, count, bend_first, forks):
+    """Walk along the ridge from a path's last vertex to the ridge's end.
+
+    Args:
+        ridge: ridge strength in grey levels, uint8.
+        hidden: where nothing can be seen, not 0 there, `factor` times smaller.
+        factor: see `hidden`.
+        noise: the ridge's strength where nothing is.
+        faintest: a strength above noise that is no noise.
+        dish: centre and the farthest the walk may go from it [px].
+        longest: of the walk [px].
+        path: u, v, angle, bend, usual strength and length at each vertex, shape (most, 6); filled in.
+        strong: whether the thread is seen at each, shape (most,); filled in.
+        count: vertices that there are.
+        bend_first: curvature to begin with; beyond 1 the best.
+        forks: filled with where there was another way: index, curvature, score; shape (most forks, 3).
+
+    Returns:
+        The number of vertices, and of forks.
+    """
+    u, v, angle, bend, usual, length = path[count - 1]
+    bends, scores = np.empty(BENDS), np.empty(BENDS)
+    gap, last, fork_count, forced = 0.0, count, 0, 0
+    if bend_first < 1.0:
+        forced = FORCED
+    while length < longest and gap < GAP_PX and count < len(path):
+        if forced > 0:
+            bend_ahead, forced = bend_first, forced - 1
+        else:
+            bend_ahead, other, score = best_arcs(
+                ridge, hidden, factor, noise, usual, (u, v, angle, bend), bends, scores
+            )
+            if score > 0.0 and fork_count < len(forks):
+                forks[fork_count, 0], forks[fork_count, 1], forks[fork_count, 2] = count, other, score
+                fork_count += 1
+        if gap > 0.0:
+            bend_ahead = 0.5 * (bend_ahead + bend)
+        middle = angle + 0.5 * bend_ahead * STEP_PX
+        x, y = u + STEP_PX * math.cos(middle), v + STEP_PX * math.sin(middle)
+        turned = angle + bend_ahead * STEP_PX
+        shift, strength = centred(ridge, noise, x, y, turned, 0.7)
+        seen = strength > max(WEAK * usual, faintest)
+        if seen:
+            if forced == 0:
+                x, y = x - shift * math.sin(turned), y + shift * math.cos(turned)
+                turned += 0.25 * shift / STEP_PX
+            usual = max(faintest, (1.0 - MEMORY) * usual + MEMORY * min(strength, STRONGEST * usual))
+            gap = 0.0
+        else:
+            gap += STEP_PX * (HIDDEN_GAP if is_hidden(hidden, factor, x, y) else 1.0)
+        if math.hypot(x - dish[0], y - dish[1]) > dish[2]:
+            break
+        bend += 0.5 * (bend_ahead - bend)
+        length += math.hypot(x - u, y - v)
+        u, v, angle = x, y, turned
+        path[count, 0], path[count, 1], path[count, 2] = u, v, angle
+        path[count, 3], path[count, 4], path[count, 5] = bend, usual, length
+        strong[count] = seen
+        count += 1
+        if seen:
+            last = count
+    return last, fork_count
+
+
+@compiled
+def refine(ridge, points, strong):
+    """Centre the vertices once more, now that their neighbours on both sides are known, and even them out."""
+    count = len(points)
+    if count < 4:
+        return
+    shifts = np.zeros(count)
+    normals = np.zeros((count, 2))
+    for index in range(1, count):
+        before, after = max(0, index - 2), min(count - 1, index + 2)
+        x, y = points[after, 0] - points[before, 0], points[after, 1] - points[before, 1]
+        length = max(1e-9, math.hypot(x, y))
+        normals[index, 0], normals[index, 1] = -y / length, x / length
+        if strong[index]:
+            shifts[index], _ = centred(ridge, 0.0, points[index, 0], points[index, 1], math.atan2(y, x), 1.0)
+    for index in range(1, count):
+        before, after = index - 1, min(count - 1, index + 1)
+        even = 0.5 * shifts[index] + 0.25 * (shifts[before] + shifts[after])
+        points[index, 0] += even * normals[index, 0]
+        points[index, 1] += even * normals[index, 1]

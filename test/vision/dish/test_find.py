@@ -1,0 +1,89 @@
+"""The dish is found, and only where there is one; the watch over it notices a bumped camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_dish, rim_shift
+from magnetosuture_thread.vision.dish.watch import AGREEING, DishWatch
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.vision.scenes import NOWHERE, Pose, finger, render
+
+
+def gray_of(centre: tuple[float, float], scale: float, seed: int, lighting: Lighting | None = None) -> np.ndarray:
+    """Return the measured channel of a frame with a needle."""
+    camera = DishCamera(Scene(), DishView(centre, scale), seed=seed, lighting=lighting)
+    return np.ascontiguousarray(camera.render(np.zeros(2), 0.3, NOWHERE)[:, :, 1])
+
+
+@pytest.mark.parametrize(
+    ("centre", "scale", "seed"), [((322.0, 238.0), 8e-5, 0), ((300.4, 246.7), 8.6e-5, 1), ((341.0, 231.0), 9.5e-5, 2)]
+)
+@pytest.mark.parametrize("lighting", [Lighting(), Lighting(gain=0.5, slope=4.0, noise=3.0)])
+def test_the_dish_is_found_to_a_quarter_of_a_pixel(centre, scale: float, seed: int, lighting: Lighting):
+    found = find_dish(gray_of(centre, scale, seed, lighting), 0.035)
+    assert found is not None
+    assert np.linalg.norm(np.subtract(found.centre_px, centre)) < 0.25
+    assert found.metres_per_pixel == pytest.approx(scale, rel=6e-3)
+
+
+def test_a_hand_over_a_third_of_the_rim_does_not_move_the_dish():
+    frame = render(Pose(np.zeros(2), 0.3), covers=(finger(np.array([0.008, 0.0]), 0.0, 0.024, (120.0, 150.0, 200.0)),))
+    found = find_dish(np.ascontiguousarray(frame[:, :, 1]), 0.035)
+    assert found is not None
+    assert np.linalg.norm(np.subtract(found.centre_px, (322.0, 238.0))) < 0.5
+    assert found.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)
+
+
+def test_no_dish_is_found_where_there_is_none():
+    noise = np.random.default_rng(0).integers(150, 200, (480, 640)).astype(np.uint8)
+    plain = np.full((480, 640), 180, np.uint8)
+    square = plain.copy()
+    cv2.rectangle(square, (150, 60), (500, 410), 20, 8)
+    for image in (noise, plain, square, 0 * plain, 0 * plain + 255):
+        assert find_dish(image, 0.035) is None
+
+
+def test_the_quick_check_tells_how_far_the_rim_has_moved():
+    gray = gray_of((322.0, 238.0), 8e-5, 3)
+    radius = 0.0175 / 8e-5
+    assert rim_shift(gray, (322.0, 238.0), radius)[0] < 0.2
+    shift, rays = rim_shift(gray, (324.0, 236.0), radius)
+    assert shift == pytest.approx(np.hypot(2.0, 2.0), abs=0.4)
+    assert rays > 0.8 * RIM_RAYS
+    assert rim_shift(0 * gray, (322.0, 238.0), radius)[1] == 0
+
+
+def test_a_bumped_camera_is_believed_only_after_several_frames():
+    before, after = gray_of((322.0, 238.0), 8e-5, 3), gray_of((330.0, 235.0), 8e-5, 3)
+    watch = DishWatch(VisionTrackerSettings())
+    assert watch.look(before) == ""
+    seen = watch.view
+    assert [watch.look(after) != "" for _ in range(AGREEING)] == [True] * (AGREEING - 1) + [False]
+    assert watch.view is not None
+    assert np.linalg.norm(np.subtract(watch.view.centre_px, (330.0, 235.0))) < 0.5
+    assert watch.look(before) != ""  # and one odd frame later changes nothing
+    assert watch.look(after) == ""
+    assert seen is not None
+
+
+def test_a_dark_frame_gives_no_view_and_changes_none():
+    gray = gray_of((322.0, 238.0), 8e-5, 3)
+    watch = DishWatch(VisionTrackerSettings())
+    watch.look(gray)
+    view = watch.view
+    assert watch.look(0 * gray) == "too little of the dish is seen"
+    assert watch.look(gray) == ""
+    assert watch.view is view
+
+
+def test_a_given_view_needs_no_dish():
+    settings = VisionTrackerSettings(dish_centre_px=(320.0, 240.0), metres_per_pixel=8e-5, camera_rotation=0.1)
+    watch = DishWatch(settings)
+    assert watch.look(np.zeros((480, 640), np.uint8)) == ""
+    assert watch.view == DishView((320.0, 240.0), 8e-5, 0.1)

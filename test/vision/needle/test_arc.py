@@ -1,0 +1,44 @@
+"""Arcs: there and back, and the fit of any circle or line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
+
+ANGLES = st.floats(-3.1, 3.1)
+CURVATURES = st.floats(-0.035, 0.035)
+
+
+@given(angle=ANGLES, curvature=CURVATURES)
+@settings(max_examples=60, deadline=None)
+def test_coordinates_are_the_inverse_of_points(angle: float, curvature: float):
+    arc = Arc(np.array([100.0, 80.0]), angle, curvature)
+    along, aside = np.linspace(-4.0, 84.0, 30), np.linspace(-5.0, 5.0, 30)
+    back = arc.coordinates(arc.at(along, aside))
+    np.testing.assert_allclose(back[0], along, atol=0.01)
+    np.testing.assert_allclose(back[1], aside, atol=0.01)
+
+
+@given(angle=ANGLES, curvature=CURVATURES)
+@settings(max_examples=60, deadline=None)
+def test_a_fit_goes_through_points_of_an_arc(angle: float, curvature: float):
+    points = Arc(np.array([300.0, 200.0]), angle, curvature).at(np.linspace(0.0, 80.0, 50))
+    fitted = fit_arc(points)
+    assert abs(abs(fitted.curvature) - abs(curvature)) < 1e-5
+    assert np.abs(fitted.coordinates(points)[1]).max() < 0.01
+
+
+def test_positive_curvature_turns_clockwise_as_seen():
+    assert Arc(np.zeros(2), 0.0, 0.01).at(10.0)[1] > 0.0
+
+
+@pytest.mark.parametrize("curvature", [0.0, 0.02, -0.03])
+def test_walked_back_an_arc_is_the_same(curvature: float):
+    arc = Arc(np.array([10.0, 20.0]), 0.7, curvature)
+    back = arc.reversed_at(50.0)
+    np.testing.assert_allclose(back.at(np.array([0.0, 20.0, 50.0])), arc.at(np.array([50.0, 30.0, 0.0])), atol=1e-9)
+    np.testing.assert_allclose(back.direction(50.0), -arc.direction(), atol=1e-12)

@@ -1,0 +1,95 @@
+"""The camera's calibration, by the dish and by markers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.configuration import load_setup
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.vision.calibration import CORNERS, calibrate_by_dish, calibrate_by_markers
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.vision.scenes import Pose, render
+
+SPACING, SIDE = 0.034, 0.005
+
+
+def markers(view: DishView, ids: tuple[int, ...] = (0, 1, 2, 3), tilt: float = 0.0) -> np.ndarray:
+    """Draw markers as a camera with this view sees them; a tilt makes it lean, as a share of the distance."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image = np.full((480, 640), 200, np.uint8)
+    square = np.array(CORNERS, dtype=float)
+    for index in ids:
+        marker = cv2.copyMakeBorder(cv2.aruco.generateImageMarker(dictionary, index, 240), 40, 40, 40, 40, 0, value=255)
+        corners = np.array([(40, 40), (280, 40), (280, 280), (40, 280)]) - 0.5
+        seen = view.to_pixels(0.5 * SPACING * square[index] + 0.5 * SIDE * square)
+        seen = seen + (seen - (320.0, 240.0)) * tilt * (seen[:, :1] - 320.0) / 320.0
+        matrix = cv2.getPerspectiveTransform(corners.astype(np.float32), seen.astype(np.float32))
+        drawn = cv2.warpPerspective(marker, matrix, (640, 480), flags=cv2.INTER_AREA, borderValue=0)
+        there = cv2.warpPerspective(np.full_like(marker, 255), matrix, (640, 480), borderValue=0)
+        image = np.where(there > 127, drawn, image)
+    return cv2.GaussianBlur(image, (0, 0), 0.7)
+
+
+def test_by_the_dish_the_mean_over_frames_is_taken():
+    frames = [render(Pose(np.array([0.001 * index, 0.0]), 0.3)) for index in range(3)]
+    found = calibrate_by_dish(frames, 0.035)
+    assert np.linalg.norm(np.subtract(found.view.centre_px, (322.0, 238.0))) < 0.25
+    assert found.view.metres_per_pixel == pytest.approx(8e-5, rel=5e-3)
+    assert found.frames == 3
+    assert found.scatter_px < 0.2
+
+
+def test_dishes_that_differ_or_are_missing_are_refused():
+    frame = render(Pose(np.zeros(2), 0.3))
+    with pytest.raises(InvalidInputError, match="a camera that stands still"):
+        calibrate_by_dish([frame, np.roll(frame, 6, axis=1)], 0.035)
+    with pytest.raises(InvalidInputError, match="0 of 1 with a dish"):
+        calibrate_by_dish([np.zeros((480, 640), np.uint8)], 0.035)
+    with pytest.raises(InvalidInputError, match="frames of one size"):
+        calibrate_by_dish([frame, frame[::2].copy()], 0.035)
+    with pytest.raises(InvalidInputError, match="none"):
+        calibrate_by_dish([], 0.035)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.3, -1.2])
+def test_by_markers_centre_scale_and_rotation_are_found(rotation: float):
+    view = DishView((318.4, 243.7), 1.2e-4, rotation)
+    found = calibrate_by_markers([markers(view)], 0.035, SPACING, SIDE)
+    assert np.linalg.norm(np.subtract(found.view.centre_px, view.centre_px)) < 0.3
+    assert found.view.metres_per_pixel == pytest.approx(view.metres_per_pixel, rel=2e-3)
+    assert found.view.rotation == pytest.approx(rotation, abs=2e-3)
+    assert found.residual_px < 0.6
+
+
+def test_missing_markers_and_a_camera_that_leans_are_refused():
+    view = DishView((320.0, 240.0), 1.2e-4)
+    with pytest.raises(InvalidInputError, match="no marker 2"):
+        calibrate_by_markers([markers(view, (0, 1, 3))], 0.035, SPACING, SIDE)
+    with pytest.raises(InvalidInputError, match="from a camera straight above"):
+        calibrate_by_markers([markers(view, tilt=0.08)], 0.035, SPACING, SIDE)
+    with pytest.raises(InvalidInputError, match="from a camera straight above"):
+        calibrate_by_markers([markers(view)], 0.035, SPACING, 0.8 * SIDE)
+
+
+def test_a_marker_that_one_frame_hides_is_taken_from_another():
+    view = DishView((318.4, 243.7), 1.2e-4, 0.1)
+    found = calibrate_by_markers([markers(view, (0, 1, 2)), markers(view, (1, 2, 3))], 0.035, SPACING, SIDE)
+    assert np.linalg.norm(np.subtract(found.view.centre_px, view.centre_px)) < 0.3
+
+
+def test_what_is_written_is_a_set_up(tmp_path: Path):
+    view = DishView((318.4, 243.7), 1.2e-4, 0.1)
+    found = calibrate_by_markers([markers(view)], 0.035, SPACING, SIDE)
+    file = tmp_path / "camera.yaml"
+    file.write_text(found.to_yaml())
+    settings = load_setup(file, (VisionTrackerSettings,))["vision_tracker"]
+    read = settings.fixed_view()
+    assert read is not None
+    np.testing.assert_allclose(read.centre_px, found.view.centre_px, atol=1e-3)
+    assert read.metres_per_pixel == pytest.approx(found.view.metres_per_pixel, rel=1e-6)
+    assert read.rotation == pytest.approx(found.view.rotation, abs=1e-6)

@@ -1,0 +1,171 @@
+"""Whatever happens before the camera: the pose is right, or there is none."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.rig.camera.scene import Lighting
+from magnetosuture_thread.vision.dish import find as dish
+from magnetosuture_thread.vision.needle import body, covers
+from magnetosuture_thread.vision.needle import find as needle
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import VisionTracker
+from test.vision.scenes import PIXEL, Pose, blob, finger, random_pose, random_thread, render
+
+TRACKER = VisionTracker(VisionTrackerSettings())
+WHITE = (255.0, 255.0, 255.0)
+COLOURS = {
+    "dark": (30.0, 32.0, 34.0),
+    "grey": (125.0, 125.0, 125.0),
+    "pale": (175.0, 180.0, 178.0),
+    "skin": (120.0, 150.0, 205.0),
+    "glove": (150.0, 110.0, 60.0),
+}
+
+
+def check(pose: Pose, frame: np.ndarray) -> str:
+    """Look at a frame; fail on a wrong pose, return why there is none."""
+    seen = TRACKER.look(frame)
+    assert seen.reason or pose.is_right(seen), f"off by {pose.error(seen)}"
+    return seen.reason
+
+
+@pytest.mark.parametrize("opacity", [1.0, 0.6])
+@pytest.mark.parametrize("share", [-0.02, 0.03, 0.3, 0.6, 0.9, 1.0])
+def test_glare_over_a_part_of_the_needle(share: float, opacity: float):
+    for seed in range(2):
+        pose = random_pose(np.random.default_rng(seed), curved=seed > 0)
+        for radius in (0.0003, 0.0008):
+            check(pose, render(pose, covers=(blob(pose.at(share), radius, WHITE, opacity),)))
+    assert check(pose, render(pose, covers=(blob(pose.at(0.5), 0.0008, WHITE, 1.0),)))
+
+
+@pytest.mark.parametrize("colour", COLOURS)
+def test_a_hand_or_a_tool_over_or_against_the_needle(colour: str):
+    random = np.random.default_rng(7)
+    reasons = []
+    for width in (0.0004, 0.0012, 0.006):
+        for share in (0.0, 0.25, 0.6, 0.97):
+            pose = random_pose(random, curved=share > 0.5)
+            end = pose.at(share) + random.normal(0.0, 3.0, 2) * PIXEL
+            cover = finger(end, random.uniform(-np.pi, np.pi), width, COLOURS[colour])
+            reasons.append(check(pose, render(pose, random_thread(random, pose), covers=(cover,))))
+    assert sum(map(bool, reasons)) > len(reasons) // 2
+
+
+@pytest.mark.parametrize("behind", [True, False], ids=["tail", "tip"])
+@pytest.mark.parametrize("colour", ["dark", "grey", "skin"])
+def test_a_tool_that_prolongs_or_shortens_the_needle(colour: str, behind: bool):
+    pose = Pose(np.array([-0.002, 0.001]), 0.6)
+    angle = pose.heading + np.pi if behind else pose.heading
+    for over in (-6.0, 0.0, 4.0, 8.0, 20.0):
+        along = -np.array([np.cos(angle), np.sin(angle)])
+        end = pose.at(0.0 if behind else 1.0) + over * PIXEL * along
+        check(pose, render(pose, covers=(finger(end, angle, 0.0005, COLOURS[colour]),)))
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.03, 0.2, 0.5, 1.3, 1.7, 3.0])
+def test_exposure(gain: float):
+    pose = Pose(np.array([0.003, -0.002]), 2.5, 200.0)
+    reason = check(pose, render(pose, gain=gain))
+    assert not reason or not 0.2 <= gain <= 1.3
+
+
+@pytest.mark.parametrize("length", [2, 5, 9, 17])
+@pytest.mark.parametrize("angle", [0.0, 0.8, 1.57])
+def test_motion_blur(length: int, angle: float):
+    pose = Pose(np.array([0.001, 0.002]), 0.8)
+    kernel = np.zeros((19, 19), np.float32)
+    ends_px = [(9 + sign * 0.5 * length * np.array([np.cos(angle), -np.sin(angle)])) for sign in (-1, 1)]
+    first, last = (np.round(16.0 * end).astype(int).tolist() for end in ends_px)
+    cv2.line(kernel, first, last, 1.0, 1, cv2.LINE_AA, 4)
+    check(pose, cv2.filter2D(render(pose), -1, kernel / kernel.sum()))
+
+
+def test_a_needle_that_leaves_over_the_rim():
+    for distance in np.arange(0.008, 0.026, 0.0013):
+        pose = Pose(distance * np.array([0.8, 0.6]), np.arctan2(0.6, 0.8))
+        reason = check(pose, render(pose))
+        assert reason or distance < 0.0105
+    assert check(Pose(np.array([0.5, 0.5]), 0.0), render(Pose(np.array([0.5, 0.5]), 0.0)))
+
+
+def test_a_second_needle_is_not_chosen_between():
+    one, other = Pose(np.array([0.002, 0.005]), 0.4), Pose(np.array([-0.005, -0.006]), 0.4)
+    seen = TRACKER.look(np.minimum(render(one), render(other)))
+    assert seen.reason == "2 needles in the dish"
+
+
+def test_a_second_dark_thing_is_passed_over():
+    pose = Pose(np.array([0.002, 0.004]), 0.4)
+    frame = render(pose)
+    cv2.line(frame, (200, 300), (290, 330), (45, 45, 45), 4, cv2.LINE_AA)
+    assert check(pose, frame) == ""
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_empty_frames(level: int):
+    assert TRACKER.look(np.full((480, 640, 3), level, np.uint8)).reason == "no dish in the image"
+
+
+class TestGuards:
+    """Each guard refuses what nothing else does: without it the frame would give a pose."""
+
+    def expect(self, monkeypatch: pytest.MonkeyPatch, frame: np.ndarray, words: str, module, **without: object) -> None:
+        assert words in TRACKER.look(frame).reason
+        for name, value in without.items():
+            monkeypatch.setattr(module, name, value)
+        assert words not in TRACKER.look(frame).reason
+
+    def test_rows_of_another_width(self, monkeypatch: pytest.MonkeyPatch):
+        pose = Pose(np.zeros(2), 0.5)
+        frame = render(pose, covers=(blob(pose.at(0.4) + np.array([-2e-4, 3.4e-4]), 4e-4, (50.0, 50.0, 50.0)),))
+        self.expect(monkeypatch, frame, "over it or against it", covers, EVEN_SHARE=0.0)
+
+    def test_another_ground_beside_it(self, monkeypatch: pytest.MonkeyPatch):
+        pose = Pose(np.zeros(2), 0.5)
+        across = np.array([-np.sin(0.5), np.cos(0.5)])
+        near = finger(pose.at(0.5) + 6.5 * PIXEL * across, 0.5 + 0.5 * np.pi, 0.02, (115.0, 115.0, 115.0))
+        self.expect(monkeypatch, render(pose, covers=(near,)), "something beside it", covers, GROUND_SLACK=1.0)
+
+    def test_a_tail_that_fades(self, monkeypatch: pytest.MonkeyPatch):
+        pose = Pose(np.zeros(2), 0.5)
+        frame = render(pose, lighting=Lighting(blur_px=1.1))
+        assert TRACKER.look(frame).reason == ""
+        monkeypatch.setattr(body, "SHARPEST_PX", 1.0)
+        assert "a tail that fades" in TRACKER.look(frame).reason
+
+    def test_a_body_that_is_not_equally_dark(self, monkeypatch: pytest.MonkeyPatch):
+        """As where a tool goes on along the needle's arc, or faint glare lies over it."""
+        pose = Pose(np.zeros(2), 0.5)
+        frame = render(pose, covers=(blob(pose.at(0.45), 9e-4, WHITE, 0.22),))
+        self.expect(monkeypatch, frame, "over it or against it", covers, DARKNESS_SLACK=9.0)
+
+    def test_a_dark_thing_that_leaves_it_at_a_small_angle(self, monkeypatch: pytest.MonkeyPatch):
+        frame = render(Pose(np.array([-0.002, 0.0]), 0.0))
+        cv2.line(frame, (305, 238), (345, 248), (45, 45, 45), 2, cv2.LINE_AA)
+        monkeypatch.setattr(covers, "EVEN_SHARE", 0.5)
+        self.expect(monkeypatch, frame, "something dark against it", covers, DARK_ROWS=1.0)
+
+    def test_what_branches_off_a_needle(self, monkeypatch: pytest.MonkeyPatch):
+        pose = Pose(np.zeros(2), 0.0)
+        frame = render(pose)
+        cv2.line(frame, (365, 240), (400, 300), (45, 45, 45), 4, cv2.LINE_AA)
+        self.expect(monkeypatch, frame, "no arc", needle, ON_AXIS=0.0)
+
+    def test_a_saturated_floor_without_a_dark_ring_is_no_dish(self, monkeypatch: pytest.MonkeyPatch):
+        bright = np.full((480, 640), 255, np.uint8)
+        v, u = np.mgrid[:480, :640]
+        bright[np.hypot(u - 322.0, v - 238.0) > 219.0] = 150  # an edge, but nothing tells where the light moved it
+        assert dish.find_dish(bright, 0.035) is None
+        monkeypatch.setattr(dish, "SATURATED_SHARE", 2.0)
+        assert dish.find_dish(bright, 0.035) is not None
+
+    def test_glare_at_an_end_leaves_less_slack(self, monkeypatch: pytest.MonkeyPatch):
+        pose = Pose(np.zeros(2), 0.5)
+        frame = render(pose, covers=(blob(pose.at(-0.08), 6e-4, WHITE),))
+        assert "with glare at an end" in TRACKER.look(frame).reason
+        monkeypatch.setattr(body, "GLARING", 2.5)
+        assert "with glare" not in TRACKER.look(frame).reason

@@ -1,0 +1,169 @@
+"""One frame alone: the sample frames, and rendered ones in other light."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.vision.look import State
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import VisionTracker
+from test.vision.scenes import NOWHERE, PIXEL, VIEW, Pose, line_error, random_pose, random_thread, render
+
+SAMPLES = Path(__file__).parent / "samples"
+TRACKER = VisionTracker(VisionTrackerSettings())
+LIGHTS = {
+    "usual": Lighting(),
+    "dark": Lighting(gain=0.5, slope=3.0, tint_bgr=(0.9, 0.95, 1.0)),
+    "bright": Lighting(gain=1.2, slope=-3.0, glare=1.4, tint_bgr=(1.0, 0.97, 0.9)),
+    "noisy": Lighting(noise=3.0),
+    "blurred": Lighting(blur_px=1.2),
+}
+
+
+@pytest.mark.parametrize("given_view", [True, False])
+def test_the_sample_frames_are_measured_to_half_a_pixel_and_a_degree(given_view: bool):
+    truth = json.loads((SAMPLES / "truth.json").read_text())
+    known = VisionTrackerSettings(dish_centre_px=(322.0, 238.0), metres_per_pixel=8e-5)
+    tracker = VisionTracker(known if given_view else VisionTrackerSettings())
+    tails, angles, tips, lines = [], [], [], []
+    for frame in truth["frames"]:
+        image = cv2.imread(str(SAMPLES / frame["file"]))
+        assert image is not None
+        seen = tracker.look(image)
+        assert seen.state is State.TRACKED, seen.reason
+        pose = Pose(VIEW.to_dish(np.array(frame["tail_px"])), frame["heading_rad"])
+        apart, turned = pose.error(seen)
+        tails.append(apart)
+        angles.append(turned)
+        tips.append(np.linalg.norm(VIEW.to_pixels(seen.tip) - frame["tip_px"]))
+        lines.append(line_error(VIEW.to_pixels(seen.centreline), np.array(frame["thread_px"])))
+    assert np.sqrt(np.mean(np.square(tails))) < 0.5
+    assert np.degrees(np.sqrt(np.mean(np.square(angles)))) < 0.5
+    assert np.sqrt(np.mean(np.square(tips))) < 1.0
+    assert np.mean([mean for mean, _ in lines]) < 0.6
+    assert min(share for _, share in lines) > 0.95
+
+
+@pytest.mark.parametrize("curved", [False, True], ids=["straight", "curved"])
+@pytest.mark.parametrize("light", LIGHTS)
+def test_rendered_needles_are_measured_in_any_light(light: str, curved: bool):
+    tails, angles, tips, lines, scaled = [], [], [], [], []
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        pose = random_pose(random, curved=curved)
+        thread = random_thread(random, pose)
+        seen = TRACKER.look(render(pose, thread, lighting=LIGHTS[light]))
+        assert seen.reason == ""
+        apart, turned = pose.error(seen)
+        tails.append(apart)
+        angles.append(turned)
+        tips.append(np.linalg.norm(seen.tip - pose.at(1.0)) / PIXEL)
+        lines.append(line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread)))
+        assert seen.curvature == pytest.approx(pose.curvature, abs=15.0)
+        error = np.array([*(seen.tail - pose.tail), turned])
+        scaled.append(error @ np.linalg.solve(seen.covariance, error) / 3.0)
+        assert 0.0 < seen.confidence <= 1.0
+    assert np.sqrt(np.mean(np.square(tails))) < 0.5
+    assert np.degrees(np.sqrt(np.mean(np.square(angles)))) < 1.0
+    assert np.sqrt(np.mean(np.square(tips))) < 1.2
+    assert np.mean([mean for mean, _ in lines]) < 1.0
+    assert np.mean([share for _, share in lines]) > 0.95
+    assert 0.05 < np.mean(scaled) < 5.0  # 1 for errors as large as the covariance says
+
+
+def test_over_many_poses_the_covariance_is_about_right():
+    scaled = []
+    for seed in range(10):
+        random = np.random.default_rng(100 + seed)
+        pose = random_pose(random, curved=True)
+        seen = TRACKER.look(render(pose, random_thread(random, pose)))
+        error = np.array([*(seen.tail - pose.tail), pose.error(seen)[1]])
+        scaled.append(error @ np.linalg.solve(seen.covariance, error) / 3.0)
+    assert 0.3 < np.mean(scaled) < 2.0
+
+
+def test_a_larger_dish_with_a_faint_thread_is_tracked():
+    view = DishView((644.0, 476.0), 0.15 / 875.0)
+    camera = DishCamera(Scene(dish_diameter=0.15, needle_curvature=150.0, thread_diameter=66e-6), view, (1280, 960), 1)
+    s = np.linspace(0.0, 0.15, 500)
+    tail, angle = np.array([0.03, 0.01]), np.pi - 0.4 + 35.0 * s
+    thread = np.vstack([tail, tail + np.cumsum(0.15 / 500 * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)])
+    seen = VisionTracker(VisionTrackerSettings(dish_diameter=0.15, thread_length=0.15)).look(
+        camera.render(tail, -0.4, thread)
+    )
+    assert seen.reason == ""
+    assert np.linalg.norm(seen.tail - tail) < 1.0 * view.metres_per_pixel
+    assert abs(np.arctan2(seen.heading[1], seen.heading[0]) + 0.4) < np.radians(2.0)
+    mean, share = line_error(view.to_pixels(seen.centreline), view.to_pixels(thread))
+    assert mean < 1.0
+    assert share > 0.95
+
+
+def test_without_a_dish_it_says_lost():
+    seen = TRACKER.look(np.full((480, 640, 3), 120, np.uint8))
+    assert (seen.state, seen.reason, seen.view) == (State.LOST, "no dish in the image", None)
+    assert seen.tail.size == seen.heading.size == seen.centreline.size == seen.covariance.size == 0
+
+
+def test_a_dish_of_another_size_than_the_scale_says_is_none():
+    frame = render(Pose(np.zeros(2), 0.3))
+    assert VisionTracker(VisionTrackerSettings(metres_per_pixel=8e-5)).look(frame).reason == ""
+    assert VisionTracker(VisionTrackerSettings(metres_per_pixel=9e-5)).look(frame).reason == "no dish in the image"
+
+
+def test_without_a_needle_it_says_lost():
+    seen = TRACKER.look(render(Pose(np.array([0.5, 0.5]), 0.0)))
+    assert (seen.state, seen.reason) == (State.LOST, "no needle in the dish")
+
+
+def test_a_needle_without_a_thread_has_no_centreline():
+    seen = TRACKER.look(render(Pose(np.zeros(2), 0.7), NOWHERE))
+    assert seen.reason == ""
+    assert len(seen.centreline) == 1
+
+
+def test_grey_frames_of_another_size_are_taken():
+    pose = Pose(np.zeros(2), 0.2)
+    grey = cv2.resize(render(pose)[:, :, 1], (800, 600), interpolation=cv2.INTER_CUBIC)
+    seen = TRACKER.look(grey)
+    assert seen.reason == ""
+    assert pose.is_right(seen)
+
+
+@pytest.mark.parametrize("rotation", [0.5, -2.0])
+def test_a_turned_camera_gives_the_same_pose_in_the_dish(rotation: float):
+    pose = Pose(np.array([0.003, -0.002]), 0.8, 120.0)
+    cosine, sine = np.cos(rotation), np.sin(rotation)
+    turned = Pose(np.array([[cosine, -sine], [sine, cosine]]) @ pose.tail, pose.heading + rotation, pose.curvature)
+    seen = VisionTracker(VisionTrackerSettings(camera_rotation=rotation)).look(render(turned))
+    apart, angle = pose.error(seen)
+    assert apart < 1.0
+    assert abs(angle) < np.radians(1.5)
+    assert np.linalg.norm(seen.tip - pose.at(1.0)) < 2.0 * PIXEL
+    assert seen.curvature == pytest.approx(120.0, abs=15.0)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((480, 640, 3), np.float32),
+        np.zeros((480, 640, 4), np.uint8),
+        np.zeros((10, 10, 3), np.uint8),
+        np.zeros(7, np.uint8),
+        np.zeros((0, 0, 3), np.uint8),
+    ],
+)
+def test_what_is_no_image_is_refused(image: np.ndarray):
+    with pytest.raises(InvalidInputError, match="image"):
+        TRACKER.look(image)
+    with pytest.raises(InvalidInputError, match="image"):
+        VisionTracker(VisionTrackerSettings()).track(image, 0.0)
