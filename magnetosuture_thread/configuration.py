@@ -108,20 +108,18 @@ class Described:
 
     def checked(self, value: Any, source: str = "") -> Any:
         """Return the value in the field's type, or raise `ConfigurationError`."""
-        about, whole = self.quantity, self.kind is tuple and self.entry is int
+        about = self.quantity
 
         def refuse() -> ConfigurationError:
-            expectation = about.expectation(self.kind).replace(
-                "a list", "a list of whole numbers" if whole else "a list"
+            of = {int: "a list of whole numbers", str: "a list of texts"}.get(self.entry, "a list")
+            return ConfigurationError(
+                f"{self.group}.{self.name}", value, about.expectation(self.kind).replace("a list", of), source
             )
-            return ConfigurationError(f"{self.group}.{self.name}", value, expectation, source)
 
         if self.kind is tuple:
             if isinstance(value, str) or not isinstance(value, Sequence) or len(value) % about.multiple:
                 raise refuse()
-            if not all(_is_number(entry) and self._within(entry) for entry in value):
-                raise refuse()
-            if self.entry is int and not all(isinstance(entry, int) for entry in value):
+            if not all(self._fits(entry) for entry in value):
                 raise refuse()
             return tuple(self.entry(entry) for entry in value)
         if self.kind is float:
@@ -134,6 +132,12 @@ class Described:
         if about.choices and value not in about.choices:
             raise refuse()
         return value
+
+    def _fits(self, entry: Any) -> bool:
+        """Return whether a list may have this entry."""
+        if self.entry is str:
+            return isinstance(entry, str)
+        return _is_number(entry) and self._within(entry) and (self.entry is float or isinstance(entry, int))
 
     def _within(self, number: float) -> bool:
         low, high = self.quantity.minimum, self.quantity.maximum

@@ -1,47 +1,108 @@
-"""From velocities to currents."""
+"""From tip velocities to currents."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magnetosuture_thread.coils.allocation import CoilArray
+from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
+from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
-FOUR = (0.0, np.pi / 2, np.pi, -np.pi / 2)
+NEEDLE = CoilBridgeSettings().needle()
+COILS = LoopCoils((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3)
+EAST = np.array([1.0, 0.0])
+MIDDLE = -0.5 * NEEDLE.length * EAST  # the tail of a needle whose middle is the dish's
 
 
-@pytest.mark.parametrize(
-    ("velocity", "currents"),
-    [
-        ((0.0, 0.0), (0.0, 0.0, 0.0, 0.0)),
-        ((0.005, 0.0), (1.0, 0.0, 0.0, 0.0)),
-        ((-0.01, 0.0), (0.0, 0.0, 2.0, 0.0)),
-        ((0.005, -0.01), (1.0, 0.0, 0.0, 2.0)),
-    ],
-)
-def test_the_coil_ahead_pulls(velocity: tuple[float, float], currents: tuple[float, ...]):
-    found = CoilArray(FOUR, 0.005, 5.0).allocate(np.array(velocity))
-    np.testing.assert_allclose(found.currents, currents, atol=1e-3)
-    np.testing.assert_allclose(found.velocity, velocity, atol=1e-5)
+def allocation(limit: float = 10.0, needle: NeedleMechanics = NEEDLE) -> CoilAllocation:
+    """Return the allocation of four coils around a dish."""
+    return CoilAllocation(COILS, needle, 0.008, limit)
+
+
+def turned(vector: np.ndarray, angle: float) -> np.ndarray:
+    """Return a vector, turned counter-clockwise."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def test_no_velocity_takes_no_current():
+    found = allocation().allocate(np.zeros(2), MIDDLE, EAST)
+    assert found.currents.tolist() == [0.0] * 4
+    assert found.velocity.tolist() == [0.0, 0.0]
+
+
+def test_the_coil_ahead_pulls_and_the_field_lies_along_the_needle():
+    found = allocation().allocate(0.005 * EAST, MIDDLE, EAST)
+    assert found.currents[0] == max(found.currents)
+    field = COILS.per_current(np.zeros(2)) @ found.currents
+    assert field[0] == pytest.approx(0.008, rel=0.5)
+    assert abs(field[1]) < 1e-3 * field[0]
+    np.testing.assert_allclose(found.velocity, [0.005, 0.0], atol=2e-5)
     assert not found.saturated
 
 
+@given(angle=st.floats(-np.pi, np.pi))
+def test_a_quarter_turn_of_everything_passes_the_currents_on_to_the_next_coil(angle: float):
+    heading, velocity = turned(EAST, angle), turned(np.array([0.004, 0.001]), angle)
+    tail = np.array([0.002, -0.001])
+    first = allocation().allocate(velocity, tail, heading)
+    quarter = np.pi / 2
+    second = allocation().allocate(turned(velocity, quarter), turned(tail, quarter), turned(heading, quarter))
+    np.testing.assert_allclose(second.currents, np.roll(first.currents, 1), atol=1e-6)
+
+
+@given(
+    x=st.floats(-0.01, 0.01),
+    y=st.floats(-0.01, 0.01),
+    angle=st.floats(-np.pi, np.pi),
+    way=st.floats(-1.0, 1.0),
+    speed=st.floats(0.001, 0.006),
+)
+def test_everywhere_in_the_dish_the_velocity_is_reached_by_the_physics(
+    x: float, y: float, angle: float, way: float, speed: float
+):
+    """The forces and the torque of the poles in the field, divided by the drag, give the velocity again."""
+    tail, heading = np.array([x, y]), turned(EAST, angle)
+    velocity = speed * turned(heading, way)
+    found = allocation(limit=1000.0).allocate(velocity, tail, heading)
+    across = turned(heading, np.pi / 2)
+    pole = NEEDLE.moment / NEEDLE.length
+    at_tail = COILS.per_current(tail) @ found.currents
+    at_tip = COILS.per_current(tail + NEEDLE.length * heading) @ found.currents
+    force = pole * (at_tip - at_tail)
+    torque = pole * NEEDLE.length * 0.5 * (at_tail + at_tip) @ across
+    tip = (force @ heading) / NEEDLE.drag * heading + (
+        (force @ across) / NEEDLE.drag_across + 0.5 * NEEDLE.length * torque / NEEDLE.turning_drag
+    ) * across
+    np.testing.assert_allclose(found.velocity, tip, atol=1e-9)
+    assert np.linalg.norm(tip - velocity) < 0.15 * speed
+
+
 def test_saturation_is_reported_with_the_velocity_really_reached():
-    found = CoilArray(FOUR, 0.005, 2.0).allocate(np.array([0.05, 0.0]))
+    found = allocation(limit=0.5).allocate(0.02 * EAST, MIDDLE, EAST)
     assert found.saturated
-    assert found.currents[0] == pytest.approx(2.0)
-    np.testing.assert_allclose(found.velocity, [0.01, 0.0], atol=1e-5)
+    assert np.abs(found.currents).max() == pytest.approx(0.5)
+    assert 0.0 < found.velocity[0] < 0.01
 
 
-@given(vx=st.floats(-1.0, 1.0), vy=st.floats(-1.0, 1.0), turn=st.floats(-3.0, 3.0))
-def test_currents_never_leave_their_limits(vx: float, vy: float, turn: float):
-    coils = CoilArray([angle + turn for angle in FOUR], 0.005, 3.0)
-    found = coils.allocate(np.array([vx, vy]))
-    assert (found.currents >= 0.0).all()
-    assert (found.currents <= 3.0).all()
+@given(vx=st.floats(-1.0, 1.0), vy=st.floats(-1.0, 1.0), x=st.floats(-0.017, 0.017), angle=st.floats(-np.pi, np.pi))
+def test_currents_never_leave_their_limits(vx: float, vy: float, x: float, angle: float):
+    found = allocation(limit=3.0).allocate(np.array([vx, vy]), np.array([x, 0.5 * x]), turned(EAST, angle))
     assert np.all(np.isfinite(found.currents))
-    reach = np.hypot(vx, vy)
-    if reach < 0.01:
-        np.testing.assert_allclose(found.velocity, [vx, vy], atol=2e-4 * max(reach, 1e-6) + 1e-6)
+    assert (np.abs(found.currents) <= 3.0).all()
+
+
+def test_a_curved_needle_is_driven_along_its_chord():
+    curved = dataclasses.replace(NEEDLE, curvature=200.0)
+    assert curved.chord == pytest.approx(2.0 / 200.0 * np.sin(0.5 * 1.4))
+    chord = curved.chord_direction(EAST)
+    np.testing.assert_allclose(chord, [np.cos(0.7), np.sin(0.7)])
+    straight = allocation().allocate(0.004 * chord, np.zeros(2), chord)
+    bent = allocation(needle=curved).allocate(0.004 * chord, np.zeros(2), EAST)
+    assert bent.currents @ straight.currents > 0.9 * np.linalg.norm(bent.currents) * np.linalg.norm(straight.currents)
+    np.testing.assert_allclose(bent.velocity, 0.004 * chord, atol=6e-4)

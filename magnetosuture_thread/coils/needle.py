@@ -1,0 +1,84 @@
+"""Where the needle is now: the last measured pose, carried forward by what the coils have asked of it since."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.coils.allocation import NeedleMechanics
+from magnetosuture_thread.errors import InvalidInputError
+
+Vector = NDArray[np.float64]
+
+FURTHEST = 0.1  # s; a pose is carried forward no further than this
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Tail, shape (2,) [m], and unit heading at the tail, shape (2,)."""
+
+    tail: Vector
+    heading: Vector
+
+
+class NeedleWatch:
+    """Keeps the needle's last measured pose for as long as it is good.
+
+    A camera's pose is some hundredths of a second old, in which the needle turns by some degrees; the
+    field must be laid along the needle as it lies now. So the pose is carried forward by the tip velocity
+    reached: along the chord it moves the needle, across it turns the needle about its middle.
+
+    Args:
+        needle: its mechanics.
+        timeout: a pose is good for this long after its arrival [s].
+    """
+
+    def __init__(self, needle: NeedleMechanics, timeout: float) -> None:
+        self._needle = needle
+        self._timeout = timeout
+        self._pose: Pose | None = None
+        self._stamp = -math.inf
+        self._arrival = -math.inf
+        self._velocity = np.zeros(2)
+
+    def see(self, tail: Vector, heading: Vector, stamp: float, now: float, arrival: float) -> None:
+        """Take a measured pose.
+
+        Args:
+            tail: shape (2,) [m].
+            heading: unit vector, shape (2,).
+            stamp: when it was measured [s].
+            now: the same clock now [s].
+            arrival: a monotonic clock now [s].
+
+        Raises:
+            InvalidInputError: it is not finite, too old, or from the future.
+        """
+        if not (np.all(np.isfinite(tail)) and np.all(np.isfinite(heading))):
+            raise InvalidInputError("needle/measured_cp.pose", [*tail.tolist(), *heading.tolist()], "finite numbers")
+        if abs(now - stamp) > self._timeout:
+            age = f"{now - stamp:.3f} s old"
+            raise InvalidInputError("needle/measured_cp.header.stamp", age, f"at most {self._timeout:g} s")
+        self._pose, self._stamp, self._arrival = Pose(tail, heading), stamp, arrival
+
+    def move(self, velocity: Vector) -> None:
+        """Say which tip velocity the coils give from now on, shape (2,) [m/s]."""
+        self._velocity = velocity
+
+    def pose(self, now: float, arrival: float) -> Pose | None:
+        """Return the pose as it is at a time of the stamps' clock and a monotonic time [s]; None if too old."""
+        if self._pose is None or arrival - self._arrival > self._timeout:
+            return None
+        ahead = min(FURTHEST, max(0.0, now - self._stamp))
+        tail, heading = self._pose.tail, self._pose.heading
+        e = self._needle.chord_direction(heading)
+        n = np.array([-e[1], e[0]])
+        lever = 0.5 * self._needle.chord
+        angle = float(self._velocity @ n) / lever * ahead
+        c, s = math.cos(angle), math.sin(angle)
+        turned = np.array([[c, -s], [s, c]])
+        middle = tail + lever * e + float(self._velocity @ e) * ahead * e
+        return Pose(middle - turned @ (lever * e), turned @ heading)

@@ -1,0 +1,1 @@
+"""Guidance: which velocity takes the needle along a path."""

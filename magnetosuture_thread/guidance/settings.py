@@ -1,0 +1,49 @@
+"""Settings of the path follower."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.guidance.follower import PathFollower
+
+
+@dataclass(frozen=True)
+class PathFollowerSettings(Configuration):
+    """Where the needle's tip is to go, and how fast."""
+
+    GROUP: ClassVar[str] = "path_follower"
+
+    waypoints: tuple[float, ...] = quantity(
+        (),
+        "where the tip goes from where it is: x and y of each point, in the dish frame",
+        unit="m",
+        minimum=-0.5,
+        maximum=0.5,
+        multiple=2,
+    )
+    speed: float = quantity(0.005, "of the tip along the path", unit="m/s", minimum=1e-5, maximum=0.1)
+    acceleration: float = quantity(0.01, "at both ends of the path", unit="m/s^2", minimum=1e-4, maximum=10.0)
+    gain: float = quantity(
+        6.0, "how fast a distance from the path is made up for", unit="1/s", minimum=0.0, maximum=50.0
+    )
+    integral_gain: float = quantity(4.0, "how fast a lasting distance is", unit="1/s^2", minimum=0.0, maximum=50.0)
+    needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
+    needle_curvature: float = quantity(
+        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
+    )
+
+    def follower(self) -> PathFollower:
+        """Return a follower of this path."""
+        return PathFollower(
+            np.reshape(self.waypoints, (-1, 2)),
+            self.speed,
+            self.acceleration,
+            self.gain,
+            self.integral_gain,
+            self.needle_length,
+            self.needle_curvature,
+        )

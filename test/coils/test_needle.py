@@ -1,0 +1,74 @@
+"""Where the needle is now."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.needle import NeedleWatch
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.errors import InvalidInputError
+
+NEEDLE = CoilBridgeSettings().needle()
+EAST = np.array([1.0, 0.0])
+
+
+def watch() -> NeedleWatch:
+    """Return a watch that has seen a needle at time 1."""
+    made = NeedleWatch(NEEDLE, 0.2)
+    made.see(np.zeros(2), EAST, 1.0, 1.0, 50.0)
+    return made
+
+
+def test_without_a_pose_there_is_none():
+    assert NeedleWatch(NEEDLE, 0.2).pose(1.0, 50.0) is None
+
+
+def test_a_pose_ends_by_the_monotonic_clock_whatever_the_other_says():
+    assert watch().pose(1.0, 50.19) is not None
+    assert watch().pose(1.0, 50.21) is None
+
+
+def test_a_pose_is_carried_along_the_needle():
+    seen = watch()
+    seen.move(np.array([0.005, 0.0]))
+    pose = seen.pose(1.04, 50.04)
+    assert pose is not None
+    np.testing.assert_allclose(pose.tail, [0.0002, 0.0], atol=1e-12)
+    np.testing.assert_allclose(pose.heading, EAST)
+
+
+def test_a_velocity_across_turns_the_needle_about_its_middle():
+    seen = watch()
+    seen.move(np.array([0.0, 0.0035]))  # one length in two seconds: 1 rad/s
+    pose = seen.pose(1.05, 50.05)
+    assert pose is not None
+    np.testing.assert_allclose(pose.heading, [np.cos(0.05), np.sin(0.05)])
+    middle = pose.tail + 0.0035 * pose.heading
+    np.testing.assert_allclose(middle, [0.0035, 0.0], atol=1e-12)
+
+
+def test_a_pose_is_not_carried_far():
+    seen = watch()
+    seen.move(np.array([0.005, 0.0]))
+    pose = seen.pose(1.9, 50.1)
+    assert pose is not None
+    np.testing.assert_allclose(pose.tail, [0.0005, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("tail", "heading", "stamp", "words"),
+    [
+        (np.array([np.nan, 0.0]), EAST, 1.0, "finite numbers"),
+        (np.zeros(2), np.array([np.inf, 0.0]), 1.0, "finite numbers"),
+        (np.zeros(2), EAST, 0.5, "0.500 s old"),
+        (np.zeros(2), EAST, 1.5, "-0.500 s old"),
+    ],
+)
+def test_a_bad_pose_is_refused_and_the_last_stays(tail, heading, stamp, words):
+    seen = watch()
+    with pytest.raises(InvalidInputError, match=words):
+        seen.see(tail, heading, stamp, 1.0, 50.0)
+    pose = seen.pose(1.0, 50.1)
+    assert pose is not None
+    np.testing.assert_allclose(pose.tail, [0.0, 0.0])
