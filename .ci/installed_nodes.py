@@ -12,8 +12,8 @@ import sys
 import time
 from pathlib import Path
 
-NODES = ("vision_tracker", "thread_model", "coil_bridge")
-TIMEOUT = 20.0  # s
+NODES = ("vision_tracker", "thread_model", "coil_bridge", "rig_simulator", "path_follower")
+TIMEOUT = 90.0  # s; the first start compiles kernels
 
 LISTEN = """
 import sys, time, rclpy

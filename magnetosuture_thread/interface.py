@@ -12,7 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
+RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
 DISH_FRAME = "dish"
+CAMERA_FRAME = "camera"
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,9 @@ class Channel:
 IMAGE = Channel("camera/image_raw", "sensor_msgs/msg/Image")
 COMPRESSED_IMAGE = Channel("camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo")
-NEEDLE_POSE = Channel("needle/measured_cp", "geometry_msgs/msg/PoseStamped")
+NEEDLE_POSE = Channel("needle/measured_cp", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TRACKER_STATE = Channel("needle/tracker_state", "magnetosuture_msgs/msg/TrackerState")
+TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped")
 NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
 NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
 SEEN_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
@@ -47,8 +51,11 @@ OBSTACLE_MARKERS = Channel("thread/obstacles", "visualization_msgs/msg/MarkerArr
 CURRENTS = Channel("coils/currents", "magnetosuture_msgs/msg/CoilCurrents")
 DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
-# Only in bags, where a simulation knows it; never an input of the graph.
+# What only a simulation knows; never an input of the graph.
 TRUE_NEEDLE = Channel("truth/needle", "geometry_msgs/msg/PoseStamped")
 TRUE_THREAD = Channel("truth/thread", "nav_msgs/msg/Path")
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
+
+FAULT_REQUEST = Channel("rig/fault", "std_msgs/msg/String")  # KIND DURATION, in force from now on
+CLOCK = Channel("clock", "rosgraph_msgs/msg/Clock")

@@ -8,9 +8,20 @@ from pathlib import Path
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import load_setup
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.resources import setup_file
+from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+
+CLASSES = (VisionTrackerSettings, ThreadModelSettings, CoilBridgeSettings, RigSettings, PathFollowerSettings)
+
+SAME = (
+    (("vision_tracker", "thread_length"), ("thread_model", "length")),
+    (("coil_bridge", "needle_length"), ("vision_tracker", "needle_length")),
+    (("path_follower", "needle_length"), ("vision_tracker", "needle_length")),
+    (("path_follower", "needle_curvature"), ("coil_bridge", "needle_curvature")),
+)
 
 
 @dataclass(frozen=True)
@@ -23,6 +34,8 @@ class Setup:
         vision: settings of the vision tracker.
         model: settings of the thread model.
         coils: settings of the coil bridge.
+        rig: settings of the simulated rig.
+        follower: settings of the path follower.
     """
 
     name: str
@@ -30,6 +43,8 @@ class Setup:
     vision: VisionTrackerSettings
     model: ThreadModelSettings
     coils: CoilBridgeSettings
+    rig: RigSettings
+    follower: PathFollowerSettings
 
 
 def read_setup(name: str) -> Setup:
@@ -39,9 +54,10 @@ def read_setup(name: str) -> Setup:
         ConfigurationError: there is no such file, or it holds anything invalid.
     """
     path = setup_file(name)
-    settings = load_setup(path, (VisionTrackerSettings, ThreadModelSettings, CoilBridgeSettings))
-    seen, predicted = settings["vision_tracker"].thread_length, settings["thread_model"].length
-    if seen != predicted:
-        name = "vision_tracker.thread_length"
-        raise ConfigurationError(name, seen, f"{predicted} m, as thread_model.length", str(path))
-    return Setup(path.stem, path, settings["vision_tracker"], settings["thread_model"], settings["coil_bridge"])
+    settings = load_setup(path, CLASSES)
+    # What several nodes must know of the same thing is in the section of each, as ROS has it.
+    for one, other in SAME:
+        value, expected = (getattr(settings[group], field) for group, field in (one, other))
+        if value != expected:
+            raise ConfigurationError(".".join(one), value, f"{expected}, as {'.'.join(other)}", str(path))
+    return Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))

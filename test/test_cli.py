@@ -26,6 +26,10 @@ def test_help_names_every_command_and_the_exit_codes():
     for words in (
         "replay",
         "record",
+        "simulate",
+        "behaviour",
+        "track",
+        "calibrate-camera",
         "evaluate",
         "bench",
         "no medical device",
@@ -35,7 +39,17 @@ def test_help_names_every_command_and_the_exit_codes():
 
 
 @pytest.mark.parametrize(
-    ("name", "option"), [("replay", "--output"), ("record", "--output"), ("evaluate", "--json"), ("bench", "--json")]
+    ("name", "option"),
+    [
+        ("replay", "--output"),
+        ("record", "--output"),
+        ("simulate", "--pace"),
+        ("behaviour", "--output"),
+        ("track", "--overlay"),
+        ("calibrate-camera", "--markers"),
+        ("evaluate", "--rig"),
+        ("bench", "--json"),
+    ],
 )
 def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
@@ -56,6 +70,13 @@ def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFi
         ["record", "r.npz", "--output", "out"],
         ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--seed", "-1"],
         ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--quality", "0"],
+        ["simulate", "petri_35mm_polyamide"],
+        ["simulate", "petri_35mm_polyamide", "--output", "out", "--pace", "0"],
+        ["simulate", "petri_35mm_polyamide", "--output", "out", "--duration", "-1"],
+        ["behaviour"],
+        ["track"],
+        ["track", "frames", "--centre", "1"],
+        ["calibrate-camera", "frames"],
         ["evaluate"],
         ["evaluate", "dir", "--formulation", "magic"],
         ["evaluate", "dir", "--solver", "magic"],

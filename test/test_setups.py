@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
@@ -23,6 +24,46 @@ def test_every_setup_that_ships_loads(name: str):
     assert setup.name == name
     assert setup.vision.thread_length == setup.model.length
     assert setup.model.thread().segment_length > setup.model.thread().diameter
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
+    setup = read_setup(name)
+    rig, vision, coils = setup.rig, setup.vision, setup.coils
+    assert (rig.dish_diameter, rig.needle_length, rig.needle_width) == (
+        vision.dish_diameter,
+        vision.needle_length,
+        vision.needle_width,
+    )
+    assert (rig.thread_length, rig.thread_attachment) == (setup.model.length, setup.model.attachment)
+    assert (rig.disc_obstacles, rig.polygon_obstacles) == (setup.model.disc_obstacles, setup.model.polygon_obstacles)
+    assert (rig.coil_angles, rig.coil_distance, rig.coil_radius) == (
+        coils.coil_angles,
+        coils.coil_distance,
+        coils.coil_radius,
+    )
+    body = rig.dynamics().needle
+    assert coils.needle_moment == pytest.approx(body.pole * rig.needle_length, rel=0.01)
+    assert coils.needle_turning_drag == pytest.approx(body.drag[2], rel=0.02)
+    thread_drag = rig.thread_drag_along * rig.thread_length
+    assert coils.needle_drag == pytest.approx(body.drag[0] + thread_drag, rel=0.05)
+    coil = rig.field().per_current(np.zeros((1, 3)))[0, 0]
+    assert np.linalg.norm(coil) == pytest.approx(coils.field_per_current, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ("coil_bridge: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
+        ("path_follower: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
+        ("path_follower: {ros__parameters: {needle_curvature: 8.0}}", "as coil_bridge.needle_curvature"),
+    ],
+)
+def test_sections_that_contradict_each_other_are_refused(tmp_path: Path, section: str, words: str):
+    path = tmp_path / "odd.yaml"
+    path.write_text(section + "\n")
+    with pytest.raises(ConfigurationError, match=words):
+        read_setup(str(path))
 
 
 def test_a_setup_is_found_by_path(tmp_path: Path):
@@ -54,7 +95,7 @@ def test_thread_and_obstacle_must_make_sense(tmp_path: Path):
         ("disc_obstacles: [0.0, 0.0, -0.001]", "half of a segment"),
         ("disc_obstacles: [0.0, 0.0, 0.0003]", "half of a segment"),
         ("viscosity: 1000.0", "from 0.0001 to 100 Pa s"),
-        ("length: 0.03", "vision_tracker.thread_length: got 0.019, expected 0.03 m"),
+        ("length: 0.03", "vision_tracker.thread_length: got 0.019, expected 0.03, as thread_model.length"),
     ):
         path = tmp_path / "odd.yaml"
         path.write_text(f"thread_model: {{ros__parameters: {{{text}}}}}\n")

@@ -59,8 +59,49 @@ def record(options: argparse.Namespace) -> int:
     return DONE
 
 
+def simulate(options: argparse.Namespace) -> int:
+    """Run the whole graph around a simulated rig."""
+    from magnetosuture_thread.jobs.simulate import simulate as run
+    from magnetosuture_thread.study.table import loop_table
+
+    console = Console(highlight=False)
+    with _progress(console) as progress:
+        task = progress.add_task("simulate", total=1.0)
+        summary = run(
+            options.scenario,
+            options.output,
+            duration=options.duration,
+            pace=options.pace,
+            say=lambda text: console.print(text, soft_wrap=True, markup=False),
+            progress=lambda share: progress.update(task, completed=share),
+        )
+    console.print(loop_table(summary))
+    console.print(f"bag: {options.output}", soft_wrap=True, markup=False)
+    _write_json(options.json, json.dumps(summary.to_json(), indent=2))
+    return DONE
+
+
+def behaviour(options: argparse.Namespace) -> int:
+    """Run the thread-behaviour tests."""
+    from magnetosuture_thread.jobs.behaviour import behaviour as run
+    from magnetosuture_thread.study.table import behaviour_table
+
+    console = Console(highlight=False)
+    with _progress(console) as progress:
+        task = progress.add_task("behaviour", total=1.0)
+        runs = run(
+            options.output,
+            say=lambda text: console.print(text, soft_wrap=True, markup=False),
+            progress=lambda share: progress.update(task, completed=share),
+        )
+    console.print(behaviour_table(runs))
+    console.print(f"results: {options.output}", soft_wrap=True, markup=False)
+    return DONE
+
+
 def evaluate(options: argparse.Namespace) -> int:
-    """Score the model on reference trajectories."""
+    """Score the model, or the simulated rig, on reference trajectories."""
+    from magnetosuture_thread.jobs.rig import score_rig
     from magnetosuture_thread.study.course_picture import draw_course
     from magnetosuture_thread.study.evaluation import Course, find_references, score
     from magnetosuture_thread.study.table import evaluation_table
@@ -70,22 +111,72 @@ def evaluate(options: argparse.Namespace) -> int:
     if options.pictures:
         options.pictures.mkdir(parents=True, exist_ok=True)
 
+    name = "rig" if options.rig else options.formulation
+
     def keep(course: Course) -> None:
         if options.pictures:
-            draw_course(options.pictures / f"{course.score.name}.png", course, options.formulation)
+            draw_course(options.pictures / f"{course.score.name}.png", course, name)
 
     with _progress(console) as progress:
         task = progress.add_task("evaluate", total=1.0)
-        evaluation = score(
-            paths,
-            formulation=options.formulation,
-            solver=options.solver,
-            segments=options.segments,
-            progress=lambda share: progress.update(task, completed=share),
-            keep=keep,
-        )
+
+        def report(share: float) -> None:
+            progress.update(task, completed=share)
+
+        if options.rig:
+            evaluation = score_rig(paths, options.segments, report, keep)
+        else:
+            evaluation = score(
+                paths,
+                formulation=options.formulation,
+                solver=options.solver,
+                segments=options.segments,
+                progress=report,
+                keep=keep,
+            )
     console.print(evaluation_table(evaluation))
     _write_json(options.json, json.dumps(evaluation.to_mapping(), indent=2, allow_nan=False))
+    return DONE
+
+
+def track(options: argparse.Namespace) -> int:
+    """Track the needle in camera frames."""
+    from magnetosuture_thread.jobs.track import settings_with
+    from magnetosuture_thread.jobs.track import track as follow
+    from magnetosuture_thread.setups import read_setup
+    from magnetosuture_thread.study.track_table import track_lines, track_table
+
+    console = Console(highlight=False)
+    settings = settings_with(read_setup(options.setup).vision, options.metres_per_pixel, options.centre)
+    with _progress(console) as progress:
+        task = progress.add_task("track", total=1.0)
+        frames = follow(
+            options.frames,
+            settings,
+            overlay=options.overlay,
+            progress=lambda share: progress.update(task, completed=share),
+        )
+    rows = [frame.to_json() for frame in frames]
+    console.print(track_table(rows))
+    for line in track_lines(rows):
+        console.print(line, soft_wrap=True, markup=False)
+    _write_json(options.json, json.dumps(rows, indent=1, allow_nan=False))
+    return DONE
+
+
+def calibrate_camera(options: argparse.Namespace) -> int:
+    """Find out where the dish is in the camera's image."""
+    from magnetosuture_thread.jobs.calibrate_camera import calibrate_camera as calibrate
+
+    console = Console(highlight=False)
+    markers = tuple(options.markers) if options.markers else None
+    found = calibrate(options.frames, options.dish_diameter, options.output, markers)
+    u, v = found.view.centre_px
+    scale, turned = found.view.metres_per_pixel * 1e3, found.view.rotation
+    console.print(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad", soft_wrap=True)
+    by = f"markers, residual {found.residual_px:.2f} px" if markers else "the dish's rim"
+    console.print(f"by {by}; {found.frames} frames, scatter {found.scatter_px:.2f} px", soft_wrap=True)
+    console.print(f"parameters: {options.output}", soft_wrap=True, markup=False)
     return DONE
 
 

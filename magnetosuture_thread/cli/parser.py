@@ -44,6 +44,43 @@ alone, by number of segments, dimension, obstacles and solver, with the largest 
 time. Single thread, wall clock; the machine's other work shows in the 99th percentile.
 """
 
+SIMULATE = """\
+Run the whole graph without a robot: rig_simulator stands in for coils, dish, needle, thread and camera;
+vision_tracker, thread_model and coil_bridge are the ones that run on a robot; path_follower asks for
+needle velocities along the scenario's path. All are processes of their own, on a ROS domain that nobody
+else uses. Everything is simulated, and the bag says so.
+
+SCENARIO is a set-up with waypoints in its section path_follower. BAG, which must not exist, gets all that
+was said, the truth included; `replay` takes it.
+"""
+
+TRACK = """\
+Find needle and thread in camera frames, without a graph. FRAMES are pictures, a folder of them, or a bag.
+Pictures are looked at one by one; a bag's frames are followed over time, as the node vision_tracker does.
+
+--json writes a list with an entry for each frame: file (for a bag, topic and stamp), status (tracked, lost
+or searching) and its reason, tail_m, tip_m and heading_rad (the tangent at the tail), curvature_per_m
+(positive to the left), thread_m from the tail on, all in the dish frame, confidence from 0 to 1, stamp_s,
+and time_s, which the frame took to look at: without reading and decoding it, all compiled before. What has
+no value is null.
+"""
+
+CALIBRATE_CAMERA = """\
+Find where the dish is in the camera's image: its centre, the scale and, by markers, the rotation. FILE
+gets a section vision_tracker of a ROS 2 parameter file.
+
+Without --markers the dish's rim is used: a mean over all frames. With --markers, ArUco markers 4x4_50 lie
+around the dish, their centres SPACING apart on a square around its centre: 0 at the top left, then
+clockwise, all upright.
+"""
+
+BEHAVIOUR = """\
+Run the paper's two thread-behaviour tests in a closed loop around the simulated rig, a polyamide thread
+of 19 mm and a silk thread of 150 mm in a larger dish, and compare the predicted thread with the truth
+and with what the camera sees. DIR, which must not exist, gets a bag of each, behaviour.json and
+behaviour.png. Everything is simulated. Takes two minutes.
+"""
+
 EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
 
 
@@ -81,6 +118,28 @@ def make_parser() -> argparse.ArgumentParser:
         help="of the JPEG frames (default: 85)",
     )
     record.add_argument("--seed", type=whole_number, default=0, help="of dust and sensor noise (default: 0)")
+    simulate = _command(
+        subparsers, "simulate", "run the whole graph around a simulated rig", SIMULATE, commands.simulate
+    )
+    simulate.add_argument("scenario", metavar="SCENARIO", help="a set-up's name or YAML file")
+    simulate.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
+    simulate.add_argument(
+        "--duration", type=number(0.1, 1e5), help="end after this many seconds (default: at the end of the path)"
+    )
+    simulate.add_argument(
+        "--pace",
+        type=number(0.05, 20.0),
+        help="run with a simulated clock, this much faster than real time (default: in real time)",
+    )
+    simulate.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to a file")
+    behaviour = _command(
+        subparsers,
+        "behaviour",
+        "compare prediction and truth in closed loop, by material",
+        BEHAVIOUR,
+        commands.behaviour,
+    )
+    behaviour.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
     evaluate = _command(
         subparsers, "evaluate", "score the model on reference trajectories", EVALUATE, commands.evaluate
     )
@@ -94,8 +153,57 @@ def make_parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--segments", type=segments, metavar="N", help="number of segments (default: the paper's, as each file says)"
     )
+    evaluate.add_argument(
+        "--rig", action="store_true", help="score the simulated rig's thread instead of the model (default: N = 100)"
+    )
     evaluate.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to a file")
     evaluate.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw each case into a folder")
+    track = _command(subparsers, "track", "find needle and thread in camera frames", TRACK, commands.track)
+    track.add_argument("frames", type=Path, nargs="+", metavar="FRAMES", help="pictures, a folder of them, or a bag")
+    track.add_argument(
+        "--setup",
+        default="petri_35mm_polyamide",
+        metavar="NAME",
+        help="a set-up's name or YAML file (default: %(default)s)",
+    )
+    track.add_argument(
+        "--metres-per-pixel",
+        type=number(1e-7, 1e-2),
+        metavar="S",
+        help="the scale (default: the set-up's, or from the dish's diameter)",
+    )
+    track.add_argument(
+        "--centre",
+        type=number(0.0, 1e5),
+        nargs=2,
+        metavar=("U", "V"),
+        help="the dish's centre [px] (default: the set-up's, or found)",
+    )
+    track.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
+    track.add_argument(
+        "--overlay", type=Path, metavar="PATH", help="draw it over the frames: a video (.mp4, .avi), or a folder of PNG"
+    )
+    calibrate = _command(
+        subparsers,
+        "calibrate-camera",
+        "find where the dish is in the camera's image",
+        CALIBRATE_CAMERA,
+        commands.calibrate_camera,
+    )
+    calibrate.add_argument(
+        "frames", type=Path, nargs="+", metavar="FRAMES", help="pictures, a folder of them, or a bag"
+    )
+    calibrate.add_argument(
+        "--dish-diameter", type=number(0.005, 0.5), required=True, metavar="D", help="inner diameter of the dish [m]"
+    )
+    calibrate.add_argument(
+        "--markers",
+        type=number(1e-3, 2.0),
+        nargs=2,
+        metavar=("SPACING", "SIDE"),
+        help="of the ArUco markers around the dish [m] (default: by the dish's rim)",
+    )
+    calibrate.add_argument("--output", type=output_file, required=True, metavar="FILE", help="parameter file to write")
     bench = _command(subparsers, "bench", "time the model on this machine", BENCH, commands.bench)
     bench.add_argument(
         "--peers", action="store_true", help="time other solvers and simulators too (needs the extra `peers`)"

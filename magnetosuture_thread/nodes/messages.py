@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, TwistStamped, Vector3
-from magnetosuture_msgs.msg import BarrierMargin, CoilCurrents, PredictedThread, SafetyMargins
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TwistStamped,
+    Vector3,
+)
+from magnetosuture_msgs.msg import BarrierMargin, CoilCurrents, PredictedThread, SafetyMargins, TrackerState
 from nav_msgs.msg import Path
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -18,13 +27,23 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, triangulate
 from magnetosuture_thread.interface import DISH_FRAME
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.vision.look import State, Track
 
+_IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
 FULL_COLOUR_CLEARANCE = 1e-3  # m; markers turn from green to red over this
 
 
 def seconds(stamp: Time) -> float:
     """Return a stamp in seconds."""
-    return stamp.sec + stamp.nanosec * 1e-9
+    return (stamp.sec * 1_000_000_000 + stamp.nanosec) * 1e-9
+
+
+def header_stamp(data: bytes) -> int | None:
+    """Return the stamp of a serialised message that begins with a header [ns]; None if it is too short."""
+    if len(data) < 12:
+        return None
+    whole, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)  # behind what begins all CDR
+    return int(whole) * 1_000_000_000 + int(nanoseconds)
 
 
 def header(stamp: Time) -> Header:
@@ -38,20 +57,55 @@ def require_dish_frame(frame: str, field: str) -> None:
         raise InvalidInputError(f"{field}.header.frame_id", repr(frame), repr(DISH_FRAME))
 
 
-def pose_message(stamp: Time, tail: np.ndarray, heading: np.ndarray) -> PoseStamped:
-    """Return the needle's pose: position of the tail, x axis from tail to tip."""
-    angle = math.atan2(heading[1], heading[0])
-    return PoseStamped(header=header(stamp), pose=_pose(tail, angle))
+def pose_message(
+    stamp: Time, tail: np.ndarray, heading: np.ndarray, covariance: np.ndarray | None = None
+) -> PoseWithCovarianceStamped:
+    """Return the needle's pose: position of the tail, x axis along the needle there.
+
+    Args:
+        stamp: of the frame that it was measured in.
+        tail: shape (2,) [m].
+        heading: unit vector, shape (2,).
+        covariance: of x, y [m] and the angle of the heading [rad], shape (3, 3); zeros, which say in ROS
+            that it is not known, if None.
+    """
+    message = PoseWithCovarianceStamped(header=header(stamp))
+    message.pose.pose = _pose(tail, math.atan2(heading[1], heading[0]))
+    if covariance is not None:
+        whole = np.zeros((6, 6))
+        whole[np.ix_(_IN_PLANE, _IN_PLANE)] = covariance
+        message.pose.covariance = whole.ravel()
+    return message
 
 
-def needle_pose(message: PoseStamped) -> NeedlePose:
+def tracker_state(stamp: Time, track: Track, processing_time: float) -> TrackerState:
+    """Return what the tracker makes of a frame; `processing_time` is the wall-clock time it took [s]."""
+    numbers = {
+        State.SEARCHING: TrackerState.STATE_SEARCHING,
+        State.TRACKED: TrackerState.STATE_TRACKED,
+        State.LOST: TrackerState.STATE_LOST,
+    }
+    message = TrackerState(header=header(stamp), state=numbers[track.state], reason=track.reason)
+    message.processing_time = processing_time
+    if track.state is State.TRACKED:
+        message.confidence = float(track.confidence)
+        message.curvature = float(track.curvature)
+    return message
+
+
+def placed(stamp: Time, point: np.ndarray, angle: float) -> PoseStamped:
+    """Return a pose in the dish plane that has no uncertainty: a truth, or a wish."""
+    return PoseStamped(header=header(stamp), pose=_pose(point, angle))
+
+
+def needle_pose(message: PoseWithCovarianceStamped) -> NeedlePose:
     """Return the needle's pose in the plane.
 
     Raises:
         InvalidInputError: wrong frame, not finite, or no unit quaternion.
     """
     require_dish_frame(message.header.frame_id, "needle/measured_cp")
-    position, q = message.pose.position, message.pose.orientation
+    position, q = message.pose.pose.position, message.pose.pose.orientation
     tail = np.array([position.x, position.y])
     size = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
     if not abs(size - 1.0) < 1e-3:
@@ -65,10 +119,28 @@ def needle_pose(message: PoseStamped) -> NeedlePose:
     return NeedlePose(seconds(message.header.stamp), tail, along / length)
 
 
-def path_message(stamp: Time, points: np.ndarray) -> Path:
-    """Return a polyline of shape (m, 2) as a path."""
-    heading = header(stamp)
-    return Path(header=heading, poses=[PoseStamped(header=heading, pose=_pose(point, 0.0)) for point in points])
+class PathMaker:
+    """Makes paths, from one to the next in the same message: most of a new one's time is its hundred poses.
+
+    A message is good until the next is made.
+    """
+
+    def __init__(self) -> None:
+        self._message = Path(header=header(Time()))
+        self._spare: list[PoseStamped] = []
+
+    def message(self, stamp: Time, points: np.ndarray) -> Path:
+        """Return a polyline of shape (m, 2) as a path."""
+        shared = self._message.header
+        shared.stamp = stamp
+        while len(self._spare) < len(points):
+            self._spare.append(PoseStamped(header=shared))
+        poses = self._spare[: len(points)]
+        for pose, (x, y) in zip(poses, points.tolist(), strict=True):
+            position = pose.pose.position
+            position.x, position.y = x, y
+        self._message.poses = poses
+        return self._message
 
 
 def path_points(message: Path) -> np.ndarray:

@@ -17,12 +17,16 @@ _TYPES = {
     int: Parameter.Type.INTEGER,
     str: Parameter.Type.STRING,
     bool: Parameter.Type.BOOL,
-    tuple: Parameter.Type.DOUBLE_ARRAY,
+}
+_ARRAYS = {
+    float: Parameter.Type.DOUBLE_ARRAY,
+    int: Parameter.Type.INTEGER_ARRAY,
+    str: Parameter.Type.STRING_ARRAY,
 }
 
 
 def _type(about: Described) -> Parameter.Type:
-    return Parameter.Type.INTEGER_ARRAY if about.kind is tuple and about.entry is int else _TYPES[about.kind]
+    return _ARRAYS[about.entry] if about.kind is tuple else _TYPES[about.kind]
 
 
 def declare(node: Node, cls: type[C]) -> C:

@@ -115,7 +115,7 @@ class NodeProcesses:
         self._logs.mkdir(parents=True, exist_ok=True)
         try:
             for name in self._names:
-                self._start(name)
+                self.start(name)
         except BaseException:
             self._end()
             raise
@@ -135,7 +135,8 @@ class NodeProcesses:
                 last = lines[-1] if lines else "it said nothing"
                 raise GraphError(f"{name} ended with exit code {process.returncode}: {last}")
 
-    def _start(self, name: str) -> None:
+    def start(self, name: str) -> None:
+        """Start one more node."""
         command = [sys.executable, "-m", f"magnetosuture_thread.nodes.{name}", "--ros-args", *self._arguments]
         with (self._logs / f"{name}.log").open("wb") as log:
             self._processes[name] = subprocess.Popen(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -19,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, DIAGNOSTICS, NODES
-from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes import messages, topics
 
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
 START_TIMEOUT = 180.0  # s for all nodes to be there
@@ -28,7 +27,6 @@ QUIET = 0.5  # s without any answer, once the tracker has taken all frames: the 
 DRAIN_TIMEOUT = 30.0  # s after the last input at the most
 DEPTH = 300  # messages that may wait for a slow node before any is lost
 _AT_ONCE = 100  # outputs taken between two inputs at the most
-_HEADER = struct.Struct("<iI")  # a stamp, behind the 4 bytes that begin every CDR message
 
 
 class Recorded(Protocol):
@@ -146,7 +144,7 @@ class LiveReplay:
                 continue
             clock = self._run_clock(clock, record.time)
             self._publish_clock(record.time)
-            stamp = _header_stamp(record.data)
+            stamp = messages.header_stamp(record.data)
             if stamp is not None:
                 self.published[record.topic.lstrip("/")][stamp] = time.perf_counter()
             publisher.publish(record.data)
@@ -204,7 +202,7 @@ class LiveReplay:
         def take(data: bytes) -> None:
             now = time.perf_counter()
             self._taken += 1
-            stamp = _header_stamp(data)
+            stamp = messages.header_stamp(data)
             if stamp is not None:
                 self.arrived[name].setdefault(stamp, now)
             if answers:
@@ -222,14 +220,6 @@ class LiveReplay:
 def _lossless(qos: QoSProfile) -> QoSProfile:
     """Return a quality of service that waits for slow readers; only the replay has time to."""
     return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=qos.durability)
-
-
-def _header_stamp(data: bytes) -> int | None:
-    """Return the stamp of a serialised message that begins with a header [ns]."""
-    if len(data) < 4 + _HEADER.size or data[1] != 1:  # not little-endian CDR
-        return None
-    seconds, nanoseconds = _HEADER.unpack_from(data, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
 def _frames_taken(data: bytes) -> int:

@@ -8,9 +8,10 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
@@ -36,14 +37,14 @@ class ThreadModelNode(Node):
         self._predictor = self._settings.predictor()
         self._health = Health(self)
         self._seen: tuple[float, np.ndarray] | None = None
-        self._early: deque[PoseStamped] = deque(maxlen=EARLY)
+        self._early: deque[PoseWithCovarianceStamped] = deque(maxlen=EARLY)
         self._last = -np.inf
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         obstacles = topics.OBSTACLE_MARKERS.publisher(self)
         obstacles.publish(messages.obstacle_markers(self.get_clock().now().to_msg(), self._settings.obstacles()))
-        topics.SEEN_THREAD.subscribe(self, self.on_seen_thread)
+        topics.SEEN_THREAD.subscribe(self, self.on_seen_thread, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
         self._health.warn("no needle pose yet")
         self.get_logger().info(
@@ -51,7 +52,7 @@ class ThreadModelNode(Node):
             f"{len(self._settings.obstacles())} obstacles, {self._settings.formulation} by {self._settings.solver}"
         )
 
-    def on_pose(self, message: PoseStamped) -> None:
+    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Step the thread to a needle pose; where that cannot be done, say so.
 
         No margin is published that is not proven.
@@ -70,15 +71,19 @@ class ThreadModelNode(Node):
         if prediction is not None:
             self._publish(message, prediction, time.perf_counter() - began)
 
-    def on_seen_thread(self, message: Path) -> None:
-        """Keep the thread that the camera sees, to start from."""
+    def on_seen_thread(self, data: bytes) -> None:
+        """Keep the thread that the camera sees, to start from.
+
+        Most are not needed, and to read a path of a hundred poses takes as long as some predictions: so
+        only the stamp is read of those.
+        """
         if self._settings.initial_shape != "seen":
             return
-        stamp = messages.seconds(message.header.stamp)
+        stamp = (messages.header_stamp(data) or 0) * 1e-9
         if self._predictor.started and stamp >= self._last - REPLAYED:
             return
         try:
-            self._seen = (stamp, messages.path_points(message))
+            self._seen = (stamp, messages.path_points(deserialize_message(data, Path)))
         except InvalidInputError as error:
             self._health.refuse(error)
             return
@@ -90,7 +95,7 @@ class ThreadModelNode(Node):
         for pose in early:
             self.on_pose(pose)
 
-    def _follow(self, message: PoseStamped) -> Prediction | None:
+    def _follow(self, message: PoseWithCovarianceStamped) -> Prediction | None:
         pose = messages.needle_pose(message)
         if pose.stamp < self._last - REPLAYED:
             self._predictor.reset()
@@ -119,7 +124,7 @@ class ThreadModelNode(Node):
             return None
         return self._seen[1]
 
-    def _publish(self, message: PoseStamped, prediction: Prediction, step_time: float) -> None:
+    def _publish(self, message: PoseWithCovarianceStamped, prediction: Prediction, step_time: float) -> None:
         stamp, settings = message.header.stamp, self._settings
         self._predicted.publish(messages.prediction_message(stamp, prediction, settings.material, step_time))
         if prediction.converged:

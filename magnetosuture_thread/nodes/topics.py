@@ -45,16 +45,28 @@ class Topic:
         options = QoSOverridingOptions.with_default_policies()
         return node.create_publisher(self.message, self.name, self.qos, qos_overriding_options=options)
 
-    def subscribe(self, node: Node, callback: Callable[[Any], None]) -> Subscription:
-        """Subscribe; reliability and depth can be overridden by parameters."""
+    def subscribe(self, node: Node, callback: Callable[[Any], None], *, raw: bool = False) -> Subscription:
+        """Subscribe; reliability and depth can be overridden by parameters.
+
+        Args:
+            node: that subscribes.
+            callback: called with each message, or with its CDR bytes.
+            raw: whether with its bytes.
+        """
         options = QoSOverridingOptions.with_default_policies()
-        return node.create_subscription(self.message, self.name, callback, self.qos, qos_overriding_options=options)
+        return node.create_subscription(
+            self.message, self.name, callback, self.qos, qos_overriding_options=options, raw=raw
+        )
 
 
 IMAGE = Topic(interface.IMAGE, SENSOR)
 COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, SENSOR)
 CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR)
 NEEDLE_POSE = Topic(interface.NEEDLE_POSE, SENSOR)
+TRACKER_STATE = Topic(interface.TRACKER_STATE, RELIABLE)
+TIP_SETPOINT = Topic(interface.TIP_SETPOINT, RELIABLE)
+TRUE_NEEDLE = Topic(interface.TRUE_NEEDLE, RELIABLE)
+TRUE_THREAD = Topic(interface.TRUE_THREAD, RELIABLE)
 NEEDLE_COMMAND = Topic(interface.NEEDLE_COMMAND, RELIABLE)
 NEEDLE_SETPOINT = Topic(interface.NEEDLE_SETPOINT, RELIABLE)
 SEEN_THREAD = Topic(interface.SEEN_THREAD, RELIABLE)
@@ -63,11 +75,14 @@ MARGINS = Topic(interface.MARGINS, RELIABLE)
 THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE)
 OBSTACLE_MARKERS = Topic(interface.OBSTACLE_MARKERS, LATCHED)
 CURRENTS = Topic(interface.CURRENTS, RELIABLE)
+FAULT_REQUEST = Topic(interface.FAULT_REQUEST, RELIABLE)
+CLOCK = Topic(interface.CLOCK, SENSOR, absolute=True)
 DIAGNOSTICS = Topic(interface.DIAGNOSTICS, RELIABLE, absolute=True)
 
 INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND)
 OUTPUTS = (
     NEEDLE_POSE,
+    TRACKER_STATE,
     SEEN_THREAD,
     PREDICTED_THREAD,
     MARGINS,
@@ -77,6 +92,8 @@ OUTPUTS = (
     CURRENTS,
     DIAGNOSTICS,
 )
+
+SIMULATED = (TRUE_NEEDLE, TRUE_THREAD, TIP_SETPOINT)  # by the rig and who steers it
 
 
 def lossless(depth: int) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,19 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
+from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker, decode_image, unpack_image
+from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.warm_up import warm_up
+
+CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
 
 
 class VisionTrackerNode(Node):
@@ -24,16 +32,21 @@ class VisionTrackerNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("vision_tracker", automatically_declare_parameters_from_overrides=True, **options)
         settings = declare(self, VisionTrackerSettings)
+        self.get_logger().info("loading the tracker's kernels; the first start on a machine compiles them")
+        warm_up()
         self._tracker = VisionTracker(settings)
         self._health = Health(self)
         self._frames = self._tracked = 0
         self._poses = topics.NEEDLE_POSE.publisher(self)
+        self._states = topics.TRACKER_STATE.publisher(self)
+        self._path = messages.PathMaker()
         self._threads = topics.SEEN_THREAD.publisher(self)
         if settings.image_transport == "compressed":
             topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
         else:
             topics.IMAGE.subscribe(self, self.on_image)
         self._health.warn("no camera frame yet")
+        self.get_logger().info(f"ready: frames from {self.resolve_topic_name(CAMERA[settings.image_transport].name)}")
 
     def on_compressed(self, message: CompressedImage) -> None:
         """Take a JPEG or PNG frame."""
@@ -48,20 +61,28 @@ class VisionTrackerNode(Node):
 
     def _take(self, message: Image | CompressedImage, decode: Any) -> None:
         self._frames += 1
+        stamp = message.header.stamp
         try:
-            track = self._tracker.track(np.asarray(decode()))
+            image = np.asarray(decode())
+            began = time.perf_counter()
+            track = self._tracker.track(image, messages.seconds(stamp))
         except InvalidInputError as error:
             self._health.refuse(error, frames=self._frames, tracked=self._tracked)
             return
-        if track.lost:
-            self._health.warn(f"lost: {track.lost}", frames=self._frames, tracked=self._tracked)
-            return
-        self._tracked += 1
-        stamp = message.header.stamp
-        # The pose first: the prediction waits for it, and a path of many poses takes some milliseconds.
-        self._poses.publish(messages.pose_message(stamp, track.tail, track.heading))
-        self._threads.publish(messages.path_message(stamp, track.centreline))
-        self._health.ok("tracking", frames=self._frames, tracked=self._tracked)
+        taken = time.perf_counter() - began
+        if track.state is State.TRACKED:
+            # The pose first: the prediction waits for it, and a path of many poses takes some milliseconds.
+            self._poses.publish(messages.pose_message(stamp, track.tail, track.heading, track.covariance))
+            if len(track.centreline) > 1:
+                at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
+                self._threads.publish(self._path.message(stamp, points_at(track.centreline, at)))
+            self._tracked += 1
+        self._states.publish(messages.tracker_state(stamp, track, taken))
+        values = {"frames": self._frames, "tracked": self._tracked}
+        if track.state is State.TRACKED:
+            self._health.ok("tracking", confidence=round(track.confidence, 3), **values)
+        else:
+            self._health.warn(f"{track.state.value}: {track.reason}", **values)
 
 
 def main(arguments: list[str] | None = None) -> int:

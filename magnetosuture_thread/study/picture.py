@@ -92,7 +92,7 @@ def _draw_frame(
     axes: Axes, frame: NDArray[np.uint8], view: DishView, chosen: Instant, obstacles: Sequence[Obstacle]
 ) -> LineCollection:
     """Draw the dish, filling the axes, and return the predicted thread's line."""
-    line = _draw_threads(axes, frame, view, chosen, obstacles, magnified=1.0)
+    line = draw_threads(axes, frame, view, chosen, obstacles, magnified=1.0)
     if len(chosen.tail):
         _draw_heading(axes, view, chosen)
     height, width = frame.shape[:2]
@@ -108,7 +108,7 @@ def _draw_frame(
     return line
 
 
-def _draw_threads(
+def draw_threads(
     axes: Axes,
     frame: NDArray[np.uint8],
     view: DishView,
@@ -163,7 +163,7 @@ def _draw_close_up(
     inset = scene.inset_axes(
         (x + 0.01 * (x == 0.0) - 0.01 * (x > 0), y + 0.01 * (y == 0.0) - 0.01 * (y > 0), 0.38, 0.38)
     )
-    _draw_threads(inset, frame, view, chosen, obstacles, magnified=1.8)
+    draw_threads(inset, frame, view, chosen, obstacles, magnified=1.8)
     inset.set_xlim(centre[0] - half, centre[0] + half)
     inset.set_ylim(centre[1] + half, centre[1] - half)
     for side in inset.spines.values():

@@ -208,7 +208,7 @@ class Collector:
         ]
 
     def _take_pose(self, instant: Instant, message: Any) -> None:
-        position, turned = message.pose.position, message.pose.orientation
+        position, turned = message.pose.pose.position, message.pose.pose.orientation
         instant.tail = np.array([position.x, position.y])
         instant.heading = 2.0 * float(np.arctan2(turned.z, turned.w))
         self.poses += 1

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 from rich.table import Table
 
+from magnetosuture_thread.study.behaviour_picture import Run
 from magnetosuture_thread.study.evaluation import Evaluation
+from magnetosuture_thread.study.loop import LoopSummary
 from magnetosuture_thread.study.replayed import Spread, Summary
 
 
@@ -44,6 +49,57 @@ def summary_table(summary: Summary) -> Table:
     return table
 
 
+def loop_table(summary: LoopSummary) -> Table:
+    """Return the figures of a closed loop as a table."""
+    table = Table(title=f"{summary.setup}, closed loop, simulated", title_justify="left", title_style="bold")
+    table.add_column("", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("remark", style="dim")
+    table.add_row("camera frames", str(summary.frames), f"over {summary.duration:.1f} s of steering")
+    table.add_row("  tracked", str(summary.tracked), f"{summary.lost} looked at and lost")
+    table.add_row("  wrong poses", str(summary.wrong), "more than 0.3 mm or 5 degrees from the truth")
+    table.add_row("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames))
+    table.add_section()
+    table.add_row("needle from its path", f"{1e3 * summary.path_error:.3f} mm", _greatest(summary.path_error_greatest))
+    table.add_row("tracked tail from the truth", f"{1e3 * summary.tail_error:.3f} mm", "root of the mean square")
+    heading = math.degrees(summary.heading_error)
+    table.add_row("tracked heading", f"{heading:.2f} deg", "root of the mean square")
+    table.add_row("currents at a limit", f"{100.0 * summary.saturated:.1f} %", "of the commands")
+    table.add_section()
+    table.add_row("latency from the frame's stamp", "", "99th percentile, greatest")
+    for name, spread in summary.latency.items():
+        table.add_row(f"  to {name}", _milliseconds(spread), _tail(spread))
+    table.add_row("  tracker alone", _milliseconds(summary.processing), _tail(summary.processing))
+    table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
+    table.add_section()
+    table.add_row("thread seen, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")
+    table.add_row("prediction error, mean", "", "greatest; % of the length")
+    for name, figures in (("seen centreline", summary.error_seen), ("truth", summary.error_truth)):
+        if figures is not None:
+            scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
+            table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
+    return table
+
+
+def behaviour_table(runs: Sequence[Run]) -> Table:
+    """Return the figures of the thread-behaviour tests as a table."""
+    table = Table(title="thread behaviour, closed loop, simulated", title_justify="left", title_style="bold")
+    table.caption = "errors: mean (greatest) over time, % of the thread's length; needle: root of the mean square"
+    table.add_column("", no_wrap=True)
+    for name in ("against the truth", "against the seen", "frames", "needle off its path"):
+        table.add_column(name, justify="right")
+    for run in runs:
+        summary = run.summary
+        errors = [
+            f"{figures['mean']:.3f} ({figures['maximum']:.3f})" if figures else "none"
+            for figures in (summary.error_truth, summary.error_seen)
+        ]
+        table.add_row(
+            summary.setup, *errors, f"{summary.predicted} of {summary.frames}", f"{1e3 * summary.path_error:.2f} mm"
+        )
+    return table
+
+
 def evaluation_table(evaluation: Evaluation) -> Table:
     """Return the scores of a set of trajectories as a table that fits 80 columns."""
     title = f"formulation {evaluation.formulation}, solver {evaluation.solver}"
@@ -77,6 +133,10 @@ def evaluation_table(evaluation: Evaluation) -> Table:
 def _micrometres(metres: float) -> str:
     """Return a margin in micrometres; what is 0 within the solvers' tolerance is written so."""
     return f"{metres * 1e6:+.3f}" if abs(metres) > 1e-9 else "0.000"
+
+
+def _greatest(metres: float) -> str:
+    return f"root of the mean square; greatest {1e3 * metres:.3f} mm"
 
 
 def _share(part: int, whole: int) -> str:

@@ -33,15 +33,15 @@ def test_a_pose_goes_there_and_back(angle: float, x: float, y: float):
 
 def test_a_needle_that_stands_upright_has_no_heading():
     message = messages.pose_message(STAMP, np.zeros(2), np.array([1.0, 0.0]))
-    message.pose.orientation = Quaternion(y=math.sqrt(0.5), w=math.sqrt(0.5))
+    message.pose.pose.orientation = Quaternion(y=math.sqrt(0.5), w=math.sqrt(0.5))
     with pytest.raises(InvalidInputError, match="an x axis in the dish plane"):
         messages.needle_pose(message)
 
 
 def test_paths_and_velocities_go_there_and_back():
     points = np.random.default_rng(0).normal(size=(5, 2))
-    np.testing.assert_array_equal(messages.path_points(messages.path_message(STAMP, points)), points)
-    assert messages.path_points(messages.path_message(STAMP, np.empty((0, 2)))).shape == (0, 2)
+    np.testing.assert_array_equal(messages.path_points(messages.PathMaker().message(STAMP, points)), points)
+    assert messages.path_points(messages.PathMaker().message(STAMP, np.empty((0, 2)))).shape == (0, 2)
     np.testing.assert_array_equal(
         messages.command_velocity(messages.twist_message(STAMP, np.array([1.0, -2.0]))), [1.0, -2.0]
     )

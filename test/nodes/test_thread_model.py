@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
 from nav_msgs.msg import Path
 from visualization_msgs.msg import Marker
@@ -24,14 +24,14 @@ def stamp(seconds: float) -> Time:
     return Time(sec=int(seconds), nanosec=round((seconds % 1.0) * 1e9))
 
 
-def pose(seconds: float, x: float = 0.0, y: float = 0.0) -> PoseStamped:
+def pose(seconds: float, x: float = 0.0, y: float = 0.0) -> PoseWithCovarianceStamped:
     """Return a needle that points east."""
     return messages.pose_message(stamp(seconds), np.array([x, y]), np.array([1.0, 0.0]))
 
 
 def seen(seconds: float) -> Path:
     """Return a thread that lies straight behind a needle at the origin."""
-    return messages.path_message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
+    return messages.PathMaker().message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
 
 
 def test_the_thread_starts_where_it_is_seen_and_follows(graph):
@@ -170,10 +170,10 @@ def test_a_step_that_fell_back_is_published_and_said(graph, monkeypatch):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda p: setattr(p.pose.position, "x", math.nan), "finite coordinates"),
-        (lambda p: setattr(p.pose.position, "y", math.inf), "finite coordinates"),
-        (lambda p: setattr(p.pose.orientation, "w", math.nan), "a unit quaternion"),
-        (lambda p: setattr(p.pose.orientation, "w", 7.0), "a unit quaternion"),
+        (lambda p: setattr(p.pose.pose.position, "x", math.nan), "finite coordinates"),
+        (lambda p: setattr(p.pose.pose.position, "y", math.inf), "finite coordinates"),
+        (lambda p: setattr(p.pose.pose.orientation, "w", math.nan), "a unit quaternion"),
+        (lambda p: setattr(p.pose.pose.orientation, "w", 7.0), "a unit quaternion"),
         (lambda p: setattr(p.header, "frame_id", "map"), "'dish'"),
         (lambda p: setattr(p.header, "stamp", stamp(0.9)), "later than"),
     ],

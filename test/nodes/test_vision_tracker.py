@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from builtin_interfaces.msg import Time
+from magnetosuture_msgs.msg import TrackerState
 from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
-from magnetosuture_thread.rig.camera import encode_jpeg
+from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 
 TAIL = np.array([0.002, 0.001])
 
@@ -30,21 +32,48 @@ def states(diagnostics) -> list[str]:
 
 
 def test_a_frame_becomes_a_pose_and_a_centreline_with_its_stamp(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode)
+    graph.add(VisionTrackerNode, confirm_frames=1)
     poses, threads = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.SEEN_THREAD)
     stamp = graph.now()
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), stamp))
     graph.wait(lambda: bool(poses and threads), "pose and centreline")
     assert poses[0].header.frame_id == threads[0].header.frame_id == "dish"
     assert poses[0].header.stamp == threads[0].header.stamp == stamp
-    position, turned = poses[0].pose.position, poses[0].pose.orientation
+    position, turned = poses[0].pose.pose.position, poses[0].pose.pose.orientation
     assert np.hypot(position.x - TAIL[0], position.y - TAIL[1]) < 1e-4
     assert abs(2.0 * np.arctan2(turned.z, turned.w) - 0.4) < 0.01
     assert len(threads[0].poses) > 50
+    covariance = np.reshape(poses[0].pose.covariance, (6, 6))
+    assert 1e-12 < covariance[0, 0] < 1e-8
+    assert 1e-8 < covariance[5, 5] < 1e-3
+    assert covariance[2, 2] == 0.0
+
+
+def test_every_frame_gets_a_state_and_a_pose_comes_once_three_agree(graph, camera, thread_arc):
+    graph.add(VisionTrackerNode)
+    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
+    image = frame(camera, thread_arc)
+    for index in range(4):
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=index * 16_000_000)))
+        graph.wait(lambda n=index: len(tracking) > n, "a state")
+    searching, tracked = TrackerState.STATE_SEARCHING, TrackerState.STATE_TRACKED
+    assert [state.state for state in tracking] == [searching, searching, tracked, tracked]
+    assert "1 of 3 frames" in tracking[0].reason
+    assert tracking[0].confidence == 0.0
+    assert tracking[3].reason == ""
+    assert 0.3 < tracking[3].confidence <= 1.0
+    assert abs(tracking[3].curvature) < 5.0
+    assert 0.0 < tracking[3].processing_time < 10.0
+    graph.wait(lambda: len(poses) == 2, "poses of the frames that were tracked")
+    assert poses[0].header.stamp == tracking[2].header.stamp
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(0 * image, Time(sec=5, nanosec=64_000_000)))
+    graph.wait(lambda: len(tracking) > 4, "a state")
+    assert tracking[4].state == TrackerState.STATE_LOST
+    assert len(poses) == 2
 
 
 def test_a_raw_image_is_taken_too(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode, image_transport="raw")
+    graph.add(VisionTrackerNode, image_transport="raw", confirm_frames=1)
     poses = graph.listen(topics.NEEDLE_POSE)
     image = frame(camera, thread_arc)
     message = Image(height=480, width=640, step=1920, encoding="bgr8", data=image.tobytes())
@@ -54,12 +83,12 @@ def test_a_raw_image_is_taken_too(graph, camera, thread_arc):
 
 
 def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode)
+    graph.add(VisionTrackerNode, confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
     far = np.array([0.5, 0.5])
     empty = camera.render(far, 0.0, np.array([far, far + 0.01]))
     graph.publish(topics.COMPRESSED_IMAGE, compressed(empty, graph.now()))
-    graph.wait(lambda: "lost: no single needle in the dish" in states(diagnostics), "lost")
+    graph.wait(lambda: any(text.startswith("searching: ") for text in states(diagnostics)), "searching")
     assert not poses
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
@@ -67,7 +96,7 @@ def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
 
 
 def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode)
+    graph.add(VisionTrackerNode, confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
     for data in (b"", b"no image", b"\xff\xd8\xff\xe0" + bytes(40)):
         message = CompressedImage(format="jpeg", data=data)

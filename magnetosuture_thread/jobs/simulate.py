@@ -1,0 +1,169 @@
+"""The job `magnetosuture simulate`: the whole graph around a simulated rig, in a closed loop."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.geometry.polyline import arc_lengths
+from magnetosuture_thread.interface import CAMERA, NODES, OBSTACLE_MARKERS, TIP_SETPOINT
+from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.study.loop import LoopCollector, LoopSummary
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.recorder import Recorder
+
+START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
+SETTLE = 1.0  # s for all nodes to have found each other
+AFTERWARDS = 0.5  # s that go on once the path is done
+PATIENCE = 3.0  # times the path's own duration, and ...
+SPARE = 20.0  # s of simulated time besides: then a run that never ends is ended
+LOOK = 0.02  # s between two looks at the nodes
+
+Say = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+def simulate(
+    scenario: str,
+    output: Path,
+    *,
+    duration: float | None = None,
+    pace: float | None = None,
+    say: Say = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> LoopSummary:
+    """Run rig, tracker, model, bridge and path follower as processes of their own, and judge the loop.
+
+    `output` becomes a bag of all that was said, the truth included; its notes say that it is simulated
+    and `replay` takes it. It is made at the end, whole or not at all.
+
+    Args:
+        scenario: name or path of a set-up with a path for the needle.
+        output: the bag's folder.
+        duration: the run ends after this many seconds of the scenario's time; when the path is done if None.
+        pace: how much faster than real time, with a simulated clock; in real time if None.
+        say: called with a line for a person at each stage.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: the output exists or cannot be written.
+        ConfigurationError: the scenario cannot be used.
+        GraphError: a node ended or did not come, or the needle never got to the end of its path.
+    """
+    setup = read_setup(scenario)
+    if not setup.follower.waypoints:
+        raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
+    with whole_folder(output) as folder:
+        _run(setup, folder, output.name, duration, pace, say, progress)
+        say("judging the run")
+        return judge(Bag(folder), setup).summary(setup.name)
+
+
+def judge(bag: Bag, setup: Setup) -> LoopCollector:
+    """Return all that a simulated run's bag says, put side by side."""
+    collector = LoopCollector(setup.model.length, setup.rig.needle_length, setup.rig.needle_curvature)
+    camera = {channel.recorded for channel in CAMERA.values()}
+    for record in bag.records(set(bag.topics) - camera):
+        collector.take(record.topic, record.time, record.decode())
+    return collector
+
+
+def _run(
+    setup: Setup, folder: Path, name: str, duration: float | None, pace: float | None, say: Say, progress: Progress
+) -> None:
+    # Only here, where it is needed: without ROS the other commands still work.
+    from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.processes import (
+        NodeProcesses,
+        environment_of,
+        graph_environment,
+        reserved_domain,
+    )
+    from magnetosuture_thread.nodes.recorder import Recorder
+
+    arguments = ["--params-file", str(setup.path.resolve()), "-p", "coil_bridge:driver:=recording"]
+    if pace is not None:
+        arguments += ["-p", "use_sim_time:=true", "-p", "rig_simulator:clock:=simulated"]
+        arguments += ["-p", f"rig_simulator:pace:={float(pace)}"]
+    notes = {"setup": setup.name, "simulated": f"the whole rig, closed loop, scenario {setup.name}"}
+    taken = [topic for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED) if topic is not topics.IMAGE]
+    with (
+        reserved_domain() as domain,
+        tempfile.TemporaryDirectory() as logs,
+        BagWriter(folder, notes, name=name) as bag,
+    ):
+        environment = graph_environment(domain)
+        for topic in taken:
+            bag.add_topic(topic.channel.recorded, topic.channel.type_name)
+        say(f"starting rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
+        with (
+            environment_of(environment),
+            NodeProcesses(("rig_simulator", *NODES), arguments, environment, Path(logs)) as nodes,
+        ):
+            running = False
+
+            def receive(topic: str, arrival: int, data: bytes) -> None:
+                # While nodes start, only what is said once and for all is worth keeping.
+                if running or topic == OBSTACLE_MARKERS.recorded:
+                    bag.write(topic, arrival, data)
+
+            recorder = Recorder(domain, taken, simulated_clock=pace is not None, receive=receive)
+            try:
+                _wait(recorder, nodes.check, {topics.NEEDLE_COMMAND.name, topics.TIP_SETPOINT.name})
+                say("running" if pace is None else f"running at {pace:g} times the speed")
+                running = True
+                nodes.start("path_follower")
+                _follow(recorder, nodes.check, setup, duration, pace or 1.0, progress)
+            finally:
+                recorder.close()
+
+
+def _wait(recorder: Recorder, check: Callable[[], None], later: set[str]) -> None:
+    """Wait until somebody publishes every topic, but those that come later."""
+    deadline = time.monotonic() + START_TIMEOUT
+    while missing := [name for name in recorder.silent() if name not in later]:
+        check()
+        if time.monotonic() > deadline:
+            raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
+        recorder.spin(LOOK)
+    recorder.spin(SETTLE)
+
+
+def _follow(
+    recorder: Recorder,
+    check: Callable[[], None],
+    setup: Setup,
+    duration: float | None,
+    pace: float,
+    progress: Progress,
+) -> None:
+    """Record until the needle is at the end of its path, or the time is over."""
+    points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
+    longest = PATIENCE * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE
+    began = time.monotonic()
+    following = False
+    while True:
+        check()
+        recorder.spin(LOOK)
+        if not following and recorder.taken[TIP_SETPOINT.recorded]:
+            following, began = True, time.monotonic()
+        said, values = recorder.said.get("path_follower", ("", {}))
+        elapsed = (time.monotonic() - began) * pace
+        done = float(values.get("progress", 0.0))
+        progress(done if duration is None else min(1.0, elapsed / duration))
+        if said == "done" or (following and duration is not None and elapsed > duration):
+            recorder.spin(AFTERWARDS / pace)
+            return
+        if elapsed > longest:
+            states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.said.items()))
+            raise GraphError(f"after {elapsed:.0f} s only {done:.0%} of the path is done; {states}")

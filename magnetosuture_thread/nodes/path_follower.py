@@ -1,0 +1,50 @@
+"""The path follower node: needle poses in, velocity commands for a fixed path out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.node import Node
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.guidance.settings import PathFollowerSettings
+from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.run import run
+
+
+class PathFollowerNode(Node):
+    """Asks for a velocity at every needle pose; without a pose it is silent, and the coil bridge stops."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("path_follower", automatically_declare_parameters_from_overrides=True, **options)
+        self._follower = declare(self, PathFollowerSettings).follower()
+        self._health = Health(self)
+        self._commands = topics.NEEDLE_COMMAND.publisher(self)
+        self._setpoints = topics.TIP_SETPOINT.publisher(self)
+        topics.NEEDLE_POSE.subscribe(self, self.on_pose)
+        self._health.warn("no needle pose yet", progress=0.0)
+
+    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Ask for the velocity that takes the tip along its path."""
+        try:
+            pose = messages.needle_pose(message)
+            wish = self._follower.follow(pose.stamp, pose.tail, pose.heading)
+        except InvalidInputError as error:
+            self._health.refuse(error)
+            return
+        self._commands.publish(messages.twist_message(self.get_clock().now().to_msg(), wish.velocity))
+        self._setpoints.publish(messages.placed(message.header.stamp, wish.tip, 0.0))
+        self._health.ok("done" if wish.progress >= 1.0 else "following", progress=round(wish.progress, 4))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node as a program."""
+    return run(PathFollowerNode, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,182 @@
+"""The whole graph around a simulated rig: nodes in processes of their own, everything recorded."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import pytest
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
+from magnetosuture_thread.jobs.behaviour import behaviour
+from magnetosuture_thread.jobs.replay import replay
+from magnetosuture_thread.jobs.simulate import simulate
+from magnetosuture_thread.resources import setup_file
+
+SHORT = """
+vision_tracker: {ros__parameters: {dish_diameter: 0.035}}
+rig_simulator:
+  ros__parameters:
+    needle_start: [0.004, 0.0, 0.0]
+    thread_segments: 30
+    frame_rate: 30.0
+FAULTS
+path_follower:
+  ros__parameters:
+    waypoints: [0.0125, 0.0035]
+"""
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a scenario of one second."""
+    path = tmp_path_factory.mktemp("scenario") / "short.yaml"
+    path.write_text(SHORT.replace("FAULTS", ""))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(scenario: Path, tmp_path_factory: pytest.TempPathFactory):
+    """Run it; return the bag, the figures and what was said."""
+    bag = tmp_path_factory.mktemp("run") / "bag"
+    said: list[str] = []
+    shares: list[float] = []
+    summary = simulate(str(scenario), bag, say=said.append, progress=shares.append)
+    return bag, summary, said, shares
+
+
+def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
+    _, summary, said, shares = run
+    assert summary.setup == "short"
+    assert summary.frames >= 20
+    assert summary.tracked >= 0.9 * summary.frames
+    assert summary.wrong == 0
+    assert summary.predicted >= 0.9 * summary.tracked
+    assert summary.tail_error < 8e-5
+    assert summary.path_error < 2e-3  # how well is for a quiet machine to say
+    assert summary.error_truth is not None
+    assert summary.error_truth["mean"] < 2.0
+    assert summary.seen_share > 0.9
+    assert any("this machine only" in line for line in said)
+    assert shares[-1] == 1.0
+
+
+def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
+    bag = Bag(run[0])
+    bag.check()
+    assert "simulated" in bag.notes
+    assert bag.notes["setup"].endswith("short")
+    for topic in (
+        "/camera/image_raw/compressed",
+        "/camera/camera_info",
+        "/truth/needle",
+        "/truth/thread",
+        "/needle/measured_cp",
+        "/needle/tracker_state",
+        "/needle/servo_cv",
+        "/needle/setpoint_cp",
+        "/needle/setpoint_cv",
+        "/coils/currents",
+        "/thread/measured",
+        "/thread/predicted",
+        "/thread/margins",
+        "/thread/markers",
+        "/thread/obstacles",
+        "/diagnostics",
+    ):
+        assert bag.counts[topic] > 0, topic
+    covariances = [record.decode().pose.covariance for record in bag.records({"/needle/measured_cp"})]
+    assert all(0.0 < covariance[0] < 1e-8 for covariance in covariances)
+
+
+def test_replay_takes_the_bag(run, scenario: Path, tmp_path: Path):
+    summary = replay(run[0], tmp_path / "out", setup_name=str(scenario))
+    assert "whole rig" in summary.simulated
+    assert summary.tracked >= 0.9 * summary.frames
+    assert summary.error_truth is not None
+    assert summary.commands > 20
+
+
+def test_under_faults_the_tracker_is_right_or_silent_and_the_needle_goes_on(tmp_path: Path):
+    path = tmp_path / "faults.yaml"
+    faults = ["dropped_frames 0.2 0.2", "glare 0.4 0.3", "late_frames 0.8 0.3", "hand 1.2 0.4"]
+    path.write_text(SHORT.replace("FAULTS", f"    faults: {faults}"))
+    summary = simulate(str(path), tmp_path / "bag")
+    assert summary.lost > 0
+    assert summary.wrong == 0
+    assert summary.tracked > 15
+
+
+def test_with_a_simulated_clock_it_runs_faster_than_real_time(scenario: Path, tmp_path: Path):
+    said: list[str] = []
+    summary = simulate(str(scenario), tmp_path / "bag", pace=1.5, say=said.append)
+    assert "running at 1.5 times the speed" in said
+    assert summary.tracked >= 0.7 * summary.frames
+    assert Bag(tmp_path / "bag").start < 1000e9  # on the simulation's own clock
+
+
+def test_a_run_can_be_ended_before_its_path(scenario: Path, tmp_path: Path):
+    summary = simulate(str(scenario), tmp_path / "bag", duration=0.5)
+    assert summary.duration < 1.5
+
+
+def test_a_scenario_without_a_path_is_refused(tmp_path: Path):
+    path = tmp_path / "still.yaml"
+    path.write_text("vision_tracker: {ros__parameters: {dish_diameter: 0.035}}\n")
+    with pytest.raises(ConfigurationError, match=r"path_follower\.waypoints"):
+        simulate(str(path), tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
+def test_an_output_that_exists_is_not_touched(scenario: Path, tmp_path: Path):
+    (tmp_path / "bag").mkdir()
+    with pytest.raises(BagError, match="exists already"):
+        simulate(str(scenario), tmp_path / "bag")
+
+
+def test_a_node_that_cannot_start_ends_the_run_with_its_last_words(tmp_path: Path):
+    path = tmp_path / "odd.yaml"
+    path.write_text(SHORT.replace("FAULTS", "    needle_curvature: 950.0"))  # more than a full turn
+    with pytest.raises(GraphError, match=r"rig_simulator ended with exit code 1: error: needle\.curvature"):
+        simulate(str(path), tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
+def test_an_interrupted_run_leaves_nothing_behind(scenario: Path, tmp_path: Path):
+    command = [
+        sys.executable,
+        "-m",
+        "magnetosuture_thread.cli",
+        "simulate",
+        str(scenario),
+        "--output",
+        str(tmp_path / "bag"),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        assert process.stdout is not None
+        next(line for line in process.stdout if b"starting" in line)
+        time.sleep(0.5)  # into the start of the nodes; where exactly does not matter
+        process.send_signal(signal.SIGINT)
+        process.wait(30.0)
+    assert process.returncode != 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_behaviour_job_draws_each_scenario(scenario: Path, tmp_path: Path):
+    runs = behaviour(tmp_path / "out", [str(scenario)])
+    assert len(runs) == 1
+    assert runs[0].summary.error_truth is not None
+    picture = cv2.imread(str(tmp_path / "out" / "behaviour.png"))
+    assert picture is not None
+    assert picture.shape[1] > 1000
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["behaviour.json", "behaviour.png", "short"]
+
+
+def test_the_scenarios_of_the_paper_ship():
+    for name in ("petri_35mm_polyamide", "petri_150mm_silk"):
+        assert setup_file(name).exists()

@@ -1,0 +1,61 @@
+"""The path follower in a graph."""
+
+from __future__ import annotations
+
+import numpy as np
+from builtin_interfaces.msg import Time
+
+from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes.path_follower import PathFollowerNode
+
+EAST = np.array([1.0, 0.0])
+
+
+def pose(seconds: float, x: float):
+    """Return a needle that points east."""
+    stamp = Time(sec=int(seconds), nanosec=round((seconds % 1.0) * 1e9))
+    return messages.pose_message(stamp, np.array([x, 0.0]), EAST)
+
+
+def test_a_pose_is_answered_by_a_command_made_now_and_by_the_wish_at_the_pose(graph):
+    graph.add(PathFollowerNode, waypoints=[0.02, 0.0])
+    commands, wishes = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.TIP_SETPOINT)
+    for index in range(30):
+        graph.publish(topics.NEEDLE_POSE, pose(5.0 + index / 60, 0.0))
+        graph.wait(lambda n=index: len(commands) > n and len(wishes) > n, "the answer")
+    assert commands[-1].header.frame_id == "dish"
+    assert commands[-1].twist.linear.x > 0.001
+    assert abs(commands[-1].twist.linear.y) < 1e-6
+    assert commands[-1].header.stamp.sec > 1000
+    assert wishes[-1].header.stamp.sec == 5
+    assert 0.007 < wishes[-1].pose.position.x < 0.01
+
+
+def test_without_a_pose_it_is_silent_and_a_bad_one_is_refused(graph):
+    graph.add(PathFollowerNode, waypoints=[0.02, 0.0])
+    commands, diagnostics = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.DIAGNOSTICS)
+    bad = pose(5.0, np.nan)
+    graph.publish(topics.NEEDLE_POSE, bad)
+    graph.wait(lambda: any("refused" in d.status[0].message for d in diagnostics), "a refusal")
+    assert commands == []
+
+
+def test_at_the_end_it_says_done(graph):
+    graph.add(PathFollowerNode, waypoints=[0.0071, 0.0])
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    seconds = 5.0
+
+    def done() -> bool:
+        nonlocal seconds
+        seconds += 1 / 60
+        graph.publish(topics.NEEDLE_POSE, pose(seconds, 0.0))
+        return any(d.status[0].message == "done" for d in diagnostics)
+
+    graph.wait(done, "the end of the path")
+
+
+def test_a_path_of_nothing_is_refused_with_the_first_pose(graph):
+    graph.add(PathFollowerNode)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
+    graph.wait(lambda: any("refused: waypoints" in d.status[0].message for d in diagnostics), "a refusal")

@@ -1,0 +1,114 @@
+"""The rig simulator in a graph."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from magnetosuture_msgs.msg import CoilCurrents
+from std_msgs.msg import String
+
+from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
+
+SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
+
+
+def currents(graph, *values: float) -> CoilCurrents:
+    """Return currents from now on."""
+    message = CoilCurrents(current=[float(value) for value in values])
+    message.header = messages.header(graph.now())
+    return message
+
+
+def nanoseconds(stamp) -> int:
+    """Return a stamp as a number."""
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def test_frames_come_with_their_truth_and_the_camera(graph):
+    frames, infos = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.CAMERA_INFO)
+    needles, threads = graph.listen_later(topics.TRUE_NEEDLE), graph.listen_later(topics.TRUE_THREAD)
+    graph.add(RigSimulatorNode, **SMALL)
+    graph.wait(lambda: min(len(frames), len(infos), len(needles), len(threads)) > 3, "frames and truth")
+    image = cv2.imdecode(np.frombuffer(bytes(frames[-1].data), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    assert image.shape == (480, 640, 3)
+    assert (infos[-1].width, infos[-1].height) == (640, 480)
+    stamps = {nanoseconds(needle.header.stamp) for needle in needles}
+    assert nanoseconds(frames[-1].header.stamp) in stamps
+    assert needles[-1].pose.position.x == pytest.approx(0.003)
+    assert needles[-1].header.frame_id == "dish"
+    assert len(threads[-1].poses) == 13
+
+
+def test_a_frame_period_is_kept_in_the_stamps(graph):
+    needles = graph.listen_later(topics.TRUE_NEEDLE)
+    graph.add(RigSimulatorNode, frame_rate=50.0, **SMALL)
+    graph.wait(lambda: len(needles) > 10, "frames")
+    steps = np.diff([nanoseconds(needle.header.stamp) for needle in needles])
+    assert (steps > 0).all()
+    np.testing.assert_allclose(steps / 2e7, np.round(steps / 2e7), atol=1e-3)
+
+
+def test_nothing_moves_without_a_current_then_the_needle_is_pulled(graph):
+    needles = graph.listen_later(topics.TRUE_NEEDLE)
+    graph.add(RigSimulatorNode, faults=["dim 0.0 60.0"], **SMALL)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.CURRENTS, currents(graph, 0, 0, 0, 0))
+    graph.wait(lambda: len(needles) > 5, "frames")
+    assert needles[-1].pose.position.x == pytest.approx(0.003, abs=1e-8)
+
+    def pulled() -> bool:
+        graph.publish(topics.CURRENTS, currents(graph, 5, 0, -2, 0))
+        return needles[-1].pose.position.x > 0.0035
+
+    graph.wait(pulled, "the needle to move")
+    graph.wait(lambda: any("running, with dim" in d.status[0].message for d in diagnostics), "the fault's name")
+
+
+def refusals(diagnostics) -> list[str]:
+    """Return what was refused."""
+    values = [value for array in diagnostics for value in array.status[0].values]
+    return [value.value for value in values if value.key == "last refusal" and value.value != "none"]
+
+
+@pytest.mark.parametrize("bad", [(1.0, 2.0), (np.nan, 0, 0, 0)])
+def test_bad_currents_are_refused_and_said(graph, bad):
+    diagnostics = graph.listen_later(topics.DIAGNOSTICS)
+    graph.add(RigSimulatorNode, **SMALL)
+    graph.publish(topics.CURRENTS, currents(graph, *bad))
+    graph.wait(lambda: any("4 finite numbers" in text for text in refusals(diagnostics)), "a refusal")
+
+
+def test_a_fault_can_be_asked_for_now(graph):
+    node = graph.add(RigSimulatorNode, **SMALL)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.CURRENTS, currents(graph, 0.01, 0, 0, 0))
+    graph.publish(topics.FAULT_REQUEST, String(data="glare 60"))
+    graph.wait(lambda: any("with glare" in d.status[0].message for d in diagnostics), "the fault")
+    graph.publish(topics.FAULT_REQUEST, String(data="sunshine 60"))
+    graph.wait(lambda: any("KIND START DURATION" in text for text in refusals(diagnostics)), "a refusal")
+    assert [fault.kind for fault in node.rig.faults.faults] == ["glare"]
+
+
+def test_late_frames_come_late_with_their_own_stamps(graph):
+    frames, needles = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.TRUE_NEEDLE)
+    node = graph.add(RigSimulatorNode, faults=["late_frames 0 60"], **SMALL)
+    graph.publish(topics.CURRENTS, currents(graph, 0.01, 0, 0, 0))
+    graph.wait(lambda: node.rig.running > 0.0, "the fault's time")
+    frames.clear()
+    graph.wait(lambda: len(frames) > 2 and len(needles) > 2, "frames")
+    assert node.get_clock().now().nanoseconds - nanoseconds(frames[-1].header.stamp) > 0.05e9
+
+
+def test_a_simulated_clock_runs_at_its_pace(graph):
+    node = graph.add(RigSimulatorNode, clock="simulated", pace=3.0, **SMALL)
+    clocks, needles = graph.listen(topics.CLOCK), graph.listen(topics.TRUE_NEEDLE)
+    graph.wait(lambda: len(clocks) > 20 and len(needles) > 5, "clocks and frames")
+    simulated = (nanoseconds(clocks[-1].clock) - nanoseconds(clocks[0].clock)) * 1e-9
+    assert simulated > 0.0
+    assert nanoseconds(clocks[-1].clock) < 1000e9  # it began near zero
+    assert abs(nanoseconds(needles[-1].header.stamp) - nanoseconds(clocks[-1].clock)) < 1e9
+    real = (node._steady.now().nanoseconds - node._started) * 1e-9
+    assert (nanoseconds(clocks[-1].clock) - 1e9) * 1e-9 == pytest.approx(3.0 * real, rel=0.3)
