@@ -77,7 +77,7 @@ def simulate(options: argparse.Namespace) -> int:
         )
     console.print(loop_table(summary))
     console.print(f"bag: {options.output}", soft_wrap=True, markup=False)
-    _write_json(options.json, json.dumps(summary.to_json(), indent=2))
+    _write_json(options.json, json.dumps(summary.to_json(), indent=2, allow_nan=False))
     return DONE
 
 

@@ -128,7 +128,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     simulate.add_argument(
         "--pace",
-        type=number(0.05, 20.0),
+        type=number(0.5, 5.0),
         help="run with a simulated clock, this much faster than real time (default: in real time)",
     )
     simulate.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to a file")

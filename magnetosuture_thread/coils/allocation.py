@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.geometry.arc import needle_chord
 
 Vector = NDArray[np.float64]
 
@@ -47,8 +47,7 @@ class NeedleMechanics:
     @property
     def chord(self) -> float:
         """Distance from tail to tip [m]."""
-        half = 0.5 * self.curvature * self.length
-        return self.length * (math.sin(half) / half if half else 1.0)
+        return needle_chord(self.length, self.curvature)[0]
 
     @property
     def pole(self) -> float:
@@ -57,9 +56,7 @@ class NeedleMechanics:
 
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
-        half = 0.5 * self.curvature * self.length
-        c, s = math.cos(half), math.sin(half)
-        return np.array([c * heading[0] - s * heading[1], s * heading[0] + c * heading[1]])
+        return np.asarray(needle_chord(self.length, self.curvature)[1] @ heading)
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.coils.stamps import check_stamp
 from magnetosuture_thread.errors import InvalidInputError
 
 Vector = NDArray[np.float64]
-
-FUTURE = 0.05  # s; clocks of two machines may differ by this much
 
 
 @dataclass(frozen=True)
@@ -65,20 +64,7 @@ class CommandGate:
         """
         if not np.all(np.isfinite(velocity)):
             raise InvalidInputError("needle/servo_cv.twist.linear", velocity.tolist(), "finite numbers [m/s]")
-        if now - stamp > self._timeout:
-            raise InvalidInputError(
-                "needle/servo_cv.header.stamp", f"{now - stamp:.3f} s old", f"at most {self._timeout:g} s"
-            )
-        if stamp - now > FUTURE:
-            raise InvalidInputError(
-                "needle/servo_cv.header.stamp", f"{stamp - now:.3f} s ahead", f"at most {FUTURE:g} s"
-            )
-        if stamp < self._stamp <= now + FUTURE:
-            raise InvalidInputError(
-                "needle/servo_cv.header.stamp",
-                f"{stamp:.6f} s",
-                f"no earlier than the last command's {self._stamp:.6f} s",
-            )
+        check_stamp("needle/servo_cv", stamp, now, self._stamp, self._timeout)
         speed = float(np.linalg.norm(velocity))
         self._velocity = velocity * min(1.0, self._max_speed / speed) if speed > 0.0 else np.zeros(2)
         self._stamp, self._arrival, self._stopped_at = stamp, arrival, None

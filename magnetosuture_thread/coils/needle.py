@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import NeedleMechanics
+from magnetosuture_thread.coils.stamps import check_stamp
 from magnetosuture_thread.errors import InvalidInputError
 
 Vector = NDArray[np.float64]
@@ -34,11 +35,13 @@ class NeedleWatch:
     Args:
         needle: its mechanics.
         timeout: a pose is good for this long after its arrival [s].
+        reach: both ends must be nearer to the dish's centre than this; the coils are beyond it [m].
     """
 
-    def __init__(self, needle: NeedleMechanics, timeout: float) -> None:
+    def __init__(self, needle: NeedleMechanics, timeout: float, reach: float) -> None:
         self._needle = needle
         self._timeout = timeout
+        self._reach = reach
         self._pose: Pose | None = None
         self._stamp = -math.inf
         self._arrival = -math.inf
@@ -55,13 +58,16 @@ class NeedleWatch:
             arrival: a monotonic clock now [s].
 
         Raises:
-            InvalidInputError: it is not finite, too old, or from the future.
+            InvalidInputError: it is not finite, not among the coils, too old, from the future, or older than
+                the last one.
         """
         if not (np.all(np.isfinite(tail)) and np.all(np.isfinite(heading))):
             raise InvalidInputError("needle/measured_cp.pose", [*tail.tolist(), *heading.tolist()], "finite numbers")
-        if abs(now - stamp) > self._timeout:
-            age = f"{now - stamp:.3f} s old"
-            raise InvalidInputError("needle/measured_cp.header.stamp", age, f"at most {self._timeout:g} s")
+        tip = tail + self._needle.chord * self._needle.chord_direction(heading)
+        if max(math.hypot(*tail), math.hypot(*tip)) > self._reach:
+            ends = f"{tail.tolist()} to {tip.tolist()}"
+            raise InvalidInputError("needle/measured_cp.pose", ends, f"within {self._reach:g} m of the dish's centre")
+        check_stamp("needle/measured_cp", stamp, now, self._stamp, self._timeout)
         self._pose, self._stamp, self._arrival = Pose(tail, heading), stamp, arrival
 
     def move(self, velocity: Vector) -> None:

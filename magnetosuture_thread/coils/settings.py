@@ -10,6 +10,9 @@ from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanic
 from magnetosuture_thread.coils.field import LoopCoils
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.arc import require_needle
+
+INSIDE = 0.9  # of the distance to the coils
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,11 @@ class CoilBridgeSettings(Configuration):
         maximum=2.0 * math.pi,
     )
 
+    @property
+    def reach(self) -> float:
+        """How far from the dish's centre a needle may be: well within the coils [m]."""
+        return INSIDE * self.coil_distance
+
     def needle(self) -> NeedleMechanics:
         """Return the needle's mechanics."""
         return NeedleMechanics(
@@ -96,7 +104,8 @@ class CoilBridgeSettings(Configuration):
         return CoilAllocation(coils, self.needle(), self.aligning_field, self.max_current)
 
     def check(self) -> None:
-        """Refuse fewer than three coils: they could not pull in every direction."""
+        """Refuse fewer than three coils, which could not pull in every direction, and a coiled needle."""
+        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
             name = f"{self.GROUP}.coil_angles"
             raise ConfigurationError(name, list(self.coil_angles), "at least 3 coils' angles [rad]")

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.geometry.arc import needle_chord
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.guidance.path import SmoothPath
 
 Vector = NDArray[np.float64]
 
 LONGEST_INTERVAL = 0.1  # s; after a longer gap between poses the wish has waited, and does not run ahead
+
+ALMOST = 0.999  # of the path; it is done when the tip is there, not the point that runs ahead of it
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,8 @@ class PathFollower:
         v = w dp/dl + k e + c,    e = p(l) - x_tip,    dc/dt = k_i e,    |c| <= half of the speed
 
     with the point's speed w, which rises and falls by a constant acceleration at the ends. The point
-    runs only while poses come. The path begins at the tip of the first pose, along the needle.
+    runs only while poses come, and waits while the tip is farther from it than `longest_lag`: when nobody
+    moves the needle, it does not run away. The path begins along the needle, where its tip is when `settle` is over.
 
     Args:
         waypoints: where the path leads from there, shape (m, 2) [m].
@@ -44,7 +48,11 @@ class PathFollower:
         acceleration: [m/s^2].
         gain: k [1/s].
         integral_gain: k_i [1/s^2]; makes up for drag that the coils' model does not know.
-        to_tip: called with tail and unit heading, both of shape (2,); returns the tip [m].
+        longest_lag: [m]
+        tolerance: the path is done once the tip was this near to its end [m].
+        settle: time from the first pose, in which nothing moves yet [s].
+        needle_length: along the body [m].
+        needle_curvature: of the needle's arc, positive to the left of its heading [1/m].
     """
 
     def __init__(
@@ -54,6 +62,9 @@ class PathFollower:
         acceleration: float,
         gain: float,
         integral_gain: float,
+        longest_lag: float,
+        tolerance: float,
+        settle: float,
         needle_length: float,
         needle_curvature: float,
     ) -> None:
@@ -62,9 +73,13 @@ class PathFollower:
         self._acceleration = acceleration
         self._gain = gain
         self._integral_gain = integral_gain
-        half = 0.5 * needle_curvature * needle_length
-        chord = needle_length * float(np.sinc(half / np.pi))
-        self._to_tip = chord * np.array([[np.cos(half), -np.sin(half)], [np.sin(half), np.cos(half)]])
+        self._longest_lag = longest_lag
+        self._tolerance = tolerance
+        self._settle = settle
+        self._first: float | None = None
+        self._done = False
+        chord, turned = needle_chord(needle_length, needle_curvature)
+        self._to_tip = chord * turned
         self._path: SmoothPath | None = None
         self._stamp = 0.0
         self._length = 0.0
@@ -82,6 +97,9 @@ class PathFollower:
             InvalidInputError: the waypoints and the first pose make no path.
         """
         tip = tail + self._to_tip @ heading
+        self._first = stamp if self._first is None else self._first
+        if self._path is None and stamp - self._first < self._settle:
+            return Wish(tip, np.zeros(2), 0.0)
         if self._path is None:
             self._path = SmoothPath(
                 np.vstack([tip, self._waypoints]), self._to_tip @ heading / np.linalg.norm(tip - tail)
@@ -94,12 +112,17 @@ class PathFollower:
         # As fast as allowed such that the point can still come to rest at the end, and has come up from rest.
         rising = np.sqrt(2.0 * self._acceleration * (self._length + 0.5 * self._acceleration * interval**2))
         speed = float(min(self._speed, rising, np.sqrt(2.0 * self._acceleration * max(left, 0.0))))
+        waits = float(np.linalg.norm(path.point(self._length) - tip)) > self._longest_lag
+        speed = 0.0 if waits else speed
         self._length = min(path.length, self._length + speed * interval)
         error = path.point(self._length) - tip
-        if path.length - self._length < 1e-6:
+        at_end = path.length - self._length < 1e-6
+        self._done = self._done or (at_end and float(np.linalg.norm(error)) < self._tolerance)
+        if self._done:
             return Wish(path.point(path.length), np.zeros(2), 1.0)
-        self._correction += self._integral_gain * interval * error
+        if not waits:
+            self._correction += self._integral_gain * interval * error
         size = float(np.linalg.norm(self._correction))
         self._correction *= min(1.0, 0.5 * self._speed / size) if size > 0.0 else 1.0
         velocity = speed * path.tangent(self._length) + self._gain * error + self._correction
-        return Wish(path.point(self._length), velocity, self._length / path.length)
+        return Wish(path.point(self._length), velocity, min(ALMOST, self._length / path.length))

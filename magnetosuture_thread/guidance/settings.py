@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.geometry.arc import require_needle
 from magnetosuture_thread.guidance.follower import PathFollower
 
 
@@ -28,13 +29,30 @@ class PathFollowerSettings(Configuration):
     speed: float = quantity(0.005, "of the tip along the path", unit="m/s", minimum=1e-5, maximum=0.1)
     acceleration: float = quantity(0.01, "at both ends of the path", unit="m/s^2", minimum=1e-4, maximum=10.0)
     gain: float = quantity(
-        6.0, "how fast a distance from the path is made up for", unit="1/s", minimum=0.0, maximum=50.0
+        8.0, "how fast a distance from the path is made up for", unit="1/s", minimum=0.0, maximum=50.0
     )
     integral_gain: float = quantity(4.0, "how fast a lasting distance is", unit="1/s^2", minimum=0.0, maximum=50.0)
+    tolerance: float = quantity(
+        0.0005, "the path is done when the tip is this near to its end", unit="m", minimum=1e-5, maximum=0.1
+    )
+    settle: float = quantity(
+        1.5,
+        "between the first pose and the start, for all nodes to have found each other and the thread to rest",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    )
+    longest_lag: float = quantity(
+        0.002, "the wish waits while the tip is farther from it", unit="m", minimum=1e-5, maximum=0.1
+    )
     needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
     needle_curvature: float = quantity(
         0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
     )
+
+    def check(self) -> None:
+        """Refuse a coiled needle."""
+        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
     def follower(self) -> PathFollower:
         """Return a follower of this path."""
@@ -44,6 +62,9 @@ class PathFollowerSettings(Configuration):
             self.acceleration,
             self.gain,
             self.integral_gain,
+            self.longest_lag,
+            self.tolerance,
+            self.settle,
             self.needle_length,
             self.needle_curvature,
         )

@@ -57,7 +57,7 @@ def behaviour(
             )
             runs.append(_judged(folder / setup.name, setup))
         figures = [run.summary.to_json() for run in runs]
-        (folder / "behaviour.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         draw_behaviour(folder / "behaviour.png", runs)
     return runs
 
@@ -82,8 +82,9 @@ def _judged(path: Path, setup: Setup) -> Run:
         if stamp in wanted:
             frames[stamp] = decode_image(message.data)
     model = setup.model
+    material = model.material.replace("_", " ", 1).replace("_", "-")
     return Run(
-        name=f"{model.material.replace('_', ' ')}, {1e3 * model.length:g} mm, {model.segments} segments, "
+        name=f"{material}, {1e3 * model.length:g} mm, {model.segments} segments, "
         f"{model.attachment} to the needle, dish of {1e3 * setup.rig.dish_diameter:g} mm",
         summary=summary,
         instants=collector.instants,

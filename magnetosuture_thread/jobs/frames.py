@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,9 @@ from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own
+LOWEST_RATE, HIGHEST_RATE = 0.1, 240.0  # frames/s, that video players show
+FRAMES_FOR_RATE = 300  # of a bag, from its beginning
 
 
 @dataclass(frozen=True)
@@ -21,7 +27,7 @@ class Frame:
     """One frame.
 
     Attributes:
-        name: the file's name, or topic and stamp.
+        name: see `FrameSource.names`, or topic and stamp.
         image: None if it is broken.
         problem: why it is; else empty.
         stamp: when it was taken [s]; None where nothing tells.
@@ -41,6 +47,8 @@ class FrameSource:
 
     Attributes:
         count: number of frames.
+        names: of picture files, each there once: the file's name alone, with as many of its folders as tell it
+            apart from others of that name, and numbered where a file is given twice; empty for a bag.
         is_sequence: whether the frames follow one another in time, as in a bag.
         notes: what a bag's writer says of it.
 
@@ -56,6 +64,7 @@ class FrameSource:
         for path in paths:
             self._add(path, alone=len(paths) == 1)
         self.is_sequence = self._bag is not None
+        self.names = _names(self._files)
         self.count = self._bag.counts[self._topic] if self._bag is not None else len(self._files)
 
     def _add(self, path: Path, alone: bool) -> None:
@@ -92,13 +101,24 @@ class FrameSource:
             for record in self._bag.records({self._topic}):
                 yield self._recorded(record)
             return
-        for file in self._files:
+        for name, file in zip(self.names, self._files, strict=True):
             try:
-                yield Frame(file.name, decode_image(file.read_bytes()))
+                yield Frame(name, decode_image(file.read_bytes()))
             except OSError as error:
-                yield Frame(file.name, None, f"cannot be read: {error.strerror}")
+                yield Frame(name, None, f"cannot be read: {error.strerror}")
             except InvalidInputError as error:
-                yield Frame(file.name, None, str(error))
+                yield Frame(name, None, str(error))
+
+    def rate(self) -> float:
+        """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
+        if self._bag is None:
+            return PICTURE_RATE
+        stamps = [_stamp(record) for record in islice(self._bag.records({self._topic}), FRAMES_FOR_RATE)]
+        intervals = [after - before for before, after in pairwise(stamps) if after > before]
+        if not intervals:
+            return PICTURE_RATE
+        # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
+        return min(HIGHEST_RATE, max(LOWEST_RATE, round(1.0 / float(np.median(intervals)), 2)))
 
     def _recorded(self, record: Record) -> Frame:
         """Return a recorded frame; it is broken where message or picture are."""
@@ -113,3 +133,43 @@ class FrameSource:
         except (BagError, InvalidInputError) as error:
             return Frame(f"{record.topic} {stamp:.6f}", None, str(error), stamp)
         return Frame(f"{record.topic} {stamp:.6f}", np.asarray(image), "", stamp)
+
+
+def numbered(names: Sequence[str], form: str) -> list[str]:
+    """Return names each of which is there once: where one comes again, it gets a number.
+
+    Args:
+        names: that may come again.
+        form: of a name with its number, 2 and up, for example `{}_{}`.
+    """
+    given, numbers, taken = list[str](), Counter[str](), set(names)
+    for name in names:
+        numbers[name] += 1
+        own = name
+        while numbers[name] > 1 and (own := form.format(name, numbers[name])) in taken:
+            numbers[name] += 1
+        taken.add(own)
+        given.append(own)
+    return given
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """Return a name for each file; see `FrameSource.names`."""
+    parts = [Path(os.path.abspath(file)).parts for file in files]
+    names: dict[tuple[str, ...], str] = {}
+    unnamed, count = set(parts), 1
+    while unnamed:
+        uses = Counter(own[-count:] for own in unnamed)
+        told = {own for own in unnamed if uses[own[-count:]] == 1}
+        names |= {own: str(Path(*own[-count:])) for own in told}
+        unnamed, count = unnamed - told, count + 1
+    return numbered([names[own] for own in parts], "{} ({})")
+
+
+def _stamp(record: Record) -> float:
+    """Return when a frame was taken [s]; when it was recorded, where it is broken."""
+    try:
+        stamp = record.decode().header.stamp
+    except BagError:
+        return record.time * 1e-9
+    return float(stamp.sec + stamp.nanosec * 1e-9)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import yaml
@@ -14,6 +16,7 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import CAMERA, NEEDLE_COMMAND, NODES, TRUE_THREAD, Channel
 from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.picture import draw_summary
 from magnetosuture_thread.study.replayed import (
@@ -63,12 +66,29 @@ def replay(
     """
     say(f"checking {bag_path}")
     bag = Bag(bag_path)
-    if not (setup_name or bag.notes.get("setup")):
+    with ExitStack() as stack:
+        setup = _setup_of(bag, setup_name, Path(stack.enter_context(TemporaryDirectory())), say)
+        return _replay(bag, setup, output, rate, say, progress)
+
+
+def _setup_of(bag: Bag, name: str, spare: Path, say: Say) -> Setup:
+    """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default."""
+    named, text = bag.notes.get("setup", ""), bag.notes.get(SCENARIO_NOTE, "")
+    if name:
+        if named and name != named:
+            say(f"the bag names the set-up {named}; taking {name}")
+        return read_setup(name)
+    if text:  # which says more than a name: the file may have changed, or be on another machine
+        path = spare / f"{named or 'scenario'}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return read_setup(str(path))
+    if not named:
         say(f"the bag names no set-up; taking {DEFAULT_SETUP}")
-    named = bag.notes.get("setup")
-    if setup_name and named and setup_name != named:
-        say(f"the bag names the set-up {named}; taking {setup_name}")
-    setup = read_setup(setup_name or bag.notes.get("setup") or DEFAULT_SETUP)
+    return read_setup(named or DEFAULT_SETUP)
+
+
+def _replay(bag: Bag, setup: Setup, output: Path, rate: float, say: Say, progress: Progress) -> Summary:
+    """Check the bag, play it and judge what came out."""
     camera = CAMERA[setup.vision.image_transport]
     bag.require(camera.recorded, camera.type_name)
     if bag.counts.get(NEEDLE_COMMAND.recorded):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ from magnetosuture_thread.study.loop import LoopCollector, LoopSummary
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.recorder import Recorder
 
+SCENARIO_NOTE = "scenario"  # of the bag, which holds the set-up's text
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 SETTLE = 1.0  # s for all nodes to have found each other
 AFTERWARDS = 0.5  # s that go on once the path is done
@@ -44,13 +44,15 @@ def simulate(
 ) -> LoopSummary:
     """Run rig, tracker, model, bridge and path follower as processes of their own, and judge the loop.
 
-    `output` becomes a bag of all that was said, the truth included; its notes say that it is simulated
-    and `replay` takes it. It is made at the end, whole or not at all.
+    `output` becomes a bag of all that was said, the truth included, with the nodes' `logs/` beside it; its
+    notes hold the scenario and say that it is simulated, and `replay` takes it. It is made at the end, whole
+    or not at all.
 
     Args:
         scenario: name or path of a set-up with a path for the needle.
         output: the bag's folder.
-        duration: the run ends after this many seconds of the scenario's time; when the path is done if None.
+        duration: the run ends after this many seconds of the scenario's time, wherever the needle is then;
+            when the path is done if None.
         pace: how much faster than real time, with a simulated clock; in real time if None.
         say: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
@@ -63,10 +65,15 @@ def simulate(
     setup = read_setup(scenario)
     if not setup.follower.waypoints:
         raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
+    if setup.vision.image_transport != "compressed":
+        expectation = "compressed: the bag must hold what the tracker saw"
+        raise ConfigurationError(
+            "vision_tracker.image_transport", setup.vision.image_transport, expectation, str(setup.path)
+        )
     with whole_folder(output) as folder:
         _run(setup, folder, output.name, duration, pace, say, progress)
-        say("judging the run")
-        return judge(Bag(folder), setup).summary(setup.name)
+    say("judging the run")
+    return judge(Bag(output), setup).summary(setup.name)
 
 
 def judge(bag: Bag, setup: Setup) -> LoopCollector:
@@ -93,13 +100,16 @@ def _run(
 
     arguments = ["--params-file", str(setup.path.resolve()), "-p", "coil_bridge:driver:=recording"]
     if pace is not None:
-        arguments += ["-p", "use_sim_time:=true", "-p", "rig_simulator:clock:=simulated"]
-        arguments += ["-p", f"rig_simulator:pace:={float(pace)}"]
-    notes = {"setup": setup.name, "simulated": f"the whole rig, closed loop, scenario {setup.name}"}
-    taken = [topic for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED) if topic is not topics.IMAGE]
+        arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:pace:={float(pace)}"]
+    notes = {
+        "setup": setup.name,
+        SCENARIO_NOTE: setup.path.read_text(encoding="utf-8"),
+        "simulated": f"the whole rig, closed loop, scenario {setup.name}",
+    }
+    said = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED)
+    taken = [topic for topic in said if topic is not topics.IMAGE]
     with (
         reserved_domain() as domain,
-        tempfile.TemporaryDirectory() as logs,
         BagWriter(folder, notes, name=name) as bag,
     ):
         environment = graph_environment(domain)
@@ -108,7 +118,7 @@ def _run(
         say(f"starting rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
         with (
             environment_of(environment),
-            NodeProcesses(("rig_simulator", *NODES), arguments, environment, Path(logs)) as nodes,
+            NodeProcesses(("rig_simulator", *NODES), arguments, environment, folder / "logs") as nodes,
         ):
             running = False
 
@@ -119,7 +129,11 @@ def _run(
 
             recorder = Recorder(domain, taken, simulated_clock=pace is not None, receive=receive)
             try:
-                _wait(recorder, nodes.check, {topics.NEEDLE_COMMAND.name, topics.TIP_SETPOINT.name})
+                _wait(
+                    recorder,
+                    nodes.check,
+                    {topics.NEEDLE_COMMAND.name, topics.TIP_SETPOINT.name, topics.FAULT_REQUEST.name},
+                )
                 say("running" if pace is None else f"running at {pace:g} times the speed")
                 running = True
                 nodes.start("path_follower")
@@ -149,7 +163,7 @@ def _follow(
 ) -> None:
     """Record until the needle is at the end of its path, or the time is over."""
     points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
-    longest = PATIENCE * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE
+    longest = PATIENCE * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE + (duration or 0.0)
     began = time.monotonic()
     following = False
     while True:
@@ -161,7 +175,9 @@ def _follow(
         elapsed = (time.monotonic() - began) * pace
         done = float(values.get("progress", 0.0))
         progress(done if duration is None else min(1.0, elapsed / duration))
-        if said == "done" or (following and duration is not None and elapsed > duration):
+        if duration is not None and elapsed > duration + (0.0 if following else SPARE):
+            return
+        if duration is None and said == "done":
             recorder.spin(AFTERWARDS / pace)
             return
         if elapsed > longest:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.jobs.frames import Frame, FrameSource
+from magnetosuture_thread.jobs.frames import Frame, FrameSource, numbered
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -26,7 +26,7 @@ class TrackedFrame:
     """What one frame showed.
 
     Attributes:
-        name: the file's name, or topic and stamp.
+        name: the file's name, with its folders where another file has the same; or topic and stamp.
         track: what was seen.
         duration: time that looking took, decoding not included [s].
         stamp: when the frame was taken [s]; None where nothing tells.
@@ -40,16 +40,17 @@ class TrackedFrame:
     def to_json(self) -> dict[str, Any]:
         """Return what is written of it, in SI units; null for what has no value."""
         track, seen = self.track, not self.track.reason
+        thread = [_numbers(point) for point in track.centreline] if seen else None
         return {
             "file": self.name,
             "status": track.state.value,
             "reason": track.reason or None,
             "tail_m": _numbers(track.tail) if seen else None,
-            "heading_rad": math.atan2(track.heading[1], track.heading[0]) if seen else None,
+            "heading_rad": _number(math.atan2(track.heading[1], track.heading[0])) if seen else None,
             "tip_m": _numbers(track.tip) if seen else None,
-            "curvature_per_m": track.curvature if seen else None,
-            "thread_m": [_numbers(point) for point in track.centreline] if seen else None,
-            "confidence": track.confidence,
+            "curvature_per_m": _number(track.curvature) if seen else None,
+            "thread_m": None if thread is None or None in thread else thread,
+            "confidence": _number(track.confidence),
             "time_s": self.duration,
             "stamp_s": self.stamp,
         }
@@ -92,12 +93,15 @@ def track(
     tracker = VisionTracker(settings)
     warm_up()
     results = []
-    with OverlayWriter(overlay) if overlay is not None else nullcontext() as writer:
+    # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
+    files = numbered([Path(name.replace("/", "_")).stem for name in source.names], "{}_{}")
+    with OverlayWriter(overlay, source.rate()) if overlay is not None else nullcontext() as writer:
         for index, frame in enumerate(source):
             result = _look(tracker, frame, source.is_sequence)
             results.append(result)
             if writer is not None and frame.image is not None:
-                writer.write(_file_name(index, frame, source), _drawn(frame.image, result, settings))
+                name = f"frame_{index:06d}" if source.is_sequence else files[index]
+                writer.write(name, _drawn(frame.image, result, settings))
             progress((index + 1) / max(source.count, 1))
     return results
 
@@ -125,10 +129,9 @@ def _drawn(image: np.ndarray, result: TrackedFrame, settings: VisionTrackerSetti
     return drawn
 
 
-def _file_name(index: int, frame: Frame, source: FrameSource) -> str:
-    """Return a name for a frame's overlay; numbered where frames have no files, or files in many folders."""
-    return f"frame_{index:06d}" if source.is_sequence else Path(frame.name).stem
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
-def _numbers(values: np.ndarray) -> list[float]:
-    return [float(value) for value in values]
+def _numbers(values: np.ndarray) -> list[float] | None:
+    return [float(value) for value in values] if np.isfinite(values).all() else None

@@ -29,7 +29,7 @@ class CoilBridgeNode(Node):
         super().__init__("coil_bridge", automatically_declare_parameters_from_overrides=True, **options)
         settings = declare(self, CoilBridgeSettings)
         self._coils = settings.allocation()
-        self._needle = NeedleWatch(settings.needle(), settings.pose_timeout)
+        self._needle = NeedleWatch(settings.needle(), settings.pose_timeout, settings.reach)
         self._gate = CommandGate(settings.command_timeout, settings.max_speed, settings.zero_hold)
         self.driver = make_driver(settings)
         self._health = Health(self)

@@ -14,8 +14,9 @@ PERIOD = 1.0  # s
 class Health:
     """Publishes a node's state once a second, and at once when it changes.
 
-    A change is not published more often than `quiet` seconds apart, so that a flood of bad messages
-    does not become a flood of reports; the count of refusals goes on all the same.
+    Changes are not published more often than `quiet` seconds apart, so that a flood of bad messages
+    does not become a flood of reports: one that comes sooner waits, and the last of those that wait is
+    published. The count of refusals goes on all the same.
 
     Args:
         node: whose health it is.
@@ -33,6 +34,8 @@ class Health:
         self._values: dict[str, object] = {}
         self._sent = -1.0
         node.create_timer(PERIOD, self.publish, clock=self._clock)
+        self._late = node.create_timer(self.quiet, self._publish_late, clock=self._clock)
+        self._late.cancel()
 
     def ok(self, text: str, **values: object) -> None:
         """Say that all is well."""
@@ -72,5 +75,13 @@ class Health:
         changed = (level, text) != (self._level, self._text)
         self._level, self._text = level, text
         self._values.update(values)
-        if changed and self._clock.now().nanoseconds * 1e-9 - self._sent > self.quiet:
+        if not changed:
+            return
+        if self._clock.now().nanoseconds * 1e-9 - self._sent > self.quiet:
             self.publish()
+        elif self._late.is_canceled():
+            self._late.reset()
+
+    def _publish_late(self) -> None:
+        self._late.cancel()
+        self.publish()

@@ -30,6 +30,9 @@ class PathFollowerNode(Node):
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Ask for the velocity that takes the tip along its path."""
+        if not self._commands.get_subscription_count():
+            self._health.warn("nobody takes velocity commands")
+            return
         try:
             pose = messages.needle_pose(message)
             wish = self._follower.follow(pose.stamp, pose.tail, pose.heading)
@@ -37,8 +40,10 @@ class PathFollowerNode(Node):
             self._health.refuse(error)
             return
         self._commands.publish(messages.twist_message(self.get_clock().now().to_msg(), wish.velocity))
-        self._setpoints.publish(messages.placed(message.header.stamp, wish.tip, 0.0))
-        self._health.ok("done" if wish.progress >= 1.0 else "following", progress=round(wish.progress, 4))
+        if 0.0 < wish.progress < 1.0:
+            self._setpoints.publish(messages.placed(message.header.stamp, wish.tip, 0.0))
+        text = "done" if wish.progress >= 1.0 else "following" if wish.progress else "settling"
+        self._health.ok(text, progress=round(wish.progress, 4))
 
 
 def main(arguments: list[str] | None = None) -> int:

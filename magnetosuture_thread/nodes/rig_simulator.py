@@ -15,7 +15,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 
-from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 from magnetosuture_thread.nodes import camera_messages, messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
@@ -25,6 +25,7 @@ from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Frame, Rig
 from magnetosuture_thread.rig.settings import RigSettings
 
+EARLY = 0.1  # of a period, that a tick may come before its time
 CLOCK_PERIOD = 0.005  # s of simulated time between two messages on /clock
 EPOCH = 1_000_000_000  # ns; simulated time begins here, as time 0 means "not set" in ROS
 
@@ -35,14 +36,17 @@ class RigSimulatorNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__("rig_simulator", automatically_declare_parameters_from_overrides=True, **options)
         self._settings = settings = declare(self, RigSettings)
-        self._pace = settings.pace if settings.clock == "simulated" else 1.0
+        # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        self._pace = settings.pace if simulated else 1.0
         self.get_logger().info("loading the rig's kernels; the first start on a machine compiles them")
         self.rig = Rig(settings)
         self.rig.warm_up()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health = Health(self)
-        self._epoch = EPOCH if settings.clock == "simulated" else self.get_clock().now().nanoseconds
+        self._epoch = EPOCH if simulated else self.get_clock().now().nanoseconds
         self._started = self._steady.now().nanoseconds
+        self._phase: float | None = None
         self._last_index = -1
         self._frames = self._skipped = 0
         self._late: deque[tuple[float, int, Frame]] = deque()
@@ -56,26 +60,26 @@ class RigSimulatorNode(Node):
         self._thread = topics.TRUE_THREAD.publisher(self)
         topics.CURRENTS.subscribe(self, self.on_currents)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
-        if settings.clock == "simulated":
+        if simulated:
             self._clocks = topics.CLOCK.publisher(self)
             self.create_timer(CLOCK_PERIOD / self._pace, self.on_clock, clock=self._steady)
         self.create_timer(1.0 / (settings.frame_rate * self._pace), self.on_frame, clock=self._steady)
-        self._health.ok("waiting for the first current", simulated=True)
         self.get_logger().info("ready: everything here is simulated")
 
     def on_currents(self, message: CoilCurrents) -> None:
         """Set the coils' currents from now on."""
         try:
             self.rig.apply(np.asarray(message.current, dtype=float), self._elapsed())
-        except MagnetosutureError as error:
+        except InvalidInputError as error:
             self._health.refuse(error)
+        except MagnetosutureError as error:
+            self._fail(error)
 
     def on_fault(self, message: String) -> None:
-        """Take a fault that begins now: KIND DURATION."""
-        kind, _, duration = message.data.partition(" ")
+        """Take a fault that begins now."""
         try:
-            self.rig.faults.add(Fault.parse(f"{kind} {max(0.0, self.rig.running)!r} {duration}"))
-        except MagnetosutureError as error:
+            self.rig.faults.add(Fault.asked_for(message.data, max(0.0, self.rig.running)))
+        except InvalidInputError as error:
             self._health.refuse(error)
 
     def on_clock(self) -> None:
@@ -85,28 +89,37 @@ class RigSimulatorNode(Node):
     def on_frame(self) -> None:
         """Take the frame that is due; one that nobody had time for is left out."""
         elapsed = self._elapsed()
-        index = math.floor(elapsed * self._settings.frame_rate)
+        if self._phase is None:
+            self._phase = elapsed
+        index = math.floor((elapsed - self._phase) * self._settings.frame_rate + EARLY)
+        # No frame is stamped later than it is taken: the first tick may have been later than the others.
+        self._phase = min(self._phase, elapsed - index / self._settings.frame_rate)
         if index > self._last_index:
-            self._skipped += max(0, index - self._last_index - 1) if self._frames else 0
+            self._skipped += index - self._last_index - 1
             self._last_index = index
-            self._take(index / self._settings.frame_rate)
+            self._take(self._phase + index / self._settings.frame_rate)
         while self._late and self._late[0][0] <= elapsed:
             _, stamp, frame = self._late.popleft()
             self._publish(stamp, frame)
 
     def _take(self, elapsed: float) -> None:
-        frame = self.rig.look(elapsed)
-        stamp = self._stamp(elapsed)
+        try:
+            frame = self.rig.look(elapsed)
+        except MagnetosutureError as error:
+            self._fail(error)
+            return
+        stamp = self._stamp(frame.time)  # currents may have moved the rig on since the frame was due
         if frame.lateness:
             self._late.append((elapsed + frame.lateness, stamp, frame))
         else:
             self._publish(stamp, frame)
         self._frames += 1
-        running = self.rig.running
-        figures = {"frames taken": self._frames, "skipped": self._skipped, "running for": f"{max(0.0, running):.3f} s"}
-        faults = sorted(self.rig.faults.kinds(running))
-        text = "running" if running >= 0.0 else "waiting for the first current"
-        self._health.ok(f"{text}, with {', '.join(faults)}" if faults else text, **figures)
+        self._health.ok(self.rig.words, taken=self._frames, skipped=self._skipped)
+
+    def _fail(self, error: MagnetosutureError) -> None:
+        """Switch the coils off where the simulation does not find its next state, and say so."""
+        self.rig.switch_off()
+        self._health.error(str(error))
 
     def _publish(self, nanoseconds: int, frame: Frame) -> None:
         stamp = Time(nanoseconds=nanoseconds).to_msg()

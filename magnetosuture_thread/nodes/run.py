@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable, Sequence
 
@@ -34,6 +35,9 @@ def run(make: Callable[[], Node], arguments: Sequence[str] | None = None) -> int
         # The multi-threaded executor loses messages in the wheels of Jazzy.
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
+        gc.collect()
+        gc.freeze()
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

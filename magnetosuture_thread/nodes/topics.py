@@ -93,7 +93,7 @@ OUTPUTS = (
     DIAGNOSTICS,
 )
 
-SIMULATED = (TRUE_NEEDLE, TRUE_THREAD, TIP_SETPOINT)  # by the rig and who steers it
+SIMULATED = (TRUE_NEEDLE, TRUE_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
 
 
 def lossless(depth: int) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import time
 from typing import Any
 
 import numpy as np
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
@@ -18,11 +19,12 @@ from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.vision.images import decode_image, unpack_image
-from magnetosuture_thread.vision.look import State
+from magnetosuture_thread.vision.look import State, no_pose
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from magnetosuture_thread.vision.warm_up import warm_up
 
+SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
 CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
 
 
@@ -37,6 +39,10 @@ class VisionTrackerNode(Node):
         self._tracker = VisionTracker(settings)
         self._health = Health(self)
         self._frames = self._tracked = 0
+        self._words = "nothing seen"
+        # Simulated time may stand still; that the camera is silent must be noticed all the same.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._last_frame = self._arrival()
         self._poses = topics.NEEDLE_POSE.publisher(self)
         self._states = topics.TRACKER_STATE.publisher(self)
         self._path = messages.PathMaker()
@@ -45,6 +51,7 @@ class VisionTrackerNode(Node):
             topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
         else:
             topics.IMAGE.subscribe(self, self.on_image)
+        self.create_timer(0.5 * SILENCE, self.on_watch, clock=self._steady)
         self._health.warn("no camera frame yet")
         self.get_logger().info(f"ready: frames from {self.resolve_topic_name(CAMERA[settings.image_transport].name)}")
 
@@ -59,14 +66,31 @@ class VisionTrackerNode(Node):
             lambda: unpack_image(message.data, message.height, message.width, message.step, message.encoding),
         )
 
+    def on_watch(self) -> None:
+        """Say so when no frame has come for too long."""
+        waited = self._arrival() - self._last_frame
+        if self._frames and waited > SILENCE:
+            reason = f"no camera frame for {waited:.1f} s"
+            stamp = self.get_clock().now().to_msg()
+            self._states.publish(messages.tracker_state(stamp, no_pose(self._missing(), reason, None), 0.0))
+            self._health.warn(f"{reason}; before that {self._words}")
+
+    def _missing(self) -> State:
+        return State.LOST if self._tracked else State.SEARCHING
+
+    def _arrival(self) -> float:
+        return float(self._steady.now().nanoseconds * 1e-9)
+
     def _take(self, message: Image | CompressedImage, decode: Any) -> None:
         self._frames += 1
+        self._last_frame = self._arrival()
         stamp = message.header.stamp
         try:
             image = np.asarray(decode())
             began = time.perf_counter()
             track = self._tracker.track(image, messages.seconds(stamp))
         except InvalidInputError as error:
+            self._states.publish(messages.tracker_state(stamp, no_pose(self._missing(), str(error), None), 0.0))
             self._health.refuse(error, frames=self._frames, tracked=self._tracked)
             return
         taken = time.perf_counter() - began
@@ -80,9 +104,11 @@ class VisionTrackerNode(Node):
         self._states.publish(messages.tracker_state(stamp, track, taken))
         values = {"frames": self._frames, "tracked": self._tracked}
         if track.state is State.TRACKED:
-            self._health.ok("tracking", confidence=round(track.confidence, 3), **values)
+            self._words = "tracking"
+            self._health.ok(self._words, confidence=round(track.confidence, 3), **values)
         else:
-            self._health.warn(f"{track.state.value}: {track.reason}", **values)
+            self._words = f"{track.state.value}: {track.reason}"
+            self._health.warn(self._words, **values)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.dish_camera import Cover
 
@@ -25,6 +25,7 @@ LIFT_TIME = 0.6  # s in which the needle is carried over the rim
 SKIN_BGR = (120.0, 145.0, 195.0)
 STEEL_BGR = (115.0, 112.0, 108.0)
 GLARE_BGR = (265.0, 265.0, 265.0)
+MOST_FAULTS = 100
 HAND_WIDTH, TOOL_WIDTH = 0.28, 0.07  # of the dish's diameter
 GLARE_SIZE = (0.3, 0.55)  # least and greatest radius, of the needle's length
 
@@ -63,6 +64,23 @@ class Fault:
             raise ConfigurationError("rig_simulator.faults", repr(text), expectation)
         return cls(words[0], start, duration)
 
+    @classmethod
+    def asked_for(cls, text: str, time: float) -> Fault:
+        """Read `KIND DURATION` as a fault that begins at a time [s].
+
+        >>> Fault.asked_for("glare 0.5", 7.0)
+        Fault(kind='glare', start=7.0, duration=0.5)
+
+        Raises:
+            InvalidInputError: it is nothing of the kind.
+        """
+        kind, _, duration = text.partition(" ")
+        try:
+            return cls.parse(f"{kind} {time!r} {duration}")
+        except ConfigurationError:
+            expectation = f"KIND DURATION, with a kind of {', '.join(KINDS)}"
+            raise InvalidInputError("rig/fault", repr(text), expectation) from None
+
     def holds(self, time: float) -> bool:
         """Return whether the fault is in force at a time [s]."""
         return self.start <= time < self.start + self.duration
@@ -85,8 +103,8 @@ class FaultSchedule:
         self._seed = seed
 
     def add(self, fault: Fault) -> None:
-        """Take one more fault."""
-        self.faults += (fault,)
+        """Take one more fault, and forget those that are over."""
+        self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-MOST_FAULTS:]
 
     def kinds(self, time: float) -> frozenset[str]:
         """Return the kinds in force at a time [s]."""
@@ -106,14 +124,14 @@ class FaultSchedule:
         """Return how long a frame is held back [s]."""
         return LATENESS if LATE in self.kinds(time) else 0.0
 
-    def lifted(self, time: float, tail: Points) -> NDArray[np.float64]:
+    def lifted(self, time: float) -> NDArray[np.float64]:
         """Return by how much the needle has been carried out of the dish, shape (2,) [m]."""
         for fault in self.faults:
             if fault.kind == NEEDLE_OUT and fault.holds(time):
                 up = min(1.0, (time - fault.start) / LIFT_TIME)
                 down = min(1.0, (fault.start + fault.duration - time) / LIFT_TIME)
-                outwards = tail / max(float(np.linalg.norm(tail)), 1e-9)
-                return np.asarray(min(up, down) * 1.2 * self._dish * outwards)
+                angle = self._random(fault).uniform(0.0, 2.0 * np.pi)
+                return np.asarray(min(up, down) * 1.2 * self._dish * np.array([np.cos(angle), np.sin(angle)]))
         return np.zeros(2)
 
     def covers(self, time: float, tail: Points, tip: Points) -> tuple[Cover, ...]:
@@ -127,10 +145,10 @@ class FaultSchedule:
             tip: shape (2,) [m].
         """
         result = []
-        for index, fault in enumerate(self.faults):
+        for fault in self.faults:
             if not fault.holds(time) or fault.kind not in (GLARE, HAND, TOOL):
                 continue
-            random = np.random.default_rng((self._seed, index))
+            random = self._random(fault)
             place = tail + random.uniform(0.0, 1.0) * (tip - tail)
             angle = random.uniform(0.0, 2.0 * np.pi)
             sway = 0.03 * self._dish * np.sin(5.0 * (time - fault.start) + angle)
@@ -144,6 +162,10 @@ class FaultSchedule:
                 outline = _finger(place, angle, width, sway, 3.0 * self._dish)
                 result.append(Cover(outline, bgr, blur_px=3.0 if fault.kind == HAND else 1.5))
         return tuple(result)
+
+    def _random(self, fault: Fault) -> np.random.Generator:
+        """Return chances that are a fault's own, whatever others there are."""
+        return np.random.default_rng((self._seed, KINDS.index(fault.kind), round(1e6 * fault.start)))
 
 
 def _ellipse(centre: Points, a: float, b: float, angle: float) -> Points:

@@ -89,6 +89,8 @@ class Rig:
             expected = f"{len(self.currents)} finite numbers [A]"
             raise InvalidInputError("coils/currents.current", currents.tolist(), expected)
         self.advance(time)
+        limit = self._settings.coil_max_current
+        currents = np.clip(currents, -limit, limit)
         if np.any(currents):
             self.began = min(self.began, self.time)
         stuck = self.currents[0]
@@ -100,10 +102,16 @@ class Rig:
     def advance(self, time: float) -> None:
         """Let needle and thread move up to a time since the start [s]; nothing happens for one that is past."""
         off_at = max(self.time, self._applied_at + self._settings.coil_timeout)
-        if off_at < time and COIL_STUCK not in self.faults.kinds(off_at - self.began):
+        if off_at < time:
             self._move(off_at)
-            self.currents = np.zeros_like(self.currents)
+            self.switch_off()
         self._move(time)
+
+    def switch_off(self) -> None:
+        """Set all currents to zero, but that of a stuck coil."""
+        stuck = self.currents[0] if COIL_STUCK in self.faults.kinds(self.running) else 0.0
+        self.currents = np.zeros_like(self.currents)
+        self.currents[0] = stuck
 
     def _move(self, time: float) -> None:
         if time > self.time:
@@ -115,11 +123,18 @@ class Rig:
         """Time since the first current that was not zero, -inf before [s]."""
         return self.time - self.began
 
+    @property
+    def words(self) -> str:
+        """What goes on, for a person."""
+        faults = ", ".join(sorted(self.faults.kinds(self.running)))
+        text = "running" if self.running >= 0.0 else "waiting for the first current"
+        return f"{text}, with {faults}" if faults else text
+
     def look(self, time: float) -> Frame:
         """Take a frame at a time since the start [s]."""
         self.advance(time)
         faults, dynamics, running = self.faults, self._dynamics, self.running
-        away = faults.lifted(running, dynamics.tail)
+        away = faults.lifted(running)
         tail, thread = dynamics.tail + away, dynamics.thread + away
         image = None
         if not faults.drops(running, float(self._random.uniform())):

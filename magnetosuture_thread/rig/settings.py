@@ -6,14 +6,18 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.arc import needle_axis, require_needle
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene, needle_axis
+from magnetosuture_thread.rig.camera.scene import Lighting, Scene
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
@@ -33,12 +37,13 @@ class RigSettings(Configuration):
 
     GROUP: ClassVar[str] = "rig_simulator"
 
-    clock: str = quantity(
-        "real", "whose time the rig runs in; simulated publishes /clock", choices=("real", "simulated")
+    pace: float = quantity(
+        1.0, "how much faster than real time /clock runs, where use_sim_time is set", minimum=0.5, maximum=5.0
     )
-    pace: float = quantity(1.0, "how much faster than real time a simulated clock runs", minimum=0.05, maximum=20.0)
     seed: int = quantity(0, "of dust, sensor noise and faults", minimum=0, maximum=2**31 - 1)
-    faults: tuple[str, ...] = quantity((), "what goes wrong: KIND START DURATION each, in seconds since the start")
+    faults: tuple[str, ...] = quantity(
+        (), "what goes wrong: KIND START DURATION each, in seconds since the first current"
+    )
 
     dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
     viscosity: float = quantity(1.0, "of the liquid around the needle", unit="Pa s", minimum=1e-4, maximum=100.0)
@@ -63,6 +68,9 @@ class RigSettings(Configuration):
     coil_radius: float = quantity(0.025, "mean radius of the windings", unit="m", minimum=0.002, maximum=0.5)
     coil_length: float = quantity(0.03, "of the winding along its axis", unit="m", minimum=0.0, maximum=0.5)
     coil_turns: float = quantity(480.0, "of a coil", minimum=1.0, maximum=1e5)
+    coil_max_current: float = quantity(
+        30.0, "that the power stage gives, in either direction", unit="A", minimum=0.01, maximum=1000.0
+    )
     coil_timeout: float = quantity(
         0.25, "without new currents for this long the power stage switches off", unit="s", minimum=0.01, maximum=10.0
     )
@@ -76,7 +84,7 @@ class RigSettings(Configuration):
         1.0e6, "of the needle, NdFeB, along its body", unit="A/m", minimum=1e3, maximum=2e6
     )
     needle_start: tuple[float, ...] = quantity(
-        (0.0, 0.0, 0.0),
+        (0.003, -0.004, 0.0),
         "x [m], y [m] of the tail and heading [rad] at the start",
         minimum=-7.0,
         maximum=7.0,
@@ -110,20 +118,34 @@ class RigSettings(Configuration):
         """Refuse what does not fit together."""
         if len(self.needle_start) != 3:
             raise ConfigurationError(f"{self.GROUP}.needle_start", list(self.needle_start), "x, y and heading")
-        x, y, heading = self.needle_start
-        ends, _ = needle_axis(
-            np.array([x, y]), heading, self.needle_length, self.needle_curvature, np.array([0.0, 1.0])
-        )
-        if np.linalg.norm(ends, axis=1).max() >= 0.5 * self.dish_diameter:
-            raise ConfigurationError(f"{self.GROUP}.needle_start", list(self.needle_start), "a needle in the dish")
         if sum(self.polygon_sizes) * 2 != len(self.polygon_obstacles):
             raise ConfigurationError(
                 f"{self.GROUP}.polygon_sizes", list(self.polygon_sizes), "corners of all polygon_obstacles in sum"
             )
         if len(self.coil_angles) < 1:
             raise ConfigurationError(f"{self.GROUP}.coil_angles", [], "at least one coil's angle [rad]")
+        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        self._check_room()
         for fault in self.faults:
             Fault.parse(fault)
+
+    def _check_room(self) -> None:
+        """Refuse a start at which needle or thread is in the wall, beyond it, or in an obstacle."""
+        at = np.linspace(0.0, 1.0, 100)
+        x, y, heading = self.needle_start
+        needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
+        things = {"a needle": needle, "a thread": self._thread_at_start(at)}
+        for name, points in things.items():
+            inside = np.linalg.norm(points, axis=1).max() < 0.5 * self.dish_diameter
+            if not inside or any(_touches(points, obstacle) for obstacle in self.obstacles()):
+                start = f"{list(self.needle_start)}, thread curvature {self.thread_start_curvature:g}"
+                raise ConfigurationError(f"{self.GROUP}.needle_start", start, f"{name} in the dish, off the obstacles")
+
+    def _thread_at_start(self, at: NDArray[np.float64]) -> Points:
+        """Return points along the thread as it lies at the start, `at` from 0 to 1, shape (m, 2) [m]."""
+        x, y, heading = self.needle_start
+        tail = np.array([x, y])
+        return needle_axis(tail, heading + math.pi, self.thread_length, self.thread_start_curvature, at)[0]
 
     def obstacles(self) -> tuple[Disc | Polygon, ...]:
         """Return discs, then polygons."""
@@ -173,8 +195,7 @@ class RigSettings(Configuration):
         """Return needle and thread at their start, in the field of the coils."""
         x, y, heading = self.needle_start
         tail = np.array([x, y])
-        at = np.linspace(0.0, 1.0, self.thread_segments + 1)
-        behind, _ = needle_axis(tail, heading + math.pi, self.thread_length, self.thread_start_curvature, at)
+        behind = self._thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1))
         obstacles = self.obstacles()
         return RigDynamics(
             needle=NeedleBody(
@@ -205,3 +226,11 @@ class RigSettings(Configuration):
             thread_points=behind,
             largest_step=LARGEST_STEP,
         )
+
+
+def _touches(points: Points, obstacle: Disc | Polygon) -> bool:
+    """Return whether a point of shape (m, 2) is in an obstacle."""
+    if isinstance(obstacle, Disc):
+        return bool((np.linalg.norm(points - obstacle.centre, axis=1) < obstacle.radius).any())
+    corners = obstacle.rings[0].astype(np.float32)
+    return any(cv2.pointPolygonTest(corners, (x, y), False) >= 0.0 for x, y in points.tolist())

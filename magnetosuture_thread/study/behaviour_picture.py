@@ -23,7 +23,7 @@ from magnetosuture_thread.study.replayed import Instant
 
 SHOWN = 4  # instants of each run
 BORDER = 0.06  # of the dish's diameter, around it in a picture
-ROW = 2.95  # height of a run [inch]
+ROW = 2.9  # height of a run [inch]
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def draw_behaviour(path: Path, runs: Sequence[Run]) -> None:
         path: of the picture.
         runs: the tests.
     """
-    height = ROW * len(runs) + 0.85
+    height = ROW * len(runs) + 0.72
     figure = Figure(figsize=(15.0, height), dpi=100, facecolor="white")
     figure.text(0.012, 1.0 - 0.32 / height, "Thread behaviour in closed loop, simulated", fontsize=13, color=INK)
     figure.text(
@@ -72,16 +72,13 @@ def draw_behaviour(path: Path, runs: Sequence[Run]) -> None:
         fontsize=9.5,
         color=FAINT,
     )
-    top = max(
-        float(np.nanmax([i.error_truth for i in run.instants] + [i.error_seen for i in run.instants])) for run in runs
-    )
     for index, run in enumerate(runs):
         bottom = (ROW * (len(runs) - 1 - index) + 0.12) / height
-        _draw_row(figure, run, bottom, (ROW - 0.5) / height, 1.25 * top)
+        _draw_row(figure, run, bottom, (ROW - 0.42) / height)
     figure.savefig(path)
 
 
-def _draw_row(figure: Figure, run: Run, bottom: float, height: float, top: float) -> None:
+def _draw_row(figure: Figure, run: Run, bottom: float, height: float) -> None:
     figure.text(0.012, bottom + height + 0.012, run.name, fontsize=10.5, color=INK)
     began = run.instants[0].stamp
     for column, instant in enumerate(chosen_instants(run.instants)):
@@ -95,7 +92,7 @@ def _draw_row(figure: Figure, run: Run, bottom: float, height: float, top: float
     ):
         mean = float(np.nanmean(errors))
         plot.plot(times, errors, color=colour, linewidth=1.2, label=f"{label}, mean {mean:.2f}")
-    plot.set_ylim(0.0, top)
+    plot.set_ylim(0.0, 1.35 * plot.get_ylim()[1])  # room for the legend
     plot.set_xlim(times[0], times[-1])
     plot.set_title("prediction error [% of the length]", fontsize=9.5, color=INK, loc="left")
     plot.set_xlabel("time [s]", fontsize=8.5, color=INK, labelpad=1)

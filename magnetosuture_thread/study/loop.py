@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     CURRENTS,
@@ -33,6 +34,7 @@ class LoopSummary:
         setup: the scenario's name.
         duration: from the first wish of the path follower to the last; all figures are of this time [s].
         frames: camera frames, lost ones too.
+        skipped: frames that the rig had no time for.
         tracked: frames with a pose.
         lost: frames that the tracker looked at without giving a pose.
         wrong: poses farther from the truth than 0.3 mm or 5 degrees.
@@ -54,6 +56,7 @@ class LoopSummary:
     setup: str
     duration: float
     frames: int
+    skipped: int
     tracked: int
     lost: int
     wrong: int
@@ -72,8 +75,8 @@ class LoopSummary:
     stretch: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures as plain values; units as above."""
-        return asdict(self)
+        """Return the figures as plain values, None where there is none; units as above."""
+        return {key: _plain(value) for key, value in asdict(self).items()}
 
 
 class LoopCollector:
@@ -142,6 +145,7 @@ class LoopCollector:
             setup=setup,
             duration=(last - first) * 1e-9,
             frames=len(frames),
+            skipped=_missing(sorted(frames)),
             tracked=len(both),
             lost=sum(state != TRACKED for state, _ in states),
             wrong=int(np.sum((tail > WRONG_TAIL) | (heading > WRONG_HEADING))),
@@ -163,9 +167,8 @@ class LoopCollector:
     def _tip(self, stamp: int) -> Points:
         """Return where the needle's true tip was."""
         x, y, heading = self._truth[stamp]
-        angle = heading + 0.5 * self._curvature * self._needle
-        chord = self._needle * np.sinc(0.5 * self._curvature * self._needle / np.pi)
-        return np.array([x + chord * np.cos(angle), y + chord * np.sin(angle)])
+        points, _ = needle_axis(np.array([x, y]), heading, self._needle, self._curvature, np.ones(1))
+        return np.asarray(points[0])
 
     def _latency(self, name: str) -> Spread | None:
         return Spread.of(
@@ -179,5 +182,16 @@ def _planar(pose: Any) -> NDArray[np.float64]:
     return np.array([pose.position.x, pose.position.y, 2.0 * np.arctan2(turned.z, turned.w)])
 
 
+def _missing(stamps: list[int]) -> int:
+    """Return how many frames are missing in a sequence that should be regular."""
+    steps = np.diff(stamps)
+    return int(np.sum(np.round(steps / np.median(steps)) - 1.0)) if len(steps) else 0
+
+
+def _plain(value: Any) -> Any:
+    """Return None for a number that is none, anything else as it is."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

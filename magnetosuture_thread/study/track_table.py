@@ -25,16 +25,16 @@ def track_table(rows: Sequence[dict[str, Any]]) -> Table:
         if row["reason"]:
             table.add_row(row["file"], f"{row['status']}: {row['reason']}", "", "", "", "", time)
             continue
-        x, y = (1e3 * value for value in row["tail_m"])
-        steps = np.diff(np.array(row["thread_m"]).reshape(-1, 2), axis=0)
+        steps = np.diff(np.array(row["thread_m"] or []).reshape(-1, 2), axis=0)
         length = 1e3 * float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+        heading, confidence = row["heading_rad"], row["confidence"]
         table.add_row(
             row["file"],
             row["status"],
-            f"{x:.2f}, {y:.2f}",
-            f"{math.degrees(row['heading_rad']):.1f}",
-            f"{length:.1f}",
-            f"{row['confidence']:.2f}",
+            ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
+            "" if heading is None else f"{math.degrees(heading):.1f}",
+            "" if row["thread_m"] is None else f"{length:.1f}",
+            "" if confidence is None else f"{confidence:.2f}",
             time,
         )
     if len(rows) > MOST_ROWS:

@@ -16,7 +16,7 @@ from magnetosuture_thread.vision.images import check_image, measured_channel
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 LARGEST_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, the camera is not overhead
-LARGEST_SCATTER_PX = 1.5  # of the dish from frame to frame
+LARGEST_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
 CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))  # of a square, clockwise as seen from the top left
 SHARE_WITH_DISH = 0.5  # of the frames must show the dish
 
@@ -67,9 +67,7 @@ def calibrate_by_dish(images: Sequence[np.ndarray], dish_diameter: float) -> Cal
     circles = np.array([(*view.centre_px, 0.5 * dish_diameter / view.metres_per_pixel) for view in views])
     u, v, radius = np.median(circles, axis=0) if len(circles) > 2 else circles.mean(axis=0)
     scatter = float(np.sqrt(np.mean(np.sum((circles - (u, v, radius)) ** 2, axis=1))))
-    if scatter > LARGEST_SCATTER_PX:
-        expected = f"a camera that stands still: at most {LARGEST_SCATTER_PX} px"
-        raise InvalidInputError("frames", f"dishes that differ by {scatter:.2f} px", expected)
+    _check_scatter("dishes", scatter)
     return Calibration(
         DishView((float(u), float(v)), 0.5 * dish_diameter / radius), len(views), 0.0, scatter, dish_diameter
     )
@@ -93,11 +91,11 @@ def calibrate_by_markers(
         side: of a marker [m].
 
     Raises:
-        InvalidInputError: no images, images of different sizes, a marker that no image shows, or corners
-            that no overhead camera sees so.
+        InvalidInputError: no images, images of different sizes, a marker that no image shows, markers that
+            differ from frame to frame, corners that no overhead camera sees so, or OpenCV is older than 4.7.
     """
     grays = _grays(images)
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), _parameters())
+    detector = _detector()
     seen: dict[int, list[np.ndarray]] = {index: [] for index in range(4)}
     for gray in grays:
         corners, ids, _ = detector.detectMarkers(gray)
@@ -108,20 +106,34 @@ def calibrate_by_markers(
     if missing:
         raise InvalidInputError("frames", f"no marker {', '.join(missing)}", "ArUco markers 4x4_50 with ids 0 to 3")
     pixels = np.vstack([np.mean(seen[index], axis=0) for index in range(4)])
-    spread = [np.sum((np.array(found) - np.mean(found, axis=0)) ** 2, axis=2).mean() for found in seen.values()]
+    # Of the markers that several frames show: one seen once says nothing of whether the camera stood still.
+    apart = [np.array(found) - np.mean(found, axis=0) for found in seen.values() if len(found) > 1]
+    scatter = float(np.sqrt(np.mean(np.sum(np.vstack(apart) ** 2, axis=2)))) if apart else 0.0
+    _check_scatter("markers", scatter)
     square = np.array(CORNERS, dtype=float)
     points = np.vstack([0.5 * spacing * centre + 0.5 * side * square for centre in square])
     view, residual = _similarity(points, pixels)
     if residual > LARGEST_RESIDUAL_PX:
         expected = f"at most {LARGEST_RESIDUAL_PX} px, from a camera straight above markers at these distances"
         raise InvalidInputError("frames", f"marker corners off by {residual:.2f} px", expected)
-    return Calibration(view, len(grays), residual, float(np.sqrt(np.mean(spread))), dish_diameter)
+    return Calibration(view, len(grays), residual, scatter, dish_diameter)
 
 
-def _parameters() -> cv2.aruco.DetectorParameters:
+def _check_scatter(what: str, scatter_px: float) -> None:
+    """Refuse frames between which the camera moved."""
+    if scatter_px > LARGEST_SCATTER_PX:
+        expected = f"a camera that stands still: at most {LARGEST_SCATTER_PX} px"
+        raise InvalidInputError("frames", f"{what} that differ by {scatter_px:.2f} px", expected)
+
+
+def _detector() -> cv2.aruco.ArucoDetector:
+    if not hasattr(cv2, "aruco") or not hasattr(cv2.aruco, "ArucoDetector"):
+        raise InvalidInputError(
+            "markers", f"OpenCV {cv2.__version__}", "OpenCV 4.7 or newer, which is needed for markers"
+        )
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return parameters
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
 
 
 def _similarity(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, float]:

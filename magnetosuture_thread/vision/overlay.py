@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.vision.look import State, Track
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
@@ -41,7 +41,9 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
             line = view.to_pixels(track.centreline)
             _line(drawn, line, THREAD, unit)
             _circle(drawn, line[-1], 2.5 * unit, THREAD, -1)
-        axis = view.to_pixels(_needle_axis(track, needle_length))
+        heading = float(np.arctan2(track.heading[1], track.heading[0]))
+        points, _ = needle_axis(track.tail, heading, needle_length, track.curvature, np.linspace(0.0, 1.0, 25))
+        axis = view.to_pixels(points)
         _line(drawn, axis, NEEDLE, unit)
         _circle(drawn, axis[0], 4.0 * unit, NEEDLE, unit)
         _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, TIP, -1)
@@ -110,16 +112,6 @@ class OverlayWriter:
         """End the video."""
         if self._video is not None:
             self._video.release()
-
-
-def _needle_axis(track: Track, length: float) -> Points:
-    """Return the needle's axis from tail to tip, shape (25, 2) [m]."""
-    s = np.linspace(0.0, length, 25)
-    half = 0.5 * track.curvature * s
-    chord = s * np.sinc(half / np.pi)
-    cosine, sine = np.cos(half), np.sin(half)
-    x, y = track.heading
-    return np.asarray(track.tail + chord[:, None] * np.column_stack([cosine * x - sine * y, cosine * y + sine * x]))
 
 
 def _plate(image: np.ndarray, track: Track, title: str, unit: int) -> None:

@@ -191,13 +191,18 @@ class VisionTracker:
         return math.dist(pose.tail, tail) < reach and turn < most
 
     def _take(self, pose: _Pose, before: _Pose | None) -> None:
-        """Keep a pose, with the velocity that the one before gives it."""
+        """Keep a pose, with the velocity that the one before gives it, no greater than a needle's can be.
+
+        Between frames a moment apart, noise alone looks like any speed.
+        """
         velocity, turn_rate = np.zeros(2), 0.0
         if before is not None:
             after = pose.time - before.time
             velocity = before.velocity + MEMORY * ((pose.tail - before.tail) / after - before.velocity)
             turned = (pose.angle - before.angle + math.pi) % (2.0 * math.pi) - math.pi
             turn_rate = before.turn_rate + MEMORY * (turned / after - before.turn_rate)
+            velocity *= min(1.0, self._settings.max_needle_speed / max(float(np.hypot(*velocity)), 1e-12))
+            turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
         self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate)
         self._anew = []
 

@@ -66,7 +66,7 @@ def test_speed_is_limited_and_direction_kept():
         ((0.01, 0.0), 9.8, "at most 0.1 s"),
         ((0.01, 0.0), 0.0, "at most 0.1 s"),
         ((0.01, 0.0), 10.2, "at most 0.05 s"),
-        ((0.01, 0.0), 9.96, "no earlier than the last command's"),
+        ((0.01, 0.0), 9.96, "no earlier than the last one's"),
     ],
 )
 def test_a_bad_command_is_refused_and_does_not_keep_the_needle_moving(

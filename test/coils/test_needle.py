@@ -15,13 +15,13 @@ EAST = np.array([1.0, 0.0])
 
 def watch() -> NeedleWatch:
     """Return a watch that has seen a needle at time 1."""
-    made = NeedleWatch(NEEDLE, 0.2)
+    made = NeedleWatch(NEEDLE, 0.2, 0.045)
     made.see(np.zeros(2), EAST, 1.0, 1.0, 50.0)
     return made
 
 
 def test_without_a_pose_there_is_none():
-    assert NeedleWatch(NEEDLE, 0.2).pose(1.0, 50.0) is None
+    assert NeedleWatch(NEEDLE, 0.2, 0.045).pose(1.0, 50.0) is None
 
 
 def test_a_pose_ends_by_the_monotonic_clock_whatever_the_other_says():
@@ -62,7 +62,11 @@ def test_a_pose_is_not_carried_far():
         (np.array([np.nan, 0.0]), EAST, 1.0, "finite numbers"),
         (np.zeros(2), np.array([np.inf, 0.0]), 1.0, "finite numbers"),
         (np.zeros(2), EAST, 0.5, "0.500 s old"),
-        (np.zeros(2), EAST, 1.5, "-0.500 s old"),
+        (np.zeros(2), EAST, 1.5, "0.500 s ahead"),
+        (np.zeros(2), EAST, 0.95, "no earlier than the last one's"),
+        (np.array([1e200, 0.0]), EAST, 1.0, "within 0.045 m"),
+        (np.array([0.05, 0.025]), EAST, 1.0, "within 0.045 m"),
+        (np.array([0.043, 0.0]), EAST, 1.0, "within 0.045 m"),
     ],
 )
 def test_a_bad_pose_is_refused_and_the_last_stays(tail, heading, stamp, words):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,9 +12,17 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.jobs import frames
 from magnetosuture_thread.jobs.calibrate_camera import calibrate_camera
+from magnetosuture_thread.jobs.frames import FrameSource
+from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.track import settings_with, track
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.reference import ReferenceTrajectory
+from magnetosuture_thread.study.track_table import track_table
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
@@ -31,17 +40,25 @@ def error_of(capsys: pytest.CaptureFixture[str]) -> str:
     return text
 
 
+def rate_of(video: Path) -> float:
+    """Return a video's frames a second."""
+    capture = cv2.VideoCapture(str(video))
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    capture.release()
+    return float(rate)
+
+
 def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    frames = tmp_path / "frames"
-    frames.mkdir()
+    folder = tmp_path / "frames"
+    folder.mkdir()
     for index in (0, 3):
-        shutil.copy(SAMPLES / f"frame_0{index}.png", frames)
-    (frames / "frame_01.png").write_bytes(b"no picture")
-    (frames / "notes.txt").write_text("not a frame")
-    cv2.imwrite(str(frames / "frame_09.jpg"), np.full((480, 640, 3), 90, np.uint8))
+        shutil.copy(SAMPLES / f"frame_0{index}.png", folder)
+    (folder / "frame_01.png").write_bytes(b"no picture")
+    (folder / "notes.txt").write_text("not a frame")
+    cv2.imwrite(str(folder / "frame_09.jpg"), np.full((480, 640, 3), 90, np.uint8))
     file, overlay = tmp_path / "seen.json", tmp_path / "drawn"
     given = ["--metres-per-pixel", "8e-5", "--centre", "322", "238", "--overlay", str(overlay)]
-    assert cli.main(["track", str(frames), "--json", str(file), *given]) == 0
+    assert cli.main(["track", str(folder), "--json", str(file), *given]) == 0
     rows = json.loads(file.read_text())
     assert [row["file"] for row in rows] == ["frame_00.png", "frame_01.png", "frame_03.png", "frame_09.jpg"]
     assert [row["status"] for row in rows] == ["tracked", "lost", "tracked", "lost"]
@@ -64,6 +81,21 @@ def test_single_files_are_taken_in_their_order():
     assert all(frame.track.state is State.TRACKED for frame in seen)
 
 
+def test_files_of_one_name_are_told_apart_and_each_has_its_overlay(tmp_path: Path):
+    image = cv2.imread(str(SAMPLES / "frame_00.png"))
+    assert image is not None
+    given = ["a/frame.png", "b/frame.png", "f.png", "f.jpg", "f.png", "c/f_2.png", "a/x/g.png", "b/x/g.png"]
+    files = [tmp_path / name for name in given]
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(file), image)
+    seen = track(files, VisionTrackerSettings(), overlay=tmp_path / "drawn")
+    names = ["a/frame.png", "b/frame.png", "f.png", "f.jpg", "f.png (2)", "f_2.png", "a/x/g.png", "b/x/g.png"]
+    assert [frame.to_json()["file"] for frame in seen] == names
+    drawn = ["a_frame", "a_x_g", "b_frame", "b_x_g", "f", "f_2", "f_3", "f_4"]
+    assert sorted(file.stem for file in (tmp_path / "drawn").iterdir()) == drawn
+
+
 def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
     video = tmp_path / "seen.mp4"
     seen = track([short_bag], VisionTrackerSettings(), overlay=video)
@@ -73,6 +105,57 @@ def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
     assert row["stamp_s"] == pytest.approx(1.0 + 5 / 30.0, abs=1e-6)
     np.testing.assert_allclose(row["tail_m"], [0.003 + 0.003 * 5 / 30.0, 0.002], atol=8e-5)
     assert video.stat().st_size > 1000
+    assert rate_of(video) == pytest.approx(30.0, abs=0.01)
+
+
+def test_an_overlay_video_has_the_rate_of_the_bag(tmp_path: Path, straight_pull: ReferenceTrajectory):
+    record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "slow", duration=0.8, rate=7.0)
+    track([tmp_path / "slow"], VisionTrackerSettings(), overlay=tmp_path / "seen.mp4")
+    assert rate_of(tmp_path / "seen.mp4") == pytest.approx(7.0, abs=0.01)
+    track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), overlay=tmp_path / "pictures.mp4")
+    assert rate_of(tmp_path / "pictures.mp4") == pytest.approx(30.0)
+
+
+def test_a_bag_whose_stamps_stand_still_has_the_rate_of_pictures(short_bag: Path, monkeypatch: pytest.MonkeyPatch):
+    source = FrameSource([short_bag])
+    monkeypatch.setattr(frames, "_stamp", lambda message: 5.0)
+    assert source.rate() == 30.0
+
+
+def test_of_broken_frames_in_a_bag_the_json_says_null(
+    short_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    topic = "/camera/image_raw/compressed"
+    with BagWriter(tmp_path / "broken") as bag:
+        bag.add_topic(topic, "sensor_msgs/msg/CompressedImage")
+        for index, message in enumerate(Bag(short_bag).records({topic})):
+            bag.write(topic, message.time, b"\0\1\0\0" if index == 4 else message.data[: 900 if index == 6 else None])
+    file = tmp_path / "seen.json"
+    assert cli.main(["track", str(tmp_path / "broken"), "--json", str(file)]) == 0
+    rows = json.loads(file.read_text(), parse_constant=lambda word: pytest.fail(f"{word} in the JSON"))
+    assert [row["status"] for row in rows[3:8]] == ["tracked", "lost", "tracked", "lost", "tracked"]
+    for row in (rows[4], rows[6]):
+        assert row["tail_m"] is row["tip_m"] is row["heading_rad"] is row["curvature_per_m"] is row["thread_m"] is None
+    assert "30 frames" in capsys.readouterr().out
+
+
+def test_what_is_no_number_is_null_and_the_table_leaves_it_empty():
+    (frame,) = track([SAMPLES / "frame_00.png"], VisionTrackerSettings())
+    nothing = np.full(2, np.nan)
+    broken = replace(
+        frame.track,
+        tail=nothing,
+        tip=nothing,
+        heading=nothing,
+        curvature=np.nan,
+        confidence=np.inf,
+        centreline=np.vstack([frame.track.centreline, nothing]),
+    )
+    row = replace(frame, track=broken).to_json()
+    json.dumps(row, allow_nan=False)
+    for key in ("tail_m", "tip_m", "heading_rad", "curvature_per_m", "thread_m", "confidence"):
+        assert row[key] is None
+    assert track_table([row]).row_count == 1
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,18 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
     assert any(applied[0] == first.current[0] for applied in list(bridge.driver.applied))
 
 
+@pytest.mark.parametrize("tail", [(1e200, 0.0), (0.05, 0.025), (-1e-320, 1e308)])
+def test_a_pose_that_cannot_be_does_not_end_the_bridge(graph, tail):
+    bridge = graph.add(CoilBridgeNode)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, messages.pose_message(graph.now(), np.array(tail), EAST))
+    graph.publish(topics.NEEDLE_COMMAND, command(graph))
+    graph.wait(lambda: any("of the dish's centre" in str(d.status[0].values) for d in diagnostics), "a refusal")
+    assert not any(applied.any() for applied in list(bridge.driver.applied))
+    drive(graph)
+    graph.wait(lambda: any(applied.any() for applied in list(bridge.driver.applied)), "a good pose")
+
+
 def test_between_commands_the_currents_follow_the_needle(graph):
     """The bridge lays the field along the needle as it turns, at its own rate."""
     graph.add(CoilBridgeNode, command_timeout=0.3, pose_timeout=0.3)

@@ -18,11 +18,11 @@ def pose(seconds: float, x: float):
 
 
 def test_a_pose_is_answered_by_a_command_made_now_and_by_the_wish_at_the_pose(graph):
-    graph.add(PathFollowerNode, waypoints=[0.02, 0.0])
+    graph.add(PathFollowerNode, settle=0.0, waypoints=[0.02, 0.0])
     commands, wishes = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.TIP_SETPOINT)
     for index in range(30):
         graph.publish(topics.NEEDLE_POSE, pose(5.0 + index / 60, 0.0))
-        graph.wait(lambda n=index: len(commands) > n and len(wishes) > n, "the answer")
+        graph.wait(lambda n=index: len(commands) > n and len(wishes) > n - 1, "the answer")
     assert commands[-1].header.frame_id == "dish"
     assert commands[-1].twist.linear.x > 0.001
     assert abs(commands[-1].twist.linear.y) < 1e-6
@@ -32,7 +32,7 @@ def test_a_pose_is_answered_by_a_command_made_now_and_by_the_wish_at_the_pose(gr
 
 
 def test_without_a_pose_it_is_silent_and_a_bad_one_is_refused(graph):
-    graph.add(PathFollowerNode, waypoints=[0.02, 0.0])
+    graph.add(PathFollowerNode, settle=0.0, waypoints=[0.02, 0.0])
     commands, diagnostics = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.DIAGNOSTICS)
     bad = pose(5.0, np.nan)
     graph.publish(topics.NEEDLE_POSE, bad)
@@ -41,7 +41,8 @@ def test_without_a_pose_it_is_silent_and_a_bad_one_is_refused(graph):
 
 
 def test_at_the_end_it_says_done(graph):
-    graph.add(PathFollowerNode, waypoints=[0.0071, 0.0])
+    graph.add(PathFollowerNode, settle=0.0, waypoints=[0.0071, 0.0], tolerance=0.0002)
+    graph.listen(topics.NEEDLE_COMMAND)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     seconds = 5.0
 
@@ -55,7 +56,16 @@ def test_at_the_end_it_says_done(graph):
 
 
 def test_a_path_of_nothing_is_refused_with_the_first_pose(graph):
-    graph.add(PathFollowerNode)
+    graph.add(PathFollowerNode, settle=0.0)
+    graph.listen(topics.NEEDLE_COMMAND)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
     graph.wait(lambda: any("refused: waypoints" in d.status[0].message for d in diagnostics), "a refusal")
+
+
+def test_it_does_not_begin_before_anybody_takes_its_commands(graph):
+    graph.add(PathFollowerNode, settle=0.0, waypoints=[0.02, 0.0])
+    wishes, diagnostics = graph.listen(topics.TIP_SETPOINT), graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
+    graph.wait(lambda: any(d.status[0].message == "nobody takes velocity commands" for d in diagnostics), "the reason")
+    assert wishes == []

@@ -85,25 +85,42 @@ def test_a_raw_image_is_taken_too(graph, camera, thread_arc):
 def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
     graph.add(VisionTrackerNode, confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
+    tracking = graph.listen(topics.TRACKER_STATE)
     far = np.array([0.5, 0.5])
     empty = camera.render(far, 0.0, np.array([far, far + 0.01]))
     graph.publish(topics.COMPRESSED_IMAGE, compressed(empty, graph.now()))
-    graph.wait(lambda: any(text.startswith("searching: ") for text in states(diagnostics)), "searching")
+    graph.wait(lambda: bool(tracking), "a state")
+    assert tracking[0].state == TrackerState.STATE_SEARCHING
+    assert tracking[0].reason.startswith("no needle in the dish")
     assert not poses
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
-    graph.wait(lambda: states(diagnostics)[-1] == "tracking", "tracking")
+    graph.wait(lambda: "tracking" in states(diagnostics), "tracking")
 
 
 def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_arc):
     graph.add(VisionTrackerNode, confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
+    tracking = graph.listen(topics.TRACKER_STATE)
     for data in (b"", b"no image", b"\xff\xd8\xff\xe0" + bytes(40)):
         message = CompressedImage(format="jpeg", data=data)
         message.header.stamp = graph.now()
         graph.publish(topics.COMPRESSED_IMAGE, message)
-    graph.wait(lambda: any("expected a JPEG or PNG image" in text for text in states(diagnostics)), "a refusal")
+    graph.wait(lambda: len(tracking) == 3, "a state for each")
+    assert all("expected a JPEG or PNG image" in state.reason for state in tracking)
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
-    graph.wait(lambda: diagnostics[-1].status[0].message == "tracking", "tracking")
+    graph.wait(lambda: "tracking" in states(diagnostics), "tracking")
     assert {value.key: value.value for value in diagnostics[-1].status[0].values}["refused"] == "3"
+
+
+def test_a_camera_that_falls_silent_is_noticed(graph, camera, thread_arc):
+    graph.add(VisionTrackerNode, confirm_frames=1)
+    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
+    graph.wait(lambda: bool(poses), "a pose")
+    graph.wait(lambda: tracking[-1].reason.startswith("no camera frame for"), "the silence")
+    assert tracking[-1].state == TrackerState.STATE_LOST
+    graph.wait(lambda: any(text.startswith("no camera frame for") for text in states(diagnostics)), "a warning")
+    assert len(poses) == 1

@@ -70,6 +70,20 @@ def test_a_stuck_coil_keeps_its_current_whatever_it_is_told():
     assert made.currents.tolist() == [0.0] * 4
 
 
+def test_a_stuck_coil_does_not_keep_the_others_on():
+    made = rig(faults=("coil_stuck 0.1 5.0",), coil_timeout=0.2)
+    made.apply(EASTWARDS, 0.0)
+    made.advance(1.0)
+    assert made.currents.tolist() == [4.0, 0.0, 0.0, 0.0]
+
+
+def test_the_power_stage_has_a_limit():
+    made = rig(coil_max_current=5.0)
+    made.apply(np.array([1e160, -80.0, 3.0, 0.0]), 0.0)
+    assert made.currents.tolist() == [5.0, -5.0, 3.0, 0.0]
+    assert np.all(np.isfinite(made.look(0.05).tail))
+
+
 def test_a_stopped_camera_gives_no_image_but_the_truth():
     made = rig(faults=("camera_stopped 0 1",))
     made.apply(EASTWARDS, 0.0)
@@ -111,6 +125,10 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"needle_start": (0.0, 0.0)}, "a multiple of 3"),
         ({"needle_start": ()}, "x, y"),
         ({"needle_start": (0.012, 0.0, 0.0)}, "a needle in the dish"),
+        ({"needle_start": (0.0, 0.0, 0.0)}, "a thread in the dish"),
+        ({"disc_obstacles": (-0.005, -0.004, 0.002)}, "a thread in the dish, off the obstacles"),
+        ({"polygon_obstacles": (0.005, -0.01, 0.007, -0.01, 0.006, 0.0), "polygon_sizes": (3,)}, "off the obstacles"),
+        ({"needle_curvature": 500.0}, "a half circle"),
         ({"faults": ("sun 1 2",)}, "KIND START DURATION"),
         ({"faults": (3,)}, "a list of texts"),
         ({"polygon_sizes": (3,)}, "corners of all"),

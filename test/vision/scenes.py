@@ -7,10 +7,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.rig.camera.dish_camera import Cover, DishCamera
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene, needle_axis
+from magnetosuture_thread.rig.camera.scene import Lighting, Scene
 from magnetosuture_thread.vision.look import Track
 
 VIEW = DishView((322.0, 238.0), 8e-5)

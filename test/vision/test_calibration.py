@@ -82,6 +82,26 @@ def test_a_marker_that_one_frame_hides_is_taken_from_another():
     assert np.linalg.norm(np.subtract(found.view.centre_px, view.centre_px)) < 0.3
 
 
+def test_markers_from_a_camera_that_moved_between_frames_are_refused():
+    view, moved = DishView((305.0, 240.0), 1.2e-4), DishView((335.0, 240.0), 1.2e-4)
+    with pytest.raises(
+        InvalidInputError, match=r"markers that differ by 15\.\d\d px, expected a camera that stands still"
+    ):
+        calibrate_by_markers([markers(view), markers(moved)], 0.035, SPACING, SIDE)
+    nudged = DishView((308.5, 240.0), 1.2e-4)
+    with pytest.raises(InvalidInputError, match="a camera that stands still"):  # even if one marker alone tells
+        calibrate_by_markers([markers(view, (0, 1)), markers(nudged, (1, 2, 3))], 0.035, SPACING, SIDE)
+    still = calibrate_by_markers([markers(view), markers(view)], 0.035, SPACING, SIDE)
+    assert still.scatter_px < 0.2
+
+
+def test_markers_need_a_newer_opencv_than_some_systems_have(monkeypatch: pytest.MonkeyPatch):
+    frame = markers(DishView((318.4, 243.7), 1.2e-4))
+    monkeypatch.delattr(cv2.aruco, "ArucoDetector")
+    with pytest.raises(InvalidInputError, match=r"OpenCV 4\.7 or newer, which is needed for markers"):
+        calibrate_by_markers([frame], 0.035, SPACING, SIDE)
+
+
 def test_what_is_written_is_a_set_up(tmp_path: Path):
     view = DishView((318.4, 243.7), 1.2e-4, 0.1)
     found = calibrate_by_markers([markers(view)], 0.035, SPACING, SIDE)

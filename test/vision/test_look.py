@@ -16,7 +16,7 @@ from magnetosuture_thread.rig.camera.scene import Lighting, Scene
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
-from test.vision.scenes import NOWHERE, PIXEL, VIEW, Pose, line_error, random_pose, random_thread, render
+from test.vision.scenes import CURVATURES, NOWHERE, PIXEL, VIEW, Pose, line_error, random_pose, random_thread, render
 
 SAMPLES = Path(__file__).parent / "samples"
 TRACKER = VisionTracker(VisionTrackerSettings())
@@ -78,6 +78,34 @@ def test_rendered_needles_are_measured_in_any_light(light: str, curved: bool):
     assert np.mean([mean for mean, _ in lines]) < 1.0
     assert np.mean([share for _, share in lines]) > 0.95
     assert 0.05 < np.mean(scaled) < 5.0  # 1 for errors as large as the covariance says
+
+
+def test_over_curvatures_lights_and_noise_tail_heading_and_thread_are_accurate():
+    tails: list[float] = []
+    angles: list[float] = []
+    lines: list[tuple[float, float]] = []
+    lost: list[str] = []
+    for number, light in enumerate(LIGHTS.values()):
+        for curvature in CURVATURES:
+            random = np.random.default_rng(200 + number)
+            drawn = random_pose(random, curved=False, within=0.0125)
+            pose = Pose(drawn.tail, drawn.heading, curvature)
+            thread = random_thread(random, pose)
+            seen = TRACKER.look(render(pose, thread, seed=5 + number, lighting=light))
+            if seen.reason:
+                lost.append(seen.reason)
+                continue
+            apart, turned = pose.error(seen)
+            tails.append(apart)
+            angles.append(turned)
+            lines.append(line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread)))
+            assert np.sign(seen.curvature) == np.sign(curvature)
+    assert min(CURVATURES) < 0.0 < max(CURVATURES)
+    assert len(lost) <= 2, lost
+    assert np.sqrt(np.mean(np.square(tails))) <= 0.5
+    assert np.degrees(np.sqrt(np.mean(np.square(angles)))) <= 1.0
+    assert np.mean([mean for mean, _ in lines]) <= 1.0
+    assert np.mean([share for _, share in lines]) >= 0.95
 
 
 def test_over_many_poses_the_covariance_is_about_right():

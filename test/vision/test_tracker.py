@@ -123,6 +123,21 @@ def test_frames_out_of_order_are_refused_and_a_bag_wound_back_begins_anew():
     assert tracker.track(render(moving(4)), -10.0).state is State.SEARCHING
 
 
+@pytest.mark.parametrize(("aside", "turned"), [(0.4 * PIXEL, 0.0), (0.0, 0.004)], ids=["moved", "turned"])
+def test_after_two_frames_a_moment_apart_the_needle_is_still_tracked(aside: float, turned: float):
+    """What differs between them is noise, and no needle is as fast as that noise seems over a microsecond."""
+    tracker = VisionTracker(VisionTrackerSettings())
+    pose = Pose(np.array([0.001, 0.002]), 0.8)
+    for index in range(4):
+        assert tracker.track(render(pose), index / RATE).reason or index > 1
+    noisy = Pose(pose.tail + np.array([aside, 0.0]), pose.heading + turned)
+    assert tracker.track(render(noisy), 3 / RATE + 1e-6).state is State.TRACKED
+    for index in range(4, 9):
+        seen = tracker.track(render(pose), index / RATE)
+        assert seen.state is State.TRACKED, seen.reason
+        assert pose.is_right(seen)
+
+
 def test_a_bumped_camera_gives_no_pose_until_the_dish_is_found_again():
     tracker = started(frames=4)
     seen: list[Track] = []

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.coverage import Box, box_around, covered, line_covered
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene, needle_axis
+from magnetosuture_thread.rig.camera.scene import Lighting, Scene
 from magnetosuture_thread.rig.camera.still_life import Light, StillLife
 
 Image = NDArray[np.uint8]

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from magnetosuture_thread.geometry.obstacles import Obstacle
-from magnetosuture_thread.geometry.polyline import Points
 
 
 @dataclass(frozen=True)
@@ -53,26 +50,3 @@ class Lighting:
     glare: float = 1.0
     noise: float = 1.0
     blur_px: float = 0.75
-
-
-def needle_axis(tail: Points, heading: float, length: float, curvature: float, at: Points) -> tuple[Points, Points]:
-    """Return points and unit tangents of a needle's axis, a circular arc.
-
-        x(s) = x_tail + R(heading) [sin(c s) / c, (1 - cos(c s)) / c],    0 <= s <= length
-
-    Args:
-        tail: shape (2,) [m].
-        heading: angle of the tangent at the tail against the x axis [rad].
-        length: of the arc [m].
-        curvature: c, positive to the left [1/m].
-        at: where along the arc, 0 at the tail and 1 at the tip, shape (m,); beyond, the arc goes on.
-
-    Returns:
-        Points, shape (m, 2) [m], and tangents, shape (m, 2).
-    """
-    s = np.asarray(at, dtype=float) * length
-    half = 0.5 * curvature * s
-    chord = s * np.sinc(half / np.pi)  # sin(half) / half without a division by zero
-    points = tail + chord[:, None] * np.column_stack([np.cos(heading + half), np.sin(heading + half)])
-    turned = heading + curvature * s
-    return points, np.column_stack([np.cos(turned), np.sin(turned)])

@@ -28,7 +28,6 @@ class DishWatch:
     def __init__(self, settings: VisionTrackerSettings) -> None:
         self._settings = settings
         self._fixed = settings.fixed_view()
-        self._given = bool(settings.dish_centre_px)
         self.view = self._fixed
         self._anew: list[DishView] = []
 

@@ -57,7 +57,7 @@ def follow(ridge, hidden, factor, noise, faintest, start, dish, longest, path, s
     """
     path[0, 0], path[0, 1], strong[0] = start[0], start[1], False
     path[0, 2:] = 0.0
-    angle, bend, strength = leave(ridge, hidden, factor, noise, faintest, start[0], start[1], start[2])
+    angle, bend, strength = leave(ridge, noise, faintest, start[0], start[1], start[2])
     if strength < 1.2 * faintest:
         return 1
     middle = angle + 0.5 * bend * START_PX

@@ -43,7 +43,7 @@ def is_hidden(hidden, factor, u, v):
 
 
 @compiled
-def leave(ridge, hidden, factor, noise, faintest, u, v, heading):
+def leave(ridge, noise, faintest, u, v, heading):
     """Find the arc along which the thread leaves the tail.
 
     Returns:

@@ -80,7 +80,7 @@ def test_a_picture_for_a_person(camera: DishCamera):
     tiles = [titled(curved.render(tail, heading, thread), "curved needle, poor light")]
     for kind in ("glare", "hand", "tool", "overexposed", "needle_out"):
         faults = FaultSchedule([Fault(kind, 0.0, 2.0)], 0.035, 0.007, seed=3)
-        away = faults.lifted(0.35, tail)
+        away = faults.lifted(0.35)
         covers = faults.covers(0.35, tail, tip)
         tiles.append(titled(camera.render(tail + away, heading, thread + away, covers, faults.gain(0.35)), kind))
     whole = np.vstack([above, below, np.hstack(tiles[:3]), np.hstack(tiles[3:])])
