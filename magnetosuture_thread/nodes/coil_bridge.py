@@ -41,6 +41,7 @@ class CoilBridgeNode(Node):
         topics.NEEDLE_COMMAND.subscribe(self, self.on_command)
         self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
         self._following = False
+        self._period, self._applied = 1.0 / settings.rate, 0.0
         self._health.ok("no command yet", driver=settings.driver)
         self.driver.open()  # last, so that nothing can fail and leave it open
 
@@ -65,7 +66,9 @@ class CoilBridgeNode(Node):
 
     def on_watchdog(self) -> None:
         """Lay the field along the needle as it lies now; stop when no good command or pose has come for too long."""
-        self._apply(self.get_clock().now().to_msg())
+        # A command has just been applied: two in a row would only cost time.
+        if self._arrival() - self._applied > 0.9 * self._period:
+            self._apply(self.get_clock().now().to_msg())
 
     def destroy_node(self) -> None:
         """Leave the coils at zero."""
@@ -85,6 +88,7 @@ class CoilBridgeNode(Node):
             self._health.ok("following commands", saturated=allocation.saturated)
         self._following = not setpoint.stop
         self.driver.apply(allocation.currents)
+        self._applied = self._arrival()
         self._needle.move(allocation.velocity)
         self._currents.publish(messages.currents_message(stamp, self._coils.names, allocation, stop))
         self._setpoints.publish(messages.twist_message(stamp, allocation.velocity))

@@ -5,24 +5,27 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.interface import DIAGNOSTICS
-from magnetosuture_thread.nodes.topics import Topic
+from magnetosuture_thread.nodes.topics import CLOCK, Topic
 
 DEPTH = 1000  # messages that may wait before any is lost
+PERIOD = 0.005  # s between two looks at all topics
 
 
 class Recorder:
     """A node that takes every message of some topics as it is.
+
+    It looks at its subscriptions itself, without an executor: with nearly a thousand messages a second
+    rclpy's waiting for each would cost as much as the graph that is recorded. When a message arrived is
+    what the middleware says, so that it does not matter when it is looked at.
 
     Args:
         domain: the graph's ROS domain.
@@ -44,37 +47,49 @@ class Recorder:
         receive: Callable[[str, int, bytes], None],
     ) -> None:
         self._receive = receive
-        self._simulated = simulated_clock
+        self._now = 0 if simulated_clock else None
         self.taken: Counter[str] = Counter()
         self.said: dict[str, tuple[str, dict[str, str]]] = {}
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain, args=[])
-        overrides = [Parameter("use_sim_time", value=simulated_clock)]
-        self._node = rclpy.create_node("recorder", context=self._context, parameter_overrides=overrides)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._subscriptions = {
-            topic.name: self._node.create_subscription(
-                topic.message, topic.name, self._taker(topic), self._quality(topic), raw=True
-            )
-            for topic in taken
-        }
+        self._node = rclpy.create_node("recorder", context=self._context)
+        followed = (CLOCK, *taken) if simulated_clock else taken
+        self._subscriptions = [
+            (topic, self._node.create_subscription(topic.message, topic.name, _never, self._quality(topic), raw=True))
+            for topic in followed
+        ]
 
     def close(self) -> None:
         """Leave the graph."""
-        self._executor.shutdown()
         self._node.destroy_node()
         self._context.try_shutdown()
 
     def silent(self) -> list[str]:
         """Return the topics that nobody publishes yet."""
-        return [name for name, subscription in self._subscriptions.items() if not subscription.get_publisher_count()]
+        return [t.name for t, subscription in self._subscriptions if not subscription.get_publisher_count()]
 
     def spin(self, duration: float) -> None:
         """Take messages for a while [s]."""
         end = time.monotonic() + duration
-        while (left := end - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=left)
+        while time.monotonic() < end:
+            for topic, subscription in self._subscriptions:
+                with subscription.handle:
+                    while (found := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                        data, info = found
+                        self._take(topic, bytes(data), info["received_timestamp"])
+            time.sleep(PERIOD)
+
+    def _take(self, topic: Topic, data: bytes, arrived: int) -> None:
+        if topic is CLOCK:
+            clock = deserialize_message(data, Clock).clock
+            self._now = clock.sec * 1_000_000_000 + clock.nanosec
+            return
+        self.taken[topic.channel.recorded] += 1
+        self._receive(topic.channel.recorded, arrived if self._now is None else self._now, data)
+        if topic.channel is DIAGNOSTICS:
+            for status in deserialize_message(data, DiagnosticArray).status:
+                values = {value.key: value.value for value in status.values}
+                self.said[status.name.split(":")[0]] = (status.message, values)
 
     def _quality(self, topic: Topic) -> QoSProfile:
         """Return the topic's own quality of service, with a longer queue."""
@@ -84,17 +99,6 @@ class Recorder:
             durability=topic.qos.durability,
         )
 
-    def _taker(self, topic: Topic) -> Callable[[Any, Any], None]:
-        def take(data: bytes, info: dict[str, int]) -> None:
-            # When the message reached this process: it may have waited here, which is not the graph's delay.
-            arrived = info["received_timestamp"]
-            if self._simulated or not arrived:
-                arrived = self._node.get_clock().now().nanoseconds
-            self.taken[topic.channel.recorded] += 1
-            self._receive(topic.channel.recorded, int(arrived), bytes(data))
-            if topic.channel is DIAGNOSTICS:
-                for status in deserialize_message(data, DiagnosticArray).status:
-                    values = {value.key: value.value for value in status.values}
-                    self.said[status.name.split(":")[0]] = (status.message, values)
 
-        return take
+def _never(data: bytes) -> None:
+    """Stand in for a callback: no executor calls any."""
