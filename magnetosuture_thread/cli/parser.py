@@ -61,8 +61,8 @@ Pictures are looked at one by one; a bag's frames are followed over time, as the
 --json writes a list with an entry for each frame: file (for a bag, topic and stamp), status (tracked, lost
 or searching) and its reason, tail_m, tip_m and heading_rad (the tangent at the tail), curvature_per_m
 (positive to the left), thread_m from the tail on, all in the dish frame, confidence from 0 to 1, stamp_s,
-and time_s, which the frame took to look at: without reading and decoding it, all compiled before. What has
-no value is null.
+and time_s, the processor time to look at the frame, on one core, without reading and decoding it; all is
+compiled before. What has no value is null.
 """
 
 CALIBRATE_CAMERA = """\

@@ -28,7 +28,8 @@ class TrackedFrame:
     Attributes:
         name: the file's name, with its folders where another file has the same; or topic and stamp.
         track: what was seen.
-        duration: time that looking took, decoding not included [s].
+        duration: processor time that looking took, on one core, decoding not included; other work on the
+            machine does not show in it [s].
         stamp: when the frame was taken [s]; None where nothing tells.
     """
 
@@ -108,7 +109,7 @@ def track(
 
 def _look(tracker: VisionTracker, frame: Frame, in_sequence: bool) -> TrackedFrame:
     """Look at one frame, and time it."""
-    began = time.perf_counter()
+    began = time.thread_time()
     try:
         if frame.image is None:
             raise InvalidInputError("image", "a broken picture", frame.problem)
@@ -118,7 +119,7 @@ def _look(tracker: VisionTracker, frame: Frame, in_sequence: bool) -> TrackedFra
             seen = tracker.look(frame.image)
     except InvalidInputError as error:
         seen = no_pose(State.LOST, frame.problem or str(error), None)
-    return TrackedFrame(frame.name, seen, time.perf_counter() - began, frame.stamp)
+    return TrackedFrame(frame.name, seen, time.thread_time() - began, frame.stamp)
 
 
 def _drawn(image: np.ndarray, result: TrackedFrame, settings: VisionTrackerSettings) -> np.ndarray:

@@ -146,7 +146,7 @@ class LiveReplay:
             self._publish_clock(record.time)
             stamp = messages.header_stamp(record.data)
             if stamp is not None:
-                self.published[record.topic.lstrip("/")][stamp] = time.perf_counter()
+                self.published[record.topic.lstrip("/")][stamp] = time.time()
             publisher.publish(record.data)
             frames += record.topic in {channel.recorded for channel in CAMERA.values()}
             progress((record.time - self._start) * 1e-9)
@@ -194,17 +194,18 @@ class LiveReplay:
             return self._start
         return self._start + round((time.perf_counter() - self._began) * self._rate * 1e9)
 
-    def _taker(self, topic: topics.Topic) -> Callable[[Any], None]:
+    def _taker(self, topic: topics.Topic) -> Callable[[Any, Any], None]:
         """Return the callback of an output topic."""
         name = topic.channel.name
         answers = topic in (topics.NEEDLE_POSE, topics.SEEN_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
 
-        def take(data: bytes) -> None:
+        def take(data: bytes, info: dict[str, int]) -> None:
             now = time.perf_counter()
             self._taken += 1
             stamp = messages.header_stamp(data)
             if stamp is not None:
-                self.arrived[name].setdefault(stamp, now)
+                # When it reached this process: how long it waited here for its turn is not the graph's delay.
+                self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)
             if answers:
                 self._last_answer = now
             if topic.channel is DIAGNOSTICS:

@@ -16,10 +16,11 @@ MOST_ROWS = 20  # beyond, only the summary is shown
 def track_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return a row for each of the first frames, as `TrackedFrame.to_json` gives them."""
     table = Table(title=f"{len(rows)} frames")
-    table.add_column("frame", overflow="fold")
+    table.caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
+    table.add_column("frame", overflow="fold", min_width=12)
     table.add_column("status")
-    for name in ("tail [mm]", "heading [deg]", "thread [mm]", "confidence", "time [ms]"):
-        table.add_column(name, justify="right")
+    for name in ("tail", "heading", "thread", "sure", "ms"):
+        table.add_column(name, justify="right", no_wrap=True)
     for row in rows[:MOST_ROWS]:
         time = f"{row['time_s'] * 1e3:.1f}"
         if row["reason"]:
