@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import load_setup
 from magnetosuture_thread.errors import ConfigurationError
@@ -60,4 +62,9 @@ def read_setup(name: str) -> Setup:
         value, expected = (getattr(settings[group], field) for group, field in (one, other))
         if value != expected:
             raise ConfigurationError(".".join(one), value, f"{expected}, as {'.'.join(other)}", str(path))
+    points = np.reshape(settings["path_follower"].waypoints, (-1, 2))
+    radius = 0.5 * settings["vision_tracker"].dish_diameter
+    outside = points[np.linalg.norm(points, axis=1) >= radius].tolist()
+    if outside:
+        raise ConfigurationError("path_follower.waypoints", outside[0], f"within the dish, {radius:g} m", str(path))
     return Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))

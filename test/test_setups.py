@@ -56,6 +56,7 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     [
         ("coil_bridge: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
         ("path_follower: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
+        ("path_follower: {ros__parameters: {waypoints: [0.0, 0.0, 0.0335, 0.001]}}", "within the dish, 0.0175 m"),
         ("path_follower: {ros__parameters: {needle_curvature: 8.0}}", "as coil_bridge.needle_curvature"),
     ],
 )

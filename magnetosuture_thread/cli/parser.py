@@ -51,7 +51,8 @@ needle velocities along the scenario's path. All are processes of their own, on 
 else uses. Everything is simulated, and the bag says so.
 
 SCENARIO is a set-up with waypoints in its section path_follower. BAG, which must not exist, gets all that
-was said, the truth included; `replay` takes it.
+was said, the truth included, and the nodes' logs; `replay` takes it. Ctrl-C ends the run, and what was
+recorded stays. The first run on a machine compiles for a minute before it begins.
 """
 
 TRACK = """\

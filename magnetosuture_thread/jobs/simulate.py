@@ -45,8 +45,8 @@ def simulate(
     """Run rig, tracker, model, bridge and path follower as processes of their own, and judge the loop.
 
     `output` becomes a bag of all that was said, the truth included, with the nodes' `logs/` beside it; its
-    notes hold the scenario and say that it is simulated, and `replay` takes it. It is made at the end, whole
-    or not at all.
+    notes hold the scenario and say that it is simulated, and `replay` takes it. It is made at the end, also
+    of a run that was interrupted; of one that never began nothing is left.
 
     Args:
         scenario: name or path of a set-up with a path for the needle.
@@ -71,14 +71,18 @@ def simulate(
             "vision_tracker.image_transport", setup.vision.image_transport, expectation, str(setup.path)
         )
     with whole_folder(output) as folder:
-        _run(setup, folder, output.name, duration, pace, say, progress)
+        problem = _run(setup, folder, output.name, duration, pace, say, progress)
+    if problem:
+        raise GraphError(f"{problem}; what was recorded is in {output}")
     say("judging the run")
     return judge(Bag(output), setup).summary(setup.name)
 
 
 def judge(bag: Bag, setup: Setup) -> LoopCollector:
     """Return all that a simulated run's bag says, put side by side."""
-    collector = LoopCollector(setup.model.length, setup.rig.needle_length, setup.rig.needle_curvature)
+    collector = LoopCollector(
+        setup.model.length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
+    )
     camera = {channel.recorded for channel in CAMERA.values()}
     for record in bag.records(set(bag.topics) - camera):
         collector.take(record.topic, record.time, record.decode())
@@ -87,7 +91,8 @@ def judge(bag: Bag, setup: Setup) -> LoopCollector:
 
 def _run(
     setup: Setup, folder: Path, name: str, duration: float | None, pace: float | None, say: Say, progress: Progress
-) -> None:
+) -> str:
+    """Run the graph and record it; return what went wrong, so that the bag stays."""
     # Only here, where it is needed: without ROS the other commands still work.
     from magnetosuture_thread.nodes import topics
     from magnetosuture_thread.nodes.processes import (
@@ -121,11 +126,17 @@ def _run(
             NodeProcesses(("rig_simulator", *NODES), arguments, environment, folder / "logs") as nodes,
         ):
             running = False
+            early: dict[str, bytes] = {}
 
             def receive(topic: str, arrival: int, data: bytes) -> None:
-                # While nodes start, only what is said once and for all is worth keeping.
-                if running or topic == OBSTACLE_MARKERS.recorded:
-                    bag.write(topic, arrival, data)
+                # While nodes start, only what is said once and for all is worth keeping: for the bag's start.
+                if not running:
+                    early.update({topic: data} if topic == OBSTACLE_MARKERS.recorded else {})
+                    return
+                for name, said_early in early.items():
+                    bag.write(name, arrival, said_early)
+                early.clear()
+                bag.write(topic, arrival, data)
 
             recorder = Recorder(domain, taken, simulated_clock=pace is not None, receive=receive)
             try:
@@ -137,7 +148,12 @@ def _run(
                 say("running" if pace is None else f"running at {pace:g} times the speed")
                 running = True
                 nodes.start("path_follower")
-                _follow(recorder, nodes.check, setup, duration, pace or 1.0, progress)
+                return _follow(recorder, nodes.check, setup, duration, pace or 1.0, progress)
+            except KeyboardInterrupt:
+                if not running:
+                    raise
+                say("interrupted; what was recorded stays")
+                return ""
             finally:
                 recorder.close()
 
@@ -160,8 +176,8 @@ def _follow(
     duration: float | None,
     pace: float,
     progress: Progress,
-) -> None:
-    """Record until the needle is at the end of its path, or the time is over."""
+) -> str:
+    """Record until the needle is at the end of its path, or the time is over; return what went wrong."""
     points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
     longest = PATIENCE * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE + (duration or 0.0)
     began = time.monotonic()
@@ -176,10 +192,10 @@ def _follow(
         done = float(values.get("progress", 0.0))
         progress(done if duration is None else min(1.0, elapsed / duration))
         if duration is not None and elapsed > duration + (0.0 if following else SPARE):
-            return
+            return ""
         if duration is None and said == "done":
             recorder.spin(AFTERWARDS / pace)
-            return
+            return ""
         if elapsed > longest:
             states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.said.items()))
-            raise GraphError(f"after {elapsed:.0f} s only {done:.0%} of the path is done; {states}")
+            return f"after {elapsed:.0f} s only {done:.0%} of the path is done; {states}"

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import MagnetosutureError
@@ -41,6 +42,9 @@ def run(make: Callable[[], Node], arguments: Sequence[str] | None = None) -> int
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except rclpy_implementation.RCLError:
+        if rclpy.ok():
+            raise  # else a callback was still at work when the node was asked to end
     except (MagnetosutureError, ParameterException) as error:
         print(f"error: {_one_line(error)}", file=sys.stderr)
         return 1

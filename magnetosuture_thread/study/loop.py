@@ -32,9 +32,10 @@ class LoopSummary:
 
     Attributes:
         setup: the scenario's name.
-        duration: from the first wish of the path follower to the last; all figures are of this time [s].
+        duration: from the start of the steering until the path was done, or to the end; all figures are of
+            this time [s].
         frames: camera frames, lost ones too.
-        skipped: frames that the rig had no time for.
+        skipped: frames that are missing: the rig had no time for them.
         tracked: frames with a pose.
         lost: frames that the tracker looked at without giving a pose.
         wrong: poses farther from the truth than 0.3 mm or 5 degrees.
@@ -86,15 +87,17 @@ class LoopCollector:
         thread_length: [m]
         needle_length: along the needle's body [m].
         needle_curvature: of its arc [1/m].
+        frame_rate: of the camera [Hz].
 
     Attributes:
         instants: the predicted frames by time, once `summary` was asked for.
     """
 
-    def __init__(self, thread_length: float, needle_length: float, needle_curvature: float) -> None:
+    def __init__(self, thread_length: float, needle_length: float, needle_curvature: float, frame_rate: float) -> None:
         self._threads = Collector(thread_length)
         self._needle = needle_length
         self._curvature = needle_curvature
+        self._rate = frame_rate
         self._truth: dict[int, NDArray[np.float64]] = {}
         self._poses: dict[int, NDArray[np.float64]] = {}
         self._wishes: dict[int, Points] = {}
@@ -130,6 +133,8 @@ class LoopCollector:
         """
         self.instants = self._threads.instants()
         first, last = (min(self._wishes), max(self._wishes)) if self._wishes else (0, 0)
+        if self._wishes and self._threads.health.get("path_follower") != "done":
+            last = max(self._truth, default=last)  # who steers is silent while the needle is lost
         frames = {stamp for stamp in self._truth if first <= stamp <= last}
         both = sorted(self._poses.keys() & frames)
         if not both:
@@ -145,7 +150,7 @@ class LoopCollector:
             setup=setup,
             duration=(last - first) * 1e-9,
             frames=len(frames),
-            skipped=_missing(sorted(frames)),
+            skipped=max(0, round((last - first) * 1e-9 * self._rate) + 1 - len(frames)),
             tracked=len(both),
             lost=sum(state != TRACKED for state, _ in states),
             wrong=int(np.sum((tail > WRONG_TAIL) | (heading > WRONG_HEADING))),
@@ -180,12 +185,6 @@ def _planar(pose: Any) -> NDArray[np.float64]:
     """Return x, y [m] and the angle [rad] of a pose in the plane."""
     turned = pose.orientation
     return np.array([pose.position.x, pose.position.y, 2.0 * np.arctan2(turned.z, turned.w)])
-
-
-def _missing(stamps: list[int]) -> int:
-    """Return how many frames are missing in a sequence that should be regular."""
-    steps = np.diff(stamps)
-    return int(np.sum(np.round(steps / np.median(steps)) - 1.0)) if len(steps) else 0
 
 
 def _plain(value: Any) -> Any:

@@ -56,7 +56,7 @@ def loop_table(summary: LoopSummary) -> Table:
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("remark", style="dim")
     table.add_row("camera frames", str(summary.frames), f"over {summary.duration:.1f} s of steering")
-    table.add_row("  skipped", str(summary.skipped), "that the rig had no time for")
+    table.add_row("  skipped", str(summary.skipped), "the rig had no time for them")
     table.add_row("  tracked", str(summary.tracked), f"{summary.lost} looked at and lost")
     table.add_row("  wrong poses", str(summary.wrong), "more than 0.3 mm or 5 degrees from the truth")
     table.add_row("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames))

@@ -21,16 +21,18 @@ def track_table(rows: Sequence[dict[str, Any]]) -> Table:
     table.add_column("status")
     for name in ("tail", "heading", "thread", "sure", "ms"):
         table.add_column(name, justify="right", no_wrap=True)
+    began = rows[0]["stamp_s"] if rows else None
     for row in rows[:MOST_ROWS]:
+        name = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s"
         time = f"{row['time_s'] * 1e3:.1f}"
         if row["reason"]:
-            table.add_row(row["file"], f"{row['status']}: {row['reason']}", "", "", "", "", time)
+            table.add_row(name, f"{row['status']}: {row['reason']}", "", "", "", "", time)
             continue
         steps = np.diff(np.array(row["thread_m"] or []).reshape(-1, 2), axis=0)
         length = 1e3 * float(np.hypot(steps[:, 0], steps[:, 1]).sum())
         heading, confidence = row["heading_rad"], row["confidence"]
         table.add_row(
-            row["file"],
+            name,
             row["status"],
             ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
             "" if heading is None else f"{math.degrees(heading):.1f}",

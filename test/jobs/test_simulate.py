@@ -90,6 +90,8 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
         "/diagnostics",
     ):
         assert bag.counts[topic] > 0, topic
+    first = min(record.time for record in bag.records({"/truth/needle"}))
+    assert first - bag.start < 0.5e9  # the nodes' start is not in it
     covariances = [record.decode().pose.covariance for record in bag.records({"/needle/measured_cp"})]
     assert all(0.0 < covariance[0] < 1e-8 for covariance in covariances)
 
@@ -210,3 +212,16 @@ def test_the_behaviour_job_draws_each_scenario(scenario: Path, tmp_path: Path):
 def test_the_scenarios_of_the_paper_ship():
     for name in ("petri_35mm_polyamide", "petri_150mm_silk"):
         assert setup_file(name).exists()
+
+
+def test_an_interrupted_run_that_has_begun_keeps_what_was_recorded(scenario: Path, tmp_path: Path):
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "simulate", str(scenario)]
+    command += ["--output", str(tmp_path / "bag"), "--duration", "60"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        assert process.stdout is not None
+        next(line for line in process.stdout if "running" in line)
+        time.sleep(4.0)  # some of the run
+        process.send_signal(signal.SIGINT)
+        rest = process.stdout.read()
+    assert "what was recorded stays" in rest
+    assert Bag(tmp_path / "bag").counts["/needle/measured_cp"] > 10

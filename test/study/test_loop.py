@@ -28,7 +28,7 @@ class Loop:
     """A collector that is told of frames."""
 
     def __init__(self, curvature: float = 0.0) -> None:
-        self.collector = LoopCollector(0.019, LENGTH, curvature)
+        self.collector = LoopCollector(0.019, LENGTH, curvature, 100.0)
 
     def truth(self, stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> None:
         """Say where the needle really was."""
@@ -101,8 +101,27 @@ def test_only_the_time_of_steering_counts():
             loop.pose(stamp)
         else:
             loop.state(stamp, 2)
+    done = Fake(name="path_follower: state", message="done")
+    loop.collector.take("/diagnostics", 10**9, Fake(header=header(10**9), status=[done]))
     summary = loop.collector.summary("x")
-    assert (summary.frames, summary.tracked, summary.lost) == (4, 3, 1)
+    assert (summary.frames, summary.tracked, summary.lost, summary.skipped) == (4, 3, 1, 0)
+
+
+def test_a_needle_that_stays_lost_is_counted_to_the_end():
+    loop = Loop()
+    for index in range(10):
+        stamp = 10**9 + index * 10**7
+        if index == 5:
+            continue  # the rig had no time
+        loop.truth(stamp)
+        if index < 4:
+            loop.pose(stamp)
+            loop.wish(stamp, LENGTH)
+        else:
+            loop.state(stamp, 2)
+    summary = loop.collector.summary("x")
+    assert (summary.frames, summary.tracked, summary.lost, summary.skipped) == (9, 4, 5, 1)
+    assert summary.duration == pytest.approx(0.09)
 
 
 def test_the_tip_of_a_curved_needle_is_at_the_end_of_its_arc():

@@ -55,7 +55,7 @@ def find_needles(
             continue
         arc, first, last = guess
         if not 0.6 * expected < last - first < 1.4 * expected:
-            refused.append(f"{last - first:.0f} px long")
+            refused.append(f"{last - first:.0f} px long instead of {expected:.0f}")
             continue
         if abs(arc.curvature) * expected > 1.25 * np.pi:
             refused.append("bent beyond a half circle")
