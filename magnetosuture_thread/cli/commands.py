@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
@@ -18,15 +20,14 @@ def replay(options: argparse.Namespace) -> int:
     from magnetosuture_thread.study.table import summary_table
 
     console = Console(highlight=False)
-    with _progress(console) as progress:
-        task = progress.add_task("replay", total=1.0)
+    with _progress(console, "replay") as progress:
         summary = play(
             options.bag,
             options.output,
             setup_name=options.setup,
             rate=options.rate,
-            say=lambda text: console.print(text, soft_wrap=True, markup=False),
-            progress=lambda share: progress.update(task, completed=share),
+            say=_sayer(console),
+            progress=progress,
         )
     console.print(summary_table(summary))
     console.print(f"results: {options.output}", soft_wrap=True, markup=False)
@@ -42,8 +43,7 @@ def record(options: argparse.Namespace) -> int:
     console = Console(highlight=False)
     setup = read_setup(options.setup)
     reference = read_reference(options.reference)
-    with _progress(console) as progress:
-        task = progress.add_task("record", total=1.0)
+    with _progress(console, "record") as progress:
         frames = write(
             reference,
             setup,
@@ -53,7 +53,7 @@ def record(options: argparse.Namespace) -> int:
             rate=options.rate,
             quality=options.quality,
             seed=options.seed,
-            progress=lambda share: progress.update(task, completed=share),
+            progress=progress,
         )
     console.print(f"{frames} simulated frames in {options.output}", soft_wrap=True, markup=False)
     return DONE
@@ -65,18 +65,24 @@ def simulate(options: argparse.Namespace) -> int:
     from magnetosuture_thread.study.table import loop_table
 
     console = Console(highlight=False)
-    with _progress(console) as progress:
-        task = progress.add_task("simulate", total=1.0)
-        summary = run(
-            options.scenario,
-            options.output,
-            duration=options.duration,
-            pace=options.pace,
-            say=lambda text: console.print(text, soft_wrap=True, markup=False),
-            progress=lambda share: progress.update(task, completed=share),
-        )
+    say = _sayer(console)
+    new = not options.output.exists()
+    try:
+        with _progress(console, "simulate") as progress:
+            summary = run(
+                options.scenario,
+                options.output,
+                duration=options.duration,
+                pace=options.pace,
+                say=say,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        if new and options.output.exists():
+            say(f"what was recorded is in {options.output}")
+        raise
     console.print(loop_table(summary))
-    console.print(f"bag: {options.output}", soft_wrap=True, markup=False)
+    say(f"bag: {options.output}")
     _write_json(options.json, json.dumps(summary.to_json(), indent=2, allow_nan=False))
     return DONE
 
@@ -87,12 +93,11 @@ def behaviour(options: argparse.Namespace) -> int:
     from magnetosuture_thread.study.table import behaviour_table
 
     console = Console(highlight=False)
-    with _progress(console) as progress:
-        task = progress.add_task("behaviour", total=1.0)
+    with _progress(console, "behaviour") as progress:
         runs = run(
             options.output,
-            say=lambda text: console.print(text, soft_wrap=True, markup=False),
-            progress=lambda share: progress.update(task, completed=share),
+            say=_sayer(console),
+            progress=progress,
         )
     console.print(behaviour_table(runs))
     console.print(f"results: {options.output}", soft_wrap=True, markup=False)
@@ -117,21 +122,16 @@ def evaluate(options: argparse.Namespace) -> int:
         if options.pictures:
             draw_course(options.pictures / f"{course.score.name}.png", course, name)
 
-    with _progress(console) as progress:
-        task = progress.add_task("evaluate", total=1.0)
-
-        def report(share: float) -> None:
-            progress.update(task, completed=share)
-
+    with _progress(console, "evaluate") as progress:
         if options.rig:
-            evaluation = score_rig(paths, options.segments, report, keep)
+            evaluation = score_rig(paths, options.segments, progress, keep)
         else:
             evaluation = score(
                 paths,
                 formulation=options.formulation,
                 solver=options.solver,
                 segments=options.segments,
-                progress=report,
+                progress=progress,
                 keep=keep,
             )
     console.print(evaluation_table(evaluation))
@@ -148,13 +148,12 @@ def track(options: argparse.Namespace) -> int:
 
     console = Console(highlight=False)
     settings = settings_with(read_setup(options.setup).vision, options.metres_per_pixel, options.centre)
-    with _progress(console) as progress:
-        task = progress.add_task("track", total=1.0)
+    with _progress(console, "track") as progress:
         frames = follow(
             options.frames,
             settings,
             overlay=options.overlay,
-            progress=lambda share: progress.update(task, completed=share),
+            progress=progress,
         )
     rows = [frame.to_json() for frame in frames]
     console.print(track_table(rows))
@@ -186,9 +185,8 @@ def bench(options: argparse.Namespace) -> int:
     from magnetosuture_thread.study.bench.table import bench_lines, bench_table
 
     console = Console(highlight=False)
-    with _progress(console) as progress:
-        task = progress.add_task("bench", total=1.0)
-        report = measure(peers=options.peers, progress=lambda share: progress.update(task, completed=share))
+    with _progress(console, "bench") as progress:
+        report = measure(peers=options.peers, progress=progress)
     console.print(bench_table(report))
     for line in bench_lines(report):
         console.print(line, soft_wrap=True, markup=False)
@@ -201,12 +199,15 @@ def _write_json(path: Path | None, text: str) -> None:
         path.write_text(text.rstrip() + "\n")
 
 
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    )
+def _sayer(console: Console) -> Callable[[str], None]:
+    """Return what prints a line as it is, however long."""
+    return lambda text: console.print(text, soft_wrap=True, markup=False)
+
+
+@contextmanager
+def _progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
+    """Show a bar, and give what sets the share done, 0 to 1."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda share: bar.update(task, completed=share)

@@ -8,13 +8,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.rig.mechanics.dynamics import Attachment, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.study.evaluation import CaseScore, Course, Evaluation
-from magnetosuture_thread.study.reference import NOT_ONE, ReferenceTrajectory, read_reference
+from magnetosuture_thread.study.evaluation import CaseScore, Course, Evaluation, Progress, resampled, score_each
+from magnetosuture_thread.study.reference import NOT_ONE, ReferenceTrajectory
 
 SEGMENTS = 100
 FORMULATION, SOLVER = "rig", "newton"
@@ -25,7 +24,7 @@ DRIVEN = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0
 def score_rig(
     paths: Sequence[Path],
     segments: int | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = lambda share: None,
     keep: Callable[[Course], None] = lambda course: None,
 ) -> Evaluation:
     """Drive the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
@@ -43,27 +42,20 @@ def score_rig(
         BagError: a file is no reference trajectory.
         SolverError: a step could not be solved.
     """
-    scores = []
-    for index, path in enumerate(paths):
 
-        def share(part: float, index: int = index) -> None:
-            progress((index + part) / len(paths))
+    def one(reference: ReferenceTrajectory, path: Path, share: Progress) -> Course:
+        return score_rig_on(reference, path, segments or SEGMENTS, share)
 
-        course = score_rig_on(read_reference(path), path, segments or SEGMENTS, share)
-        scores.append(course.score)
-        keep(course)
-    return Evaluation(FORMULATION, SOLVER, tuple(scores))
+    return Evaluation(FORMULATION, SOLVER, score_each(paths, one, progress, keep))
 
 
-def score_rig_on(
-    reference: ReferenceTrajectory, path: Path, segments: int, progress: Callable[[float], None]
-) -> Course:
+def score_rig_on(reference: ReferenceTrajectory, path: Path, segments: int, progress: Progress) -> Course:
     """Score the rig's thread on one trajectory; see `score_rig`.
 
     Source: reference set, "How a prediction is scored". Deviation: none.
     """
     properties = thread_of(reference, path, segments)
-    truth = np.stack([_resampled(curve, segments) for curve in reference.threads])
+    truth = np.stack([resampled(curve, segments) for curve in reference.threads])
     rig = RigDynamics(
         DRIVEN,
         properties,
@@ -122,9 +114,3 @@ def thread_of(reference: ReferenceTrajectory, path: Path, segments: int) -> Thre
     if not all(math.isfinite(value) and value > 0.0 for value in values):
         raise BagError(path, f"has a thread with one of {', '.join(names)} not positive")
     return ThreadProperties(length, segments, bending, stretching, across, along, attachment, diameter=diameter)
-
-
-def _resampled(curve: NDArray[np.float64], segments: int) -> NDArray[np.float64]:
-    """Return n + 1 points of a curve whose own points are equally spaced in arc length."""
-    given, wanted = np.linspace(0.0, 1.0, len(curve)), np.linspace(0.0, 1.0, segments + 1)
-    return np.column_stack([np.interp(wanted, given, curve[:, axis]) for axis in range(2)])

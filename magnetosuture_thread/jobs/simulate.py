@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.nodes.recorder import Recorder
 
 SCENARIO_NOTE = "scenario"  # of the bag, which holds the set-up's text
+INTERRUPTED = "interrupted"
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 SETTLE = 1.0  # s for all nodes to have found each other
 AFTERWARDS = 0.5  # s that go on once the path is done
@@ -61,6 +62,7 @@ def simulate(
         BagError: the output exists or cannot be written.
         ConfigurationError: the scenario cannot be used.
         GraphError: a node ended or did not come, or the needle never got to the end of its path.
+        KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
     setup = read_setup(scenario)
     if not setup.follower.waypoints:
@@ -72,6 +74,8 @@ def simulate(
         )
     with whole_folder(output) as folder:
         problem = _run(setup, folder, output.name, duration, pace, say, progress)
+    if problem == INTERRUPTED:
+        raise KeyboardInterrupt
     if problem:
         raise GraphError(f"{problem}; what was recorded is in {output}")
     say("judging the run")
@@ -152,8 +156,7 @@ def _run(
             except KeyboardInterrupt:
                 if not running:
                     raise
-                say("interrupted; what was recorded stays")
-                return ""
+                return INTERRUPTED  # passed on once the bag is whole
             finally:
                 recorder.close()
 

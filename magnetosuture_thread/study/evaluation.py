@@ -26,6 +26,9 @@ TOLERANCE = 1e-6  # of the residuals
 NEAR = 3e-3  # m; within this of an obstacle, depths are looked at
 
 
+Progress = Callable[[float], None]
+
+
 @dataclass(frozen=True)
 class CaseScore:
     """How a formulation did on one trajectory.
@@ -142,16 +145,40 @@ def score(
         BagError: a file is no reference trajectory.
         SolverError: a step could not be solved.
     """
+
+    def one(reference: ReferenceTrajectory, path: Path, share: Progress) -> Course:
+        return score_one(reference, path, formulation, solver, segments, share)
+
+    return Evaluation(formulation, solver, score_each(paths, one, progress, keep))
+
+
+def score_each(
+    paths: Sequence[Path],
+    one: Callable[[ReferenceTrajectory, Path, Progress], Course],
+    progress: Progress,
+    keep: Callable[[Course], None],
+) -> tuple[CaseScore, ...]:
+    """Score trajectories one after another.
+
+    Args:
+        paths: the trajectories.
+        one: scores one of them, and is given what it tells the share done to.
+        progress: is told the share of all that is done.
+        keep: is given each case's course.
+
+    Raises:
+        BagError: a file is no reference trajectory.
+    """
     scores = []
     for index, path in enumerate(paths):
 
         def share(part: float, index: int = index) -> None:
             progress((index + part) / len(paths))
 
-        course = score_one(read_reference(path), path, formulation, solver, segments, share)
+        course = one(read_reference(path), path, share)
         scores.append(course.score)
         keep(course)
-    return Evaluation(formulation, solver, tuple(scores))
+    return tuple(scores)
 
 
 def score_one(
@@ -171,7 +198,7 @@ def score_one(
     chosen = make_formulation(formulation, thread, surroundings, make_solver(solver, TOLERANCE), TOLERANCE, paper)
     predictor = ThreadPredictor(chosen, thread)
     predictor.warm_up()
-    truth = np.stack([_resampled(curve, thread.segments) for curve in reference.threads])
+    truth = np.stack([resampled(curve, thread.segments) for curve in reference.threads])
     headings = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])
     predictor.start_at(NeedlePose(reference.times[0], reference.tails[0], headings[0]), truth[0])
     count = len(reference.times)
@@ -237,7 +264,7 @@ def thread_of(reference: ReferenceTrajectory, path: Path, segments: int | None =
     return thread, PaperOptions.tuned(MATERIALS[family].stiffness_weight)
 
 
-def _resampled(curve: Points, segments: int) -> Points:
+def resampled(curve: Points, segments: int) -> Points:
     """Return n + 1 points of a curve whose own points are equally spaced in arc length."""
     given, wanted = np.linspace(0.0, 1.0, len(curve)), np.linspace(0.0, 1.0, segments + 1)
     return np.column_stack([np.interp(wanted, given, curve[:, axis]) for axis in range(curve.shape[1])])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,9 +15,9 @@ EAST = np.array([1.0, 0.0])
 RATE = 60.0
 
 
-def follower(**changes: object) -> PathFollower:
+def follower(**changes: Any) -> PathFollower:
     """Return a follower of a bent path."""
-    settings = PathFollowerSettings(waypoints=(0.02, 0.003, 0.025, 0.012), **{"settle": 0.0, **changes})  # type: ignore[arg-type]
+    settings = PathFollowerSettings(waypoints=(0.02, 0.003, 0.025, 0.012), **{"settle": 0.0, **changes})
     return settings.follower()
 
 

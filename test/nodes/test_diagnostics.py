@@ -5,7 +5,7 @@ from __future__ import annotations
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes import diagnostics, topics
 from magnetosuture_thread.nodes.diagnostics import Health
 
 
@@ -38,3 +38,14 @@ def test_a_flood_of_refusals_is_counted_and_not_repeated(graph):
     )
     assert len(said) < 20
     assert said[-1].status[0].level == DiagnosticStatus.WARN
+
+
+def test_a_change_that_comes_too_soon_is_said_a_moment_later_and_not_lost(graph, monkeypatch):
+    monkeypatch.setattr(diagnostics, "PERIOD", 1e6)  # the state of each second would say it too
+    said = graph.listen_later(topics.DIAGNOSTICS)
+    health = Health(graph.probe)
+    graph.wait(lambda: graph.matched(topics.DIAGNOSTICS), "the match")
+    for text in ("first", "second", "third"):
+        health.warn(text)
+    graph.wait(lambda: any(d.status[0].message == "third" for d in said), "the last change")
+    assert "second" not in [d.status[0].message for d in said]

@@ -38,6 +38,15 @@ def test_a_needle_that_stands_upright_has_no_heading():
         messages.needle_pose(message)
 
 
+def test_a_path_is_made_anew_in_the_message_of_the_last():
+    maker, points = messages.PathMaker(), np.random.default_rng(1).normal(size=(9, 2))
+    maker.message(STAMP, points)
+    shorter = maker.message(Time(sec=9), points[:3] + 1.0)
+    np.testing.assert_array_equal(messages.path_points(shorter), points[:3] + 1.0)
+    assert shorter.header.stamp.sec == shorter.poses[2].header.stamp.sec == 9
+    np.testing.assert_array_equal(messages.path_points(maker.message(STAMP, points)), points)
+
+
 def test_paths_and_velocities_go_there_and_back():
     points = np.random.default_rng(0).normal(size=(5, 2))
     np.testing.assert_array_equal(messages.path_points(messages.PathMaker().message(STAMP, points)), points)

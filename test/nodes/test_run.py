@@ -162,3 +162,35 @@ with NodeProcesses(["coil_bridge"], [], dict(os.environ), Path({str(tmp_path)!r}
     while child.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not child.exists()
+
+
+END_AT_WORK = """
+import sys
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+from magnetosuture_thread.nodes.run import run
+
+class Late(Node):
+    def __init__(self):
+        super().__init__("late")
+        self.said = self.create_publisher(String, "said", 1)
+        self.create_timer(0.01, self.work)
+
+    def work(self):
+        if sys.argv[1] == "asked":
+            rclpy.shutdown()
+        else:
+            self.said.destroy()
+        self.said.publish(String(data="late"))
+
+sys.exit(run(Late, []))
+"""
+
+
+@pytest.mark.parametrize(("why", "clean"), [("asked", True), ("broken", False)])
+def test_a_callback_that_is_still_at_work_at_the_end_is_no_failure(environment, why: str, clean: bool):
+    command = [sys.executable, "-c", END_AT_WORK, why]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode == 0) is clean, ended.stderr
+    assert ("Traceback" not in ended.stderr) is clean

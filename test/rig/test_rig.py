@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -12,9 +14,9 @@ from magnetosuture_thread.rig.settings import RigSettings
 EASTWARDS = np.array([4.0, 0.0, -2.0, 0.0])
 
 
-def rig(**changes: object) -> Rig:
+def rig(**changes: Any) -> Rig:
     """Return a rig whose needle points east, with a straight thread behind it."""
-    return Rig(RigSettings(**{"needle_start": (0.003, 0.0, 0.0), "thread_segments": 20, **changes}))  # type: ignore[arg-type]
+    return Rig(RigSettings(**{"needle_start": (0.003, 0.0, 0.0), "thread_segments": 20, **changes}))
 
 
 def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
@@ -136,9 +138,9 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"viscosity": 0.0}, "from 0.0001"),
     ],
 )
-def test_settings_that_make_no_rig_are_refused(changes: dict[str, object], words: str):
+def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], words: str):
     with pytest.raises(ConfigurationError, match=words):
-        RigSettings(**changes)  # type: ignore[arg-type]
+        RigSettings(**changes)
 
 
 def test_obstacles_are_drawn_and_felt():

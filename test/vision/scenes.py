@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -83,10 +84,10 @@ def render(
     covers: tuple[Cover, ...] = (),
     gain: float = 1.0,
     lighting: Lighting | None = None,
-    **scene: object,
+    **scene: Any,
 ) -> np.ndarray:
     """Draw a frame."""
-    what = Scene(needle_curvature=pose.curvature, **scene)  # type: ignore[arg-type]
+    what = Scene(needle_curvature=pose.curvature, **scene)
     return camera_for(seed, lighting, what).render(pose.tail, pose.heading, thread, covers, gain)
 
 
