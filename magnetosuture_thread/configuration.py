@@ -219,6 +219,28 @@ _RosLoader.add_implicit_resolver(
 )
 
 
+def read_yaml(path: Path, what: str) -> Any:
+    """Return what a YAML file holds, read as ROS does: 1e-5 is a number, nothing is a date, no key stands twice.
+
+    Args:
+        path: the file.
+        what: it is, for the error.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or is no YAML.
+    """
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), _RosLoader)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not text"
+        raise ConfigurationError(what, reason, "a readable YAML file", str(path)) from None
+    except yaml.YAMLError as error:
+        problem = str(getattr(error, "problem", error))
+        mark = getattr(error, "problem_mark", None)
+        line = f" in line {mark.line + 1}" if mark else ""
+        raise ConfigurationError(what, problem + line, "valid YAML", str(path)) from None
+
+
 def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, Any]:
     """Read a set-up: a ROS 2 parameter file with one section for each node.
 
@@ -232,16 +254,7 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
     Raises:
         ConfigurationError: the file cannot be read, is no parameter file, or holds anything invalid.
     """
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _RosLoader)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not text"
-        raise ConfigurationError("set-up file", reason, "a readable YAML file", str(path)) from None
-    except yaml.YAMLError as error:
-        problem = str(getattr(error, "problem", error))
-        mark = getattr(error, "problem_mark", None)
-        line = f" in line {mark.line + 1}" if mark else ""
-        raise ConfigurationError("set-up file", problem + line, "valid YAML", str(path)) from None
+    content = read_yaml(path, "set-up file")
     known = {cls.GROUP: cls for cls in classes}
     if not isinstance(content, Mapping):
         raise ConfigurationError("set-up file", content, "sections " + ", ".join(known), str(path))

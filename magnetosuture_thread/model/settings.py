@@ -8,7 +8,8 @@ from typing import ClassVar
 
 from magnetosuture_thread.configuration import Configuration, described, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings, triangulate
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
@@ -200,40 +201,12 @@ class ThreadModelSettings(Configuration):
         return (*self._discs(), *self._polygons())
 
     def _discs(self) -> tuple[Disc, ...]:
-        values = self.disc_obstacles
-        return tuple(Disc(values[k : k + 2], values[k + 2]) for k in range(0, len(values), 3))
+        return discs_from(self.disc_obstacles)
 
     def _polygons(self) -> tuple[Polygon, ...]:
-        name, corners = f"{self.GROUP}.polygon_sizes", len(self.polygon_obstacles) // 2
-        if sum(abs(size) for size in self.polygon_sizes) != corners:
-            raise ConfigurationError(
-                name, list(self.polygon_sizes), f"the corners of each outline, {corners} in all without their signs"
-            )
-        shapes: list[list[tuple[tuple[float, float], ...]]] = []
-        begin = 0
-        for size in self.polygon_sizes:
-            end = begin + 2 * abs(size)
-            values = self.polygon_obstacles[begin:end]
-            ring = tuple(zip(values[::2], values[1::2], strict=True))
-            if size > 0:
-                shapes.append([ring])
-            elif shapes:
-                shapes[-1].append(ring)
-            else:
-                raise ConfigurationError(name, list(self.polygon_sizes), "an outline before its holes")
-            begin = end
-        polygons = []
-        for index, rings in enumerate(shapes):
-            try:
-                polygon = Polygon(rings[0], tuple(rings[1:]))
-                if self.corner_radius > 0.0:
-                    polygon = polygon.smoothed(self.corner_radius, self.corner_angle)
-                triangulate(polygon)
-            except ConfigurationError as error:
-                where = f"{self.GROUP}.polygon_obstacles, {error.name.replace('polygon', f'polygon {index}', 1)}"
-                raise ConfigurationError(where, error.value, error.expectation) from None
-            polygons.append(polygon)
-        return tuple(polygons)
+        return polygons_from(
+            self.GROUP, self.polygon_obstacles, self.polygon_sizes, self.corner_radius, self.corner_angle
+        )
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]

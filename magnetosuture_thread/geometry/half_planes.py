@@ -1,0 +1,87 @@
+"""The point of a convex region, bounded by straight lines, that is nearest to a given one; compiled."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Points
+
+ROUNDING = 1e-12
+"""Of the size of what is projected: by so much a result may be on the wrong side of a line."""
+SLACK = 1e-14
+"""The same, on the way: without it, of two lines that are nearly one, rounding would let each forbid the other."""
+
+
+@compiled
+def _nearest(
+    point: NDArray[np.float64], given: Points, bounds: NDArray[np.float64], work: Points, found: NDArray[np.float64]
+) -> bool:
+    """Write the nearest point; `work` (k, 3) has room for rows of length one; return whether there is one."""
+    # Of size one, so that the tolerance means something however small or large the point is.
+    size = math.hypot(point[0], point[1])
+    if size == 0.0:
+        size = max(1e-300, np.abs(bounds).max())
+    x, y = point[0] / size, point[1] / size
+    for i in range(len(given)):
+        length = math.hypot(given[i, 0], given[i, 1])
+        work[i, 2] = bounds[i] / length / size if length > 0.0 else -np.inf
+        work[i, 0] = given[i, 0] / length if length > 0.0 else 0.0
+        work[i, 1] = given[i, 1] / length if length > 0.0 else 0.0
+    best, inside = np.inf, True
+    for i in range(len(work)):
+        nx, ny, least = work[i, 0], work[i, 1], work[i, 2]
+        if nx * x + ny * y >= least:
+            continue
+        inside = False
+        # Along the line i, from its point nearest to the origin: where all the others let it be.
+        px, py, low, high = least * nx, least * ny, -np.inf, np.inf
+        for j in range(len(work)):
+            slope = work[j, 1] * nx - work[j, 0] * ny
+            missing = work[j, 2] - work[j, 0] * px - work[j, 1] * py - SLACK
+            if slope > 0.0:
+                low = max(low, missing / slope)
+            elif slope < 0.0:
+                high = min(high, missing / slope)
+        along = min(max(y * nx - x * ny, low), high)
+        qx, qy = px - along * ny, py + along * nx
+        square = (qx - x) ** 2 + (qy - y) ** 2
+        if not square < best:
+            continue
+        holds = True
+        for j in range(len(work)):
+            if work[j, 0] * qx + work[j, 1] * qy < work[j, 2] - ROUNDING:
+                holds = False
+                break
+        if holds:
+            best, found[0], found[1] = square, size * qx, size * qy
+    if inside:
+        found[0], found[1] = point[0], point[1]
+    return inside or best < np.inf
+
+
+def nearest_within(point: NDArray[np.float64], rows: Points, least: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the point of an intersection of half planes that is nearest to a given one, exactly.
+
+        min |q - p|^2    such that    a_i . q >= b_i
+
+    A point that is not within already goes to one of the lines it is beyond of; along each of these the
+    others leave an interval, and the nearest point of it is a candidate. Quadratic in their number.
+
+    Args:
+        point: p, shape (2,).
+        rows: a_i, of any length; a row of zeros says nothing; shape (k, 2).
+        least: b_i, shape (k,).
+
+    Returns:
+        q, shape (2,), p itself where it is within; it may miss a line by 1e-12 of |p|. None where no
+        candidate passes that: the half planes have no point in common, or only rounding tells.
+
+    Source: none; the nearest point has at least one of the lines crossed as an active constraint.
+    """
+    found = np.empty(2)
+    point, rows, least = (np.ascontiguousarray(array, dtype=np.float64) for array in (point, rows, least))
+    return found if _nearest(point, rows, least, np.empty((len(rows), 3)), found) else None

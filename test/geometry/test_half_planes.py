@@ -1,0 +1,88 @@
+"""The nearest point within half planes."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magnetosuture_thread.geometry.half_planes import ROUNDING, nearest_within
+
+NUMBERS = st.floats(-1.0, 1.0)
+
+
+@st.composite
+def half_planes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a point and half planes that all hold the origin, some through it, some nearly the same."""
+    count = draw(st.integers(1, 12))
+    angles = np.array(draw(st.lists(st.floats(0.0, 2.0 * np.pi), min_size=count, max_size=count)))
+    rows = np.column_stack([np.cos(angles), np.sin(angles)]) * draw(st.sampled_from([1e-3, 1.0, 7.0]))
+    least = np.array(draw(st.lists(st.sampled_from([0.0, -0.05, -0.3, -2.0]), min_size=count, max_size=count)))
+    if draw(st.booleans()):
+        rows, least = np.concatenate([rows, (1.0 + 1e-15) * rows]), np.concatenate([least, least])
+    return np.array([draw(NUMBERS), draw(NUMBERS)]), rows, least * np.linalg.norm(rows, axis=1)
+
+
+def missing(rows: np.ndarray, least: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return by how much points (m, 2) are beyond the lines, as distances."""
+    return (least - points @ rows.T) / np.linalg.norm(rows, axis=1)
+
+
+@settings(deadline=None)
+@given(problem=half_planes())
+def test_what_is_found_is_within_and_nothing_within_is_nearer(problem: tuple[np.ndarray, np.ndarray, np.ndarray]):
+    point, rows, least = problem
+    found = nearest_within(point, rows, least)
+    assert found is not None
+    assert missing(rows, least, found[None]).max() <= 1.01 * ROUNDING * np.linalg.norm(point) + 1e-18
+    angle = np.linspace(0.0, 2.0 * np.pi, 721)
+    way = np.column_stack([np.cos(angle), np.sin(angle)])
+    others = (np.linspace(0.0, 1.5, 61)[:, None, None] * way).reshape(-1, 2)
+    others = others[missing(rows, least, others).max(axis=1) <= 0.0]
+    assert np.linalg.norm(found - point) <= np.linalg.norm(others - point, axis=1).min(initial=np.inf) + 1e-9
+
+
+@settings(deadline=None)
+@given(problem=half_planes(), share=st.floats(0.0, 1.0))
+def test_the_way_to_what_is_found_is_square_to_all_that_is_within(
+    problem: tuple[np.ndarray, np.ndarray, np.ndarray], share: float
+):
+    """(p - q) . (z - q) <= 0 for every z within: what makes q the nearest point of a convex region."""
+    point, rows, least = problem
+    found = nearest_within(point, rows, least)
+    assert found is not None
+    for target in (np.zeros(2), point[::-1] * (1.0, -1.0), -point):
+        inside = nearest_within(share * target, rows, least)
+        assert inside is not None
+        assert (point - found) @ (inside - found) <= 1e-9
+
+
+def test_a_point_within_is_left_bit_for_bit():
+    point = np.array([0.1, 0.3])
+    found = nearest_within(point, np.array([[1.0, 0.0], [0.0, 0.0]]), np.array([0.1, 5.0]))
+    assert found is not None
+    assert found.tolist() == point.tolist()
+
+
+def test_half_planes_without_a_common_point_have_none():
+    rows = np.array([[1.0, 0.0], [-1.0, 0.0]])
+    assert nearest_within(np.zeros(2), rows, np.array([1.0, 1.0])) is None
+
+
+def test_a_slot_lets_what_is_along_it_through():
+    rows = np.array([[0.0, 1.0], [0.0, -1.0]])
+    found = nearest_within(np.array([2.0, 1.0]), rows, np.zeros(2))
+    assert found is not None
+    np.testing.assert_allclose(found, [2.0, 0.0], atol=1e-15)
+
+
+def test_however_large_or_small_a_point_is_it_is_taken_to_the_line():
+    rows, least = np.array([[1.0, 0.0], [0.6, 0.8]]), np.zeros(2)
+    for size in (1e-300, 1e-30, 1e30, 1e300):
+        found = nearest_within(np.array([-size, size]), rows, least)
+        assert found is not None
+        np.testing.assert_allclose(found / size, [0.0, 1.0], atol=1e-12)
+
+
+def test_what_is_no_number_has_no_nearest_point():
+    assert nearest_within(np.array([np.nan, 0.0]), np.array([[1.0, 0.0]]), np.zeros(1)) is None
