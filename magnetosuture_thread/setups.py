@@ -23,6 +23,10 @@ SAME = (
     (("coil_bridge", "needle_length"), ("vision_tracker", "needle_length")),
     (("path_follower", "needle_length"), ("vision_tracker", "needle_length")),
     (("path_follower", "needle_curvature"), ("coil_bridge", "needle_curvature")),
+    (("coil_bridge", "dish_diameter"), ("vision_tracker", "dish_diameter")),
+    (("coil_bridge", "disc_obstacles"), ("thread_model", "disc_obstacles")),
+    (("coil_bridge", "polygon_obstacles"), ("thread_model", "polygon_obstacles")),
+    (("coil_bridge", "polygon_sizes"), ("thread_model", "polygon_sizes")),
 )
 
 

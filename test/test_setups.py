@@ -51,6 +51,25 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     assert np.linalg.norm(coil) == pytest.approx(coils.field_per_current, rel=0.01)
 
 
+@pytest.mark.parametrize("name", SHIPPED)
+def test_in_every_setup_that_ships_the_path_keeps_clear_of_wall_and_obstacles(name: str):
+    """The needle follows its path as the bridge has it move, and nothing is taken off any velocity."""
+    setup = read_setup(name)
+    workspace, needle, follower = setup.coils.workspace(), setup.coils.needle(), setup.follower.follower()
+    x, y, angle = setup.rig.needle_start
+    tail, heading, time, interval, progress = np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]), 0.0, 0.02, 0.0
+    while progress < 1.0:
+        wish = follower.follow(time, tail, heading)
+        progress, time = wish.progress, time + interval
+        assert time < 120.0
+        assert workspace.safe_velocity(wish.velocity, tail, heading).tolist() == wish.velocity.tolist()
+        e = needle.chord_direction(heading)
+        turned = float(wish.velocity @ (-e[1], e[0])) / (0.5 * needle.chord) * interval
+        turn = np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
+        middle = tail + 0.5 * needle.chord * e + float(wish.velocity @ e) * interval * e
+        heading, tail = turn @ heading, middle - 0.5 * needle.chord * (turn @ e)
+
+
 @pytest.mark.parametrize(
     ("section", "words"),
     [
@@ -58,6 +77,13 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
         ("path_follower: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
         ("path_follower: {ros__parameters: {waypoints: [0.0, 0.0, 0.0335, 0.001]}}", "within the dish, 0.0175 m"),
         ("path_follower: {ros__parameters: {needle_curvature: 8.0}}", "as coil_bridge.needle_curvature"),
+        ("coil_bridge: {ros__parameters: {dish_diameter: 0.05}}", "as vision_tracker.dish_diameter"),
+        ("coil_bridge: {ros__parameters: {disc_obstacles: [0.0, 0.0, 0.002]}}", "as thread_model.disc_obstacles"),
+        ("thread_model: {ros__parameters: {disc_obstacles: [0.0, 0.0, 0.002]}}", "as thread_model.disc_obstacles"),
+        (
+            "coil_bridge: {ros__parameters: {polygon_obstacles: [0.0, 0.0, 0.01, 0.0, 0.0, 0.01], polygon_sizes: [3]}}",
+            "as thread_model.polygon_obstacles",
+        ),
     ],
 )
 def test_sections_that_contradict_each_other_are_refused(tmp_path: Path, section: str, words: str):

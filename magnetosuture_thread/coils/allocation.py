@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.field import CoilModel
 from magnetosuture_thread.geometry.arc import needle_chord
 
 Vector = NDArray[np.float64]
@@ -99,7 +100,7 @@ class CoilAllocation:
         max_current: in either direction [A].
     """
 
-    def __init__(self, coils: LoopCoils, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:
+    def __init__(self, coils: CoilModel, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:
         self.names = coils.names
         self._coils = coils
         self._needle = needle
@@ -110,13 +111,23 @@ class CoilAllocation:
         """Return no current in any coil."""
         return Allocation(np.zeros(len(self.names)), np.zeros(2), False)
 
-    def allocate(self, velocity: Vector, tail: Vector, heading: Vector) -> Allocation:
+    def allocate(
+        self,
+        velocity: Vector,
+        tail: Vector,
+        heading: Vector,
+        before: Vector | None = None,
+        largest_change: float = math.inf,
+    ) -> Allocation:
         """Return the currents for a tip velocity.
 
         Args:
             velocity: of the tip, shape (2,) [m/s].
             tail: the needle's tail, shape (2,) [m].
             heading: unit vector along the needle at its tail, shape (2,).
+            before: the currents until now, from which each may differ by `largest_change` [A], shape (m,);
+                from any if None.
+            largest_change: see there; not held where the velocity is zero.
         """
         if not np.any(velocity):
             return self.zero()
@@ -147,12 +158,17 @@ class CoilAllocation:
         target[0] = DRIVE_WEIGHT / usual * float(velocity @ e)
         target[1] = TURN_WEIGHT * STEEPEST / fastest * sideways
         target[2] = ALIGN_WEIGHT
-        limit = self._max_current
+        limit = np.full(len(self.names), self._max_current)
+        lower, upper = -limit, limit
+        if before is not None:
+            lower = np.clip(before - largest_change, -limit, limit)
+            upper = np.clip(before + largest_change, -limit, limit)
         # Most solutions are well inside of the limits, and then plain least squares is one of them.
         currents = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
-        if np.any(np.abs(currents) > limit):
-            found = lsq_linear(system, target, bounds=(-limit, limit), method="bvls")
-            currents = np.clip(found.x, -limit, limit)
+        if np.any((currents < lower) | (currents > upper)):
+            # Bounds that meet are refused by the solver; so little apart they do no harm.
+            found = lsq_linear(system, target, bounds=(lower, np.maximum(upper, lower + 1e-9)), method="bvls")
+            currents = np.clip(found.x, lower, upper)
         reached = float(along @ currents) * e + float((turning + drift) @ currents) * n
         missed = float(np.linalg.norm(reached - velocity)) > SATURATION * float(np.linalg.norm(velocity))
         return Allocation(currents, reached, missed and bool(np.any(np.abs(currents) >= 0.999 * limit)))

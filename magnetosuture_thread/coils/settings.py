@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+import os.path
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import ClassVar
 
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
-from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
+from magnetosuture_thread.coils.field import CoilProperties, coils_around, make_coils
+from magnetosuture_thread.coils.workspace import Workspace
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
 
 INSIDE = 0.9  # of the distance to the coils
 
@@ -21,17 +28,28 @@ class CoilBridgeSettings(Configuration):
 
     GROUP: ClassVar[str] = "coil_bridge"
 
-    driver: str = quantity(
-        "recording", "what the currents go to; recording stands in without hardware", choices=("recording",)
+    autostart: str = quantity(
+        "active",
+        "how far the node goes by itself when it starts; armed only with a driver that moves nothing real",
+        choices=("unconfigured", "inactive", "active", "armed"),
     )
-    rate: float = quantity(100.0, "how often the watchdog runs", unit="Hz", minimum=10.0, maximum=1000.0)
+    driver: str = quantity(
+        "recording",
+        "what the currents go to: recording keeps them, simulated sends them to rig_simulator, roboclaw is hardware",
+        choices=("recording", "simulated", "roboclaw"),
+    )
+    rate: float = quantity(
+        200.0, "how often limits and watchdog run and currents go out", unit="Hz", minimum=10.0, maximum=1000.0
+    )
+    realtime_priority: int = quantity(
+        10,
+        "of the process among the real-time ones, where the system allows any; 0 asks for none",
+        minimum=0,
+        maximum=99,
+    )
     command_timeout: float = quantity(
         0.1, "without a new velocity command for this long the coils go to zero", unit="s", minimum=0.01, maximum=1.0
     )
-    zero_hold: float = quantity(
-        1.0, "after a stop, zero currents are sent for this long", unit="s", minimum=0.1, maximum=60.0
-    )
-    max_speed: float = quantity(0.02, "greatest needle speed", unit="m/s", minimum=1e-5, maximum=0.5)
     pose_timeout: float = quantity(
         0.2,
         "without a new needle pose for this long the coils go to zero: currents depend on where the needle is",
@@ -39,8 +57,49 @@ class CoilBridgeSettings(Configuration):
         minimum=0.01,
         maximum=1.0,
     )
+    zero_hold: float = quantity(
+        1.0, "after a stop, zero currents are published for this long", unit="s", minimum=0.1, maximum=60.0
+    )
+    max_speed: float = quantity(0.02, "greatest speed of the needle's tip", unit="m/s", minimum=1e-5, maximum=0.5)
+    max_acceleration: float = quantity(
+        0.5, "greatest change of that velocity; a stop is not limited", unit="m/s^2", minimum=1e-3, maximum=100.0
+    )
     max_current: float = quantity(
         10.0, "greatest current in a coil, in either direction", unit="A", minimum=0.01, maximum=100.0
+    )
+    max_current_slew: float = quantity(
+        1000.0, "greatest change of a coil's current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
+    )
+
+    dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
+    keep_out: float = quantity(
+        0.0005, "clearance that the needle keeps of the wall and of obstacles", unit="m", minimum=0.0, maximum=0.05
+    )
+    approach_rate: float = quantity(
+        10.0,
+        "share of its clearance by which the needle may approach, each second",
+        unit="1/s",
+        minimum=0.1,
+        maximum=1e3,
+    )
+    disc_obstacles: tuple[float, ...] = quantity(
+        (), "x, y and radius of each round obstacle", unit="m", minimum=-0.5, maximum=0.5, multiple=3
+    )
+    polygon_obstacles: tuple[float, ...] = quantity(
+        (), "x and y of each corner of all polygons", unit="m", minimum=-0.5, maximum=0.5, multiple=2
+    )
+    polygon_sizes: tuple[int, ...] = quantity(
+        (),
+        "number of corners of each polygon; negative for a hole in the polygon before it",
+        minimum=-10000,
+        maximum=10000,
+    )
+
+    calibration: str = quantity(
+        "", "file of the coils' calibration; without one, coil_angles and the three parameters before it tell all"
+    )
+    coil_model: str = quantity(
+        "loops", "field of a coil: that of a loop, or of a dipole in its middle", choices=("loops", "dipoles")
     )
     field_per_current: float = quantity(
         1.2e-3,
@@ -82,10 +141,24 @@ class CoilBridgeSettings(Configuration):
         maximum=2.0 * math.pi,
     )
 
+    coil_resistance: float = quantity(
+        1.0,
+        "of a coil with its cable, cold; for boards that set a duty cycle",
+        unit="ohm",
+        minimum=0.01,
+        maximum=1000.0,
+    )
+    roboclaw_ports: tuple[str, ...] = quantity((), "serial port of each board, which has two coils in a row")
+    roboclaw_addresses: tuple[int, ...] = quantity((), "address of each board, 128 if empty", minimum=128, maximum=135)
+    roboclaw_baud_rate: int = quantity(115200, "of the serial lines; USB has none", minimum=2400, maximum=1000000)
+    roboclaw_timeout: float = quantity(
+        0.2, "without a packet for this long a board stops by itself; whole tenths", unit="s", minimum=0.1, maximum=1.0
+    )
+
     @property
     def reach(self) -> float:
         """How far from the dish's centre a needle may be: well within the coils [m]."""
-        return INSIDE * self.coil_distance
+        return INSIDE * min(coil.distance for coil in self.coils_properties())
 
     def needle(self) -> NeedleMechanics:
         """Return the needle's mechanics."""
@@ -98,14 +171,68 @@ class CoilBridgeSettings(Configuration):
             self.needle_turning_drag,
         )
 
+    @cached_property
+    def _calibration(self) -> CoilCalibration | None:
+        """What the calibration file says, read once; None without one."""
+        if not self.calibration:
+            return None
+        try:
+            return read_calibration(Path(os.path.expanduser(self.calibration)))
+        except ConfigurationError as error:
+            # What reads the set-up puts its own file's name in front.
+            name = f"{self.GROUP}.calibration, {error.source}: {error.name}"
+            raise ConfigurationError(name, error.value, error.expectation) from None
+
+    def coils_properties(self) -> tuple[CoilProperties, ...]:
+        """Return the coils, in the order of their currents: as calibrated, else as the parameters have them."""
+        if self._calibration is not None:
+            return self._calibration.coils
+        return coils_around(self.coil_angles, self.coil_distance, self.coil_radius, self.field_per_current)
+
+    def resistances(self) -> tuple[float, ...]:
+        """Return each coil's resistance with its cable, as calibrated where that is known [ohm]."""
+        return tuple(coil.resistance or self.coil_resistance for coil in self.coils_properties())
+
     def allocation(self) -> CoilAllocation:
         """Return what turns velocities into currents."""
-        coils = LoopCoils(self.coil_angles, self.coil_distance, self.coil_radius, self.field_per_current)
+        model = self.coil_model if self._calibration is None else self._calibration.model
+        coils = make_coils(model, self.coils_properties())
         return CoilAllocation(coils, self.needle(), self.aligning_field, self.max_current)
 
+    def obstacles(self) -> tuple[Disc | Polygon, ...]:
+        """Return all obstacles: the discs, then the polygons."""
+        discs = discs_from(self.disc_obstacles)
+        return (*discs, *polygons_from(self.GROUP, self.polygon_obstacles, self.polygon_sizes))
+
+    def workspace(self) -> Workspace:
+        """Return what keeps the needle off the wall and off the obstacles."""
+        radius, needle = 0.5 * self.dish_diameter, self.needle()
+        return Workspace(radius, self.obstacles(), self.keep_out, self.approach_rate, needle, self.max_speed)
+
     def check(self) -> None:
-        """Refuse fewer than three coils, which could not pull in every direction, and a coiled needle."""
+        """Refuse too few coils, a coiled needle, obstacles that are none, and limits that cannot hold."""
         require_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
             name = f"{self.GROUP}.coil_angles"
             raise ConfigurationError(name, list(self.coil_angles), "at least 3 coils' angles [rad]")
+        if self._calibration is not None:
+            count, known = len(self._calibration.coils), len(self.coil_angles)
+            if count != known:
+                name = f"{self.GROUP}.calibration"
+                raise ConfigurationError(name, f"{count} coils in {self.calibration}", f"{known}, as in coil_angles")
+        for obstacle in self.obstacles():
+            if isinstance(obstacle, Disc) and obstacle.radius <= 0.0:
+                name = f"{self.GROUP}.disc_obstacles"
+                raise ConfigurationError(name, obstacle.radius, "as every third number a positive radius [m]")
+        if 0.5 * self.dish_diameter - self.keep_out < 0.5 * self.needle_length:
+            room = 0.5 * (self.dish_diameter - self.needle_length)
+            raise ConfigurationError(
+                f"{self.GROUP}.keep_out", self.keep_out, f"less than {room:g} m, room for the needle"
+            )
+        if self.autostart == "armed" and self.driver == "roboclaw":
+            name = f"{self.GROUP}.autostart"
+            raise ConfigurationError(name, self.autostart, "active at most: hardware is armed by a person")
+        # One step may not take more than all that is left of the clearance.
+        if self.approach_rate > self.rate:
+            name = f"{self.GROUP}.approach_rate"
+            raise ConfigurationError(name, self.approach_rate, f"at most coil_bridge.rate, {self.rate:g} 1/s")

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
-from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 NEEDLE = CoilBridgeSettings().needle()
-COILS = LoopCoils((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3)
+COILS = LoopCoils(coils_around((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3))
 EAST = np.array([1.0, 0.0])
 MIDDLE = -0.5 * NEEDLE.length * EAST  # the tail of a needle whose middle is the dish's
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.field import CoilProperties, DipoleCoils, LoopCoils, coils_around, make_coils
+from magnetosuture_thread.errors import ConfigurationError
 
 DISTANCE, RADIUS, FIELD = 0.05, 0.025, 1.2e-3
 
 
 def coils(*angles: float) -> LoopCoils:
     """Return coils at some angles."""
-    return LoopCoils(angles or (0.0,), DISTANCE, RADIUS, FIELD)
+    return LoopCoils(coils_around(angles or (0.0,), DISTANCE, RADIUS, FIELD))
 
 
 def test_the_field_at_the_centre_is_the_one_measured_and_points_to_the_coil():
@@ -43,3 +44,59 @@ def test_off_the_axis_it_is_the_sum_over_the_loop(point: tuple[float, float]):
     scale = FIELD / summed(np.zeros(3))[0]
     expected = scale * summed(np.array([*point, 0.0]))[:2]
     np.testing.assert_allclose(coils().per_current(np.array(point))[:, 0], expected, rtol=1e-5, atol=1e-9)
+
+
+UNLIKE = (
+    CoilProperties("east", 0.1, 0.05, 0.025, 1.2e-3),
+    CoilProperties("north", 1.4, 0.06, 0.02, -0.9e-3),
+    CoilProperties("west", 3.0, 0.045, 0.03, 1.5e-3),
+)
+
+
+@pytest.mark.parametrize("model", ["loops", "dipoles"])
+def test_coils_may_differ_in_everything(model: str):
+    together = make_coils(model, UNLIKE)
+    assert together.names == ("east", "north", "west")
+    point = np.array([0.006, -0.004])
+    for index, coil in enumerate(UNLIKE):
+        alone = make_coils(model, [coil]).per_current(point)
+        np.testing.assert_allclose(together.per_current(point)[:, [index]], alone, rtol=1e-13)
+
+
+@pytest.mark.parametrize("model", ["loops", "dipoles"])
+def test_the_field_at_the_centre_is_each_coils_own_and_points_away_where_it_is_negative(model: str):
+    field = make_coils(model, UNLIKE).per_current(np.zeros(2))
+    for coil, found in zip(UNLIKE, field.T, strict=True):
+        expected = coil.field_per_current * np.array([np.cos(coil.angle), np.sin(coil.angle)])
+        np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
+def test_a_dipole_is_the_limit_of_a_small_loop():
+    small = [CoilProperties(coil.name, coil.angle, coil.distance, 0.002, coil.field_per_current) for coil in UNLIKE]
+    for point in (np.array([0.01, 0.012]), np.array([-0.013, -0.009])):
+        loops, dipoles = LoopCoils(small).per_current(point), DipoleCoils(small).per_current(point)
+        np.testing.assert_allclose(loops, dipoles, rtol=0.02, atol=1e-6)
+
+
+@pytest.mark.parametrize("model", ["loops", "dipoles"])
+def test_in_the_dish_plane_it_has_no_curl(model: str):
+    field, point, step = make_coils(model, UNLIKE), np.array([0.007, 0.005]), 1e-6
+    by_x, by_y = (
+        (field.per_current(point + step * way) - field.per_current(point - step * way)) / (2.0 * step)
+        for way in np.eye(2)
+    )
+    np.testing.assert_allclose(by_x[1], by_y[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"distance": 50.0}, r"coil\.distance: got 50\.0, expected a number from 0\.01 to 1 m"),
+        ({"field_per_current": 0.0}, "at least 1e-06 T/A"),
+        ({"radius": float("nan")}, "radius"),
+        ({"name": " "}, "a name"),
+    ],
+)
+def test_a_coil_that_cannot_be_is_refused(change: dict, words: str):
+    with pytest.raises(ConfigurationError, match=words):
+        CoilProperties(**{"name": "east", **change})

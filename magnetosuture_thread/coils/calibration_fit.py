@@ -1,0 +1,267 @@
+"""Fits the model of the coils to measurements of their field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from magnetosuture_thread.coils.calibration import LEAST_COILS, CoilCalibration
+from magnetosuture_thread.coils.field import MODELS, CoilProperties
+from magnetosuture_thread.coils.measurements import ProbeMeasurements
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+
+Array = NDArray[np.float64]
+
+LEAST_READINGS = 6  # of a coil with current in it: twelve numbers for its four, with some to tell how well they fit
+NEAREST, FARTHEST = 1.05, 1.0  # a coil is no nearer than so many times the farthest point, nor farther than this [m]
+RADII = (0.002, 0.5)  # m
+NO_RADIUS = 0.025  # m; of a dipole, whose field has none
+ROUGH, EXACT = 1e-5, 1e-12  # of cost and parameters, where a fit ends: of one coil, which is a start, and of all
+STARTS = (1.0, 0.5, 2.0)  # of the distance that the gradient tells, where a fit begins
+WORST_FIT = 0.25  # of the field measured; with a greater residual it is not from these coils
+SINGULAR = 1e-6  # of the scaled Jacobian: below, some parameters cannot be told apart
+PARAMETERS = ("angle", "distance", "radius", "field_per_current")
+# Standard deviations, of the angle in rad, of the others as a share: beyond, a parameter is poorly determined, or
+# the measurements say nothing of it. The field hardly depends on the radius, so it may be anything.
+POOR = {"angle": 0.02, "distance": 0.1, "radius": 0.25, "field_per_current": 0.02}
+UNKNOWN = {"angle": 0.3, "distance": 1.0, "radius": math.inf, "field_per_current": 0.5}
+
+
+@dataclass(frozen=True)
+class CalibrationFit:
+    """What a fit found.
+
+    Attributes:
+        calibration: the coils.
+        deviations: standard deviations of angle [rad], distance [m], radius [m] and field per current [T/A]
+            of each coil, shape (m, 4); not a number where the model has no such parameter.
+        poor: names of the parameters of each coil that are poorly determined.
+        background: what the probe reads without currents, shape (2,) [T].
+        residual: root of the mean square of a component's difference [T].
+        worst: line of the file with the largest difference, and its size [T].
+        readings: how many the fit rests on.
+    """
+
+    calibration: CoilCalibration
+    deviations: Array
+    poor: tuple[tuple[str, ...], ...]
+    background: Array
+    residual: float
+    worst: tuple[int, float]
+    readings: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all as plain values: coils with their deviations, and the whole."""
+        coils = [
+            {
+                **{key: getattr(coil, key) for key in ("name", *PARAMETERS, "residual")},
+                "deviations": dict(zip(PARAMETERS, row, strict=True)),
+                "poor": list(poor),
+            }
+            for coil, row, poor in zip(self.calibration.coils, self.deviations.tolist(), self.poor, strict=True)
+        ]
+        return {
+            "model": self.calibration.model,
+            "coils": coils,
+            "background": self.background.tolist(),
+            "residual": self.residual,
+            "worst": self.worst,
+            "readings": self.readings,
+        }
+
+
+def fit_calibration(data: ProbeMeasurements, model: str = "loops") -> CalibrationFit:
+    """Fit the coils of a model, and a background, to measurements.
+
+        min  sum | B_0 + I_i b(p_i; angle, distance, radius, field) - B_i |^2
+
+    over four numbers of each coil (three of a dipole) and the background B_0 of earth and probe, which is
+    the same in all. First coil by coil, from several starts and both polarities, then all at once. The
+    standard deviations are those of least squares, s^2 (J^T J)^-1, with the scatter s of the residuals.
+
+    Args:
+        data: readings in the dish.
+        model: loops or dipoles.
+
+    Raises:
+        InvalidInputError: too few coils or readings, points beyond a coil, parameters that these readings say
+            nothing of, or a field that no such coils have.
+
+    Source: none; nonlinear least squares by scipy, trust region reflective.
+    """
+    _check_readings(data)
+    size = float(np.sqrt(np.mean(data.field[data.current != 0.0] ** 2)))
+    off = data.field[data.current == 0.0]
+    background = off.mean(axis=0) if len(off) else np.zeros(2)
+    starts = [_start(data, index, model, background, size) for index in range(len(data.names))]
+    solve = _Problem(data, np.arange(len(data.names)), model, size)
+    found = solve.best([np.concatenate([*starts, background / size])], EXACT)
+    difference = size * found.fun.reshape(-1, 2)
+    residual = float(np.sqrt(np.mean(difference**2)))
+    if residual > WORST_FIT * size:
+        given = f"a field that differs from the model's by {residual / size:.0%}"
+        raise InvalidInputError(data.source, given, "one coil on at a time, in the dish frame, in SI units")
+    coils = [_coil(data, index, found.x, size, difference) for index in range(len(data.names))]
+    deviations = _deviations(data, coils, model, found.jac, size, residual / size)
+    apart = np.linalg.norm(difference, axis=1)
+    worst = int(np.argmax(apart))
+    return CalibrationFit(
+        CoilCalibration("", "", "", model, tuple(coils)),
+        deviations,
+        tuple(_beyond(coil, row, POOR) for coil, row in zip(coils, deviations, strict=True)),
+        size * found.x[-2:],
+        residual,
+        (int(data.lines[worst]), float(apart[worst])),
+        len(apart),
+    )
+
+
+def _check_readings(data: ProbeMeasurements) -> None:
+    if len(data.names) < LEAST_COILS:
+        raise InvalidInputError(f"{data.source}, coil", ", ".join(data.names), f"at least {LEAST_COILS} coils")
+    for index, name in enumerate(data.names):
+        count = int(np.count_nonzero(data.current[data.coil == index]))
+        if count < LEAST_READINGS:
+            expected = f"at least {LEAST_READINGS} with current, all over the dish"
+            raise InvalidInputError(f"{data.source}, {name}", f"{count} readings with current", expected)
+    if float(np.abs(data.field).max()) < 1e-6:
+        raise InvalidInputError(f"{data.source}, bx and by", "less than 1e-6 T everywhere", "the field of coils in T")
+
+
+class _Problem:
+    """Residuals of some of the coils, in units of the field's size, over numbers of order one.
+
+    The numbers are, for each coil, angle, log distance, log radius and field / size; then the background / size.
+    """
+
+    def __init__(self, data: ProbeMeasurements, coils: NDArray[np.int64], model: str, size: float) -> None:
+        rows = np.flatnonzero(np.isin(data.coil, coils))
+        self._of = np.searchsorted(coils, data.coil[rows])
+        self._points, self._current = data.points[rows], data.current[rows, None]
+        self._field, self._model = data.field[rows] / size, MODELS[model]
+        nearest = max(0.01, NEAREST * float(np.hypot(*data.points.T).max()))
+        radii = RADII if model == "loops" else (NO_RADIUS, 1.000001 * NO_RADIUS)
+        low = [-np.inf, math.log(nearest), math.log(radii[0]), -np.inf]
+        high = [np.inf, math.log(max(FARTHEST, 2.0 * nearest)), math.log(radii[1]), np.inf]
+        count = len(coils)
+        self._bounds = (np.array(low * count + [-np.inf] * 2), np.array(high * count + [np.inf] * 2))
+
+    def best(self, starts: list[Array], tolerance: float, background: bool = True) -> Any:
+        """Return the best solution from several starts."""
+        low, high = self._bounds
+        if not background:  # which one coil alone might not tell from its own field
+            low, high = low.copy(), high.copy()
+            low[-2:], high[-2:] = starts[0][-2:] - 1e-9, starts[0][-2:] + 1e-9
+        found = [
+            least_squares(
+                self._residuals,
+                np.clip(start, low, high),
+                jac="3-point",
+                bounds=(low, high),
+                x_scale="jac",
+                ftol=tolerance,
+                xtol=tolerance,
+                gtol=tolerance,
+                max_nfev=300,
+            )
+            for start in starts
+        ]
+        return min(found, key=lambda solution: float(solution.cost))
+
+    def _residuals(self, x: Array) -> Array:
+        angle, distance, radius, field = x[:-2].reshape(-1, 4).T[:, self._of]
+        distance, radius = np.exp(distance), np.exp(radius)
+        axis = np.column_stack([np.cos(angle), np.sin(angle)])
+        across = np.column_stack([-axis[:, 1], axis[:, 0]])
+        along, aside = np.sum(self._points * axis, axis=1), np.sum(self._points * across, axis=1)
+        axial, outwards = self._model(along, aside, distance, radius, field)
+        of_coil = self._current * (axial[:, None] * axis + outwards[:, None] * across)
+        return np.asarray((x[-2:] + of_coil - self._field).ravel())
+
+
+def _start(data: ProbeMeasurements, index: int, model: str, background: Array, size: float) -> Array:
+    """Return a coil's four numbers as its own readings have them, the background taken off."""
+    on = (data.coil == index) & (data.current != 0.0)
+    per_current = (data.field[on] - background) / data.current[on, None]
+    points = data.points[on]
+    # Field and gradient at the centre by a straight line, and how fast the field grows along itself.
+    system = np.column_stack([np.ones(len(points)), points / max(1e-6, float(np.abs(points).max()))])
+    line = np.linalg.lstsq(system, per_current, rcond=None)[0]
+    strength = max(float(np.linalg.norm(line[0])), 1e-9)
+    along = line[0] / strength
+    growth = abs(float(along @ (line[1:].T / max(1e-6, float(np.abs(points).max()))) @ along)) / strength
+    distance = 2.5 / max(growth, 2.5)  # a dipole's is 3 / distance, a loop's a little less
+    angle = math.atan2(along[1], along[0])
+    starts = [
+        np.array([turned, math.log(share * distance), math.log(0.5 * share * distance), sign * strength / size])
+        for share in STARTS
+        for turned, sign in ((angle, 1.0), (angle + math.pi, -1.0))
+    ]
+    alone = _Problem(data, np.array([index]), model, size)
+    found = alone.best([np.concatenate([start, background / size]) for start in starts], ROUGH, background=False)
+    return np.asarray(found.x[:4])
+
+
+def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference: Array) -> CoilProperties:
+    """Return a coil from its numbers."""
+    angle, distance, radius, field = x[4 * index : 4 * index + 4]
+    farthest = int(np.argmax(np.hypot(*data.points.T)))
+    if math.exp(distance) <= 1.001 * NEAREST * float(np.linalg.norm(data.points[farthest])):
+        where, place = data.at(int(data.lines[farthest])), data.points[farthest].tolist()
+        raise InvalidInputError(
+            where, f"a point at {place} m", f"points within the coils; {data.names[index]} is nearer"
+        )
+    residual = float(np.sqrt(np.mean(difference[data.coil == index] ** 2)))
+    wrapped = math.remainder(float(angle), 2.0 * math.pi)
+    try:
+        return CoilProperties(
+            data.names[index], wrapped, math.exp(distance), math.exp(radius), float(field) * size, residual=residual
+        )
+    except ConfigurationError as error:
+        name = error.name.replace(CoilProperties.GROUP, data.names[index], 1)
+        raise InvalidInputError(f"{data.source}, {name}", error.value, error.expectation) from None
+
+
+def _deviations(
+    data: ProbeMeasurements, coils: list[CoilProperties], model: str, jacobian: Array, size: float, residual: float
+) -> Array:
+    """Return standard deviations, shape (m, 4), once it is known that there are any."""
+    used = np.ones(jacobian.shape[1], dtype=bool)
+    if model == "dipoles":
+        used[2:-2:4] = False
+    own = jacobian[:, used]
+    scale = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
+    _, values, turned = np.linalg.svd(own / scale, full_matrices=False)
+    labels = [f"{coil.name}.{name}" for coil in coils for name in PARAMETERS] + ["background x", "background y"]
+    if values[-1] < SINGULAR * values[0]:
+        weights = np.abs(turned[-1])
+        mixed = [label for label, weight in zip(np.array(labels)[used], weights, strict=True) if weight > 0.3]
+        words = "readings that tell them apart: all over the dish, and some without current"
+        raise InvalidInputError(data.source, f"nothing that tells {', '.join(mixed)}", words)
+    freedom = max(1, len(own) - own.shape[1])
+    scatter = residual * math.sqrt(len(own) / freedom)
+    deviations = np.full(len(used), np.nan)
+    deviations[used] = scatter * np.linalg.norm(turned.T / values, axis=1) / scale
+    shaped = deviations[:-2].reshape(-1, 4)
+    shaped = shaped * np.array([[1.0, coil.distance, coil.radius, size] for coil in coils])
+    for coil, row in zip(coils, shaped, strict=True):
+        unknown = _beyond(coil, row, UNKNOWN)
+        if unknown:
+            words = "readings that determine it: all over the dish, with a field well above the probe's noise"
+            raise InvalidInputError(f"{data.source}, {coil.name}", f"an unknown {' and '.join(unknown)}", words)
+    return np.asarray(shaped)
+
+
+def _beyond(coil: CoilProperties, deviations: Array, most: dict[str, float]) -> tuple[str, ...]:
+    """Return the parameters whose standard deviation is beyond some bounds."""
+    sizes = {name: 1.0 if name == "angle" else abs(getattr(coil, name)) for name in PARAMETERS}
+    return tuple(
+        name
+        for name, deviation in zip(PARAMETERS, deviations.tolist(), strict=True)
+        if deviation > most[name] * sizes[name]
+    )

@@ -1,0 +1,131 @@
+"""The file of the coils' calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
+from magnetosuture_thread.coils.field import CoilProperties
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.errors import ConfigurationError
+
+COILS = (
+    CoilProperties("east", 0.01, 0.052, 0.024, 1.1e-3, 2.5, 3.0e-5),
+    CoilProperties("north", 1.55, 0.048, 0.026, -1.3e-3),
+    CoilProperties("west", 3.1, 0.05, 0.025, 1.2e-3, 2.7),
+    CoilProperties("south", -1.6, 0.05, 0.025, 1.2e-5),
+)
+GIVEN = CoilCalibration("rig 1", "2026-11-21", "by hand; µT probe", "dipoles", COILS)
+COIL = "{name: %s, angle: 0.0, distance: 0.05, radius: 0.025, field_per_current: 1.2e-3}"
+THREE = f"[{COIL % 'a'}, {COIL % 'b'}, {COIL % 'c'}]"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_what_is_written_is_read(tmp_path: Path):
+    assert read_calibration(written(tmp_path, GIVEN.to_yaml())) == GIVEN
+
+
+def test_the_least_file_has_a_model_and_coils(tmp_path: Path):
+    read = read_calibration(written(tmp_path, f"model: loops\ncoils: {THREE}\n"))
+    assert (read.name, read.date, read.notes) == ("", "", "")
+    assert read.coils[0].resistance == 0.0
+    assert read.field().names == ("a", "b", "c")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("model: [", "coil calibration: got .* expected valid YAML"),
+        ("- 1", "expected keys name, date"),
+        (f"coils: {THREE}", "model: got None, expected a value"),
+        (f"model: magic\ncoils: {THREE}", "model: got 'magic', expected one of loops, dipoles"),
+        (f"model: [loops]\ncoils: {THREE}", "one of loops, dipoles"),
+        (f"model: loops\nunits: mm\ncoils: {THREE}", "units: got 'mm', expected one of name"),
+        (f"model: loops\nname: 7\ncoils: {THREE}", "name: got 7, expected text"),
+        (f"model: loops\ncoils: [{COIL % 'a'}]", "coils: got '1 coils', expected a list of at least 3"),
+        ("model: loops\ncoils: 4", "coils: got 4"),
+        (f"model: loops\ncoils: [{COIL % 'a'}, {COIL % 'b'}, 7]", r"coils\[2\]: got 7, expected keys"),
+        (f"model: loops\ncoils: [{COIL % 'a'}, {COIL % 'b'}, {COIL % 'a'}]", "two of the name a"),
+        ("model: loops\ncoils: " + THREE.replace("0.05", "50.0", 1), r"coils\[0\]\.distance: got 50\.0, .* to 1 m"),
+        ("model: loops\ncoils: " + THREE.replace("0.05", ".nan", 1), r"coils\[0\]\.distance: got nan"),
+        ("model: loops\ncoils: " + THREE.replace("1.2e-3", "1.2", 1), r"coils\[0\]\.field_per_current: got 1\.2"),
+        ("model: loops\ncoils: " + THREE.replace("1.2e-3", "0.0", 1), r"coils\[0\]\.field_per_current: .* at least"),
+        ("model: loops\ncoils: " + THREE.replace("radius: 0.025, ", "", 1), r"coils\[0\]\.radius: got None"),
+        ("model: loops\ncoils: " + THREE.replace("radius", "diameter", 1), r"coils\[0\]\.radius: got None"),
+        ("model: loops\ncoils: " + THREE.replace("radius", "turns: 9, radius", 1), r"coils\[0\]\.turns: got 9"),
+        ("model: loops\ncoils: " + THREE.replace("name: a", "name: 3", 1), r"coils\[0\]\.name: got 3, expected text"),
+        ("model: loops\nmodel: loops", "model is given twice"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_refused_with_its_name_the_key_and_the_value(
+    tmp_path: Path, text: str, words: str
+):
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        read_calibration(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_not_text_is_refused(tmp_path: Path):
+    with pytest.raises(ConfigurationError, match="No such file"):
+        read_calibration(tmp_path / "none.yaml")
+    (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigurationError, match="not text"):
+        read_calibration(tmp_path / "bytes.yaml")
+
+
+def test_the_bridge_takes_coils_model_reach_and_resistances_from_it(tmp_path: Path):
+    path = written(tmp_path, GIVEN.to_yaml())
+    settings = CoilBridgeSettings(calibration=str(path), coil_resistance=1.5)
+    assert settings.coils_properties() == COILS
+    assert settings.resistances() == (2.5, 1.5, 2.7, 1.5)
+    assert settings.reach == pytest.approx(0.9 * 0.048)
+    assert settings.allocation().names == ("east", "north", "west", "south")
+    # A dipole's field, as the file has it, whatever the parameter says.
+    assert settings.coil_model == "loops"
+
+
+def test_without_one_the_parameters_hold():
+    settings = CoilBridgeSettings(coil_distance=0.06, coil_resistance=2.0)
+    assert [coil.distance for coil in settings.coils_properties()] == [0.06] * 4
+    assert settings.resistances() == (2.0,) * 4
+    assert settings.reach == pytest.approx(0.054)
+
+
+def test_both_models_drive_the_needle_alike():
+    tail, east = np.array([-0.0035, 0.0]), np.array([1.0, 0.0])
+    loops, dipoles = (CoilBridgeSettings(coil_model=model).allocation() for model in ("loops", "dipoles"))
+    first, second = (model.allocate(0.004 * east, tail, east).currents for model in (loops, dipoles))
+    assert np.linalg.norm(first - second) > 1e-3
+    assert first @ second > 0.9 * np.linalg.norm(first) * np.linalg.norm(second)
+
+
+def test_the_home_folder_may_be_a_tilde(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    written(tmp_path, GIVEN.to_yaml())
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert CoilBridgeSettings(calibration="~/rig.yaml").coils_properties() == COILS
+
+
+def test_the_bridge_names_parameter_and_file(tmp_path: Path):
+    path = written(tmp_path, GIVEN.to_yaml().replace("0.048", "48.0"))
+    with pytest.raises(ConfigurationError) as caught:
+        CoilBridgeSettings(calibration=str(path))
+    expected = f"coil_bridge.calibration, {path}: coils[1].distance: got 48.0, expected a number from 0.01 to 1 m"
+    assert str(caught.value) == expected
+
+
+def test_a_calibration_of_another_number_of_coils_is_refused(tmp_path: Path):
+    path = written(tmp_path, GIVEN.to_yaml())
+    with pytest.raises(
+        ConfigurationError, match=r"coil_bridge\.calibration: got '4 coils .*expected 3, as in coil_ang"
+    ):
+        CoilBridgeSettings(calibration=str(path), coil_angles=(0.0, 2.0, 4.0))
