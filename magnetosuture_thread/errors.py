@@ -78,3 +78,17 @@ class SolverError(MagnetosutureError):
 
 class GraphError(MagnetosutureError):
     """A node or a part of the running graph that failed."""
+
+
+class DriverError(MagnetosutureError):
+    """A coil driver that can never work as it is configured.
+
+    Args:
+        driver: its name.
+        problem: what is wrong and what was expected.
+    """
+
+    def __init__(self, driver: str, problem: str) -> None:
+        self.driver = driver
+        self.problem = problem
+        super().__init__(f"driver {driver}: {problem}")

@@ -1,4 +1,4 @@
-"""The graph's interface in words: nodes, frame, and each topic's name and type, written down once.
+"""The graph's interface in words: nodes, frame, and each topic's name and type, the services, written down once.
 
 Nothing of ROS is needed here: bags are read and written by the same names on machines without it.
 
@@ -49,7 +49,11 @@ MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
 THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
 OBSTACLE_MARKERS = Channel("thread/obstacles", "visualization_msgs/msg/MarkerArray")
 CURRENTS = Channel("coils/currents", "magnetosuture_msgs/msg/CoilCurrents")
+BRIDGE_STATE = Channel("coils/state", "magnetosuture_msgs/msg/CoilBridgeState")
 DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+
+# Services of the coil bridge, of std_srvs: SetBool, Trigger and Trigger.
+ARM, EMERGENCY_STOP, RESET = "coils/arm", "coils/emergency_stop", "coils/reset"
 
 # What only a simulation knows; never an input of the graph.
 TRUE_NEEDLE = Channel("truth/needle", "geometry_msgs/msg/PoseStamped")
@@ -57,5 +61,6 @@ TRUE_THREAD = Channel("truth/thread", "nav_msgs/msg/Path")
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 
+RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents")  # the wires to the simulated coils
 FAULT_REQUEST = Channel("rig/fault", "std_msgs/msg/String")  # KIND DURATION, in force from now on
 CLOCK = Channel("clock", "rosgraph_msgs/msg/Clock")

@@ -39,6 +39,8 @@ ALLOWED = {
 
 # Packages that only some rooms may know.
 OWNERS = {
+    "basicmicro": {"coils"},
+    "serial": {"coils"},
     "cv2": {"vision", "rig"},
     "mcap": {"bags"},
     "rosbags": {"bags"},
@@ -53,11 +55,13 @@ OWNERS = {
     "builtin_interfaces": {"nodes"},
     "diagnostic_msgs": {"nodes"},
     "geometry_msgs": {"nodes"},
+    "lifecycle_msgs": {"nodes"},
     "magnetosuture_msgs": {"nodes"},
     "nav_msgs": {"nodes"},
     "rosgraph_msgs": {"nodes"},
     "sensor_msgs": {"nodes"},
     "std_msgs": {"nodes"},
+    "std_srvs": {"nodes"},
     "visualization_msgs": {"nodes"},
 }
 

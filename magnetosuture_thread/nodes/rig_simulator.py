@@ -8,7 +8,7 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from magnetosuture_msgs.msg import CoilCurrents
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.time import Time
@@ -16,11 +16,12 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
-from magnetosuture_thread.nodes import camera_messages, messages, topics
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.rig_currents import RigCurrents
+from magnetosuture_thread.nodes.rig_frames import FramePublisher
 from magnetosuture_thread.nodes.run import run
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Frame, Rig
 from magnetosuture_thread.rig.settings import RigSettings
@@ -50,30 +51,14 @@ class RigSimulatorNode(Node):
         self._last_index = -1
         self._frames = self._skipped = 0
         self._late: deque[tuple[float, int, Frame]] = deque()
-        self._compressed = topics.COMPRESSED_IMAGE.publisher(self)
-        self._raw = topics.IMAGE.publisher(self)
-        self._info = topics.CAMERA_INFO.publisher(self)
-        self._needle = topics.TRUE_NEEDLE.publisher(self)
-        camera = self.rig.camera
-        self._camera = camera_messages.camera_info(Time().to_msg(), camera.size, camera.view, settings.camera_distance)
-        self._path = messages.PathMaker()
-        self._thread = topics.TRUE_THREAD.publisher(self)
-        topics.CURRENTS.subscribe(self, self.on_currents)
+        self._publisher = FramePublisher(self, self.rig.camera, settings)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
         if simulated:
             self._clocks = topics.CLOCK.publisher(self)
             self.create_timer(CLOCK_PERIOD / self._pace, self.on_clock, clock=self._steady)
         self.create_timer(1.0 / (settings.frame_rate * self._pace), self.on_frame, clock=self._steady)
+        self.currents = RigCurrents(self, settings, self._steady, self._apply)
         self.get_logger().info("ready: everything here is simulated")
-
-    def on_currents(self, message: CoilCurrents) -> None:
-        """Set the coils' currents from now on."""
-        try:
-            self.rig.apply(np.asarray(message.current, dtype=float), self._elapsed())
-        except InvalidInputError as error:
-            self._health.refuse(error)
-        except MagnetosutureError as error:
-            self._fail(error)
 
     def on_fault(self, message: String) -> None:
         """Take a fault that begins now."""
@@ -100,7 +85,22 @@ class RigSimulatorNode(Node):
             self._take(self._phase + index / self._settings.frame_rate)
         while self._late and self._late[0][0] <= elapsed:
             _, stamp, frame = self._late.popleft()
-            self._publish(stamp, frame)
+            self._publisher.publish(stamp, frame)
+
+    def destroy_node(self) -> None:
+        """Take away the lines of simulated boards."""
+        try:
+            self.currents.close()
+        finally:
+            super().destroy_node()
+
+    def _apply(self, currents: NDArray[np.float64]) -> None:
+        try:
+            self.rig.apply(currents, self._elapsed())
+        except InvalidInputError as error:
+            self._health.refuse(error)
+        except MagnetosutureError as error:
+            self._fail(error)
 
     def _take(self, elapsed: float) -> None:
         try:
@@ -112,7 +112,7 @@ class RigSimulatorNode(Node):
         if frame.lateness:
             self._late.append((elapsed + frame.lateness, stamp, frame))
         else:
-            self._publish(stamp, frame)
+            self._publisher.publish(stamp, frame)
         self._frames += 1
         self._health.ok(self.rig.words, taken=self._frames, skipped=self._skipped)
 
@@ -120,18 +120,6 @@ class RigSimulatorNode(Node):
         """Switch the coils off where the simulation does not find its next state, and say so."""
         self.rig.switch_off()
         self._health.error(str(error))
-
-    def _publish(self, nanoseconds: int, frame: Frame) -> None:
-        stamp = Time(nanoseconds=nanoseconds).to_msg()
-        if frame.image is not None:
-            data = encode_jpeg(frame.image, self._settings.jpeg_quality)
-            self._compressed.publish(camera_messages.compressed_image(stamp, data))
-            if self._raw.get_subscription_count():
-                self._raw.publish(camera_messages.image(stamp, frame.image))
-            self._camera.header.stamp = stamp
-            self._info.publish(self._camera)
-        self._needle.publish(messages.placed(stamp, frame.tail, frame.heading))
-        self._thread.publish(self._path.message(stamp, frame.thread))
 
     def _elapsed(self) -> float:
         """Return the rig's own time since the node's start [s]."""

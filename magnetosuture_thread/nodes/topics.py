@@ -20,6 +20,9 @@ SENSOR = qos_profile_sensor_data
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
+FAR = 10_000  # numbers so far apart are of different publishers
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -58,6 +61,26 @@ class Topic:
             self.message, self.name, callback, self.qos, qos_overriding_options=options, raw=raw
         )
 
+    def subscribe_numbered(self, node: Node, callback: Callable[[Any, int], None]) -> Subscription:
+        """Subscribe, and get with each message the number that its publisher gave it.
+
+        Where the middleware does not number messages, all that tells is how many publishers there are: of
+        one, the messages are numbered here; of several, so that each message seems to be of another.
+        """
+        taken = 0
+
+        def take(message: Any, info: dict[str, Any]) -> None:
+            nonlocal taken
+            taken += 1
+            number = info["publication_sequence_number"]
+            if number is None or number == UNNUMBERED:
+                number = taken if subscription.get_publisher_count() <= 1 else taken * FAR
+            callback(message, number)
+
+        options = QoSOverridingOptions.with_default_policies()
+        subscription = node.create_subscription(self.message, self.name, take, self.qos, qos_overriding_options=options)
+        return subscription
+
 
 IMAGE = Topic(interface.IMAGE, SENSOR)
 COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, SENSOR)
@@ -75,6 +98,8 @@ MARGINS = Topic(interface.MARGINS, RELIABLE)
 THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE)
 OBSTACLE_MARKERS = Topic(interface.OBSTACLE_MARKERS, LATCHED)
 CURRENTS = Topic(interface.CURRENTS, RELIABLE)
+BRIDGE_STATE = Topic(interface.BRIDGE_STATE, LATCHED)
+RIG_CURRENTS = Topic(interface.RIG_CURRENTS, RELIABLE)
 FAULT_REQUEST = Topic(interface.FAULT_REQUEST, RELIABLE)
 CLOCK = Topic(interface.CLOCK, SENSOR, absolute=True)
 DIAGNOSTICS = Topic(interface.DIAGNOSTICS, RELIABLE, absolute=True)
@@ -90,6 +115,7 @@ OUTPUTS = (
     OBSTACLE_MARKERS,
     NEEDLE_SETPOINT,
     CURRENTS,
+    BRIDGE_STATE,
     DIAGNOSTICS,
 )
 

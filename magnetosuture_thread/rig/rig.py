@@ -87,7 +87,7 @@ class Rig:
         """
         if currents.shape != self.currents.shape or not np.all(np.isfinite(currents)):
             expected = f"{len(self.currents)} finite numbers [A]"
-            raise InvalidInputError("coils/currents.current", currents.tolist(), expected)
+            raise InvalidInputError("rig/currents.current", currents.tolist(), expected)
         self.advance(time)
         limit = self._settings.coil_max_current
         currents = np.clip(currents, -limit, limit)

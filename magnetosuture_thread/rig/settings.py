@@ -24,6 +24,7 @@ from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
+from magnetosuture_thread.rig.power.stage import PowerStage
 
 LARGEST_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
 
@@ -75,6 +76,18 @@ class RigSettings(Configuration):
         0.25, "without new currents for this long the power stage switches off", unit="s", minimum=0.01, maximum=10.0
     )
 
+    power_stage: str = quantity(
+        "topic",
+        "where the currents come from: a topic, or simulated RoboClaw boards, which a driver finds at ports",
+        choices=("topic", "roboclaw"),
+    )
+    power_stage_ports: tuple[str, ...] = quantity(
+        (), "path at which each board is to be found, with two coils in a row; for power_stage roboclaw"
+    )
+    coil_resistance: float = quantity(1.0, "of a coil on a board", unit="ohm", minimum=0.01, maximum=1000.0)
+    coil_inductance: float = quantity(0.01, "of a coil on a board", unit="H", minimum=1e-6, maximum=10.0)
+    supply_voltage: float = quantity(24.0, "of the boards", unit="V", minimum=1.0, maximum=80.0)
+
     needle_length: float = quantity(0.007, "along the body", unit="m", minimum=0.001, maximum=0.05)
     needle_width: float = quantity(0.0004, "diameter of the body", unit="m", minimum=5e-5, maximum=0.005)
     needle_curvature: float = quantity(
@@ -124,6 +137,10 @@ class RigSettings(Configuration):
             )
         if len(self.coil_angles) < 1:
             raise ConfigurationError(f"{self.GROUP}.coil_angles", [], "at least one coil's angle [rad]")
+        ports = len(self.power_stage_ports)
+        if self.power_stage == "roboclaw" and (not ports or 2 * ports != len(self.coil_angles)):
+            expectation = f"a path for two of the {len(self.coil_angles)} coils"
+            raise ConfigurationError(f"{self.GROUP}.power_stage_ports", list(self.power_stage_ports), expectation)
         require_needle(self.GROUP, self.needle_length, self.needle_curvature)
         self._check_room()
         for fault in self.faults:
@@ -190,6 +207,12 @@ class RigSettings(Configuration):
             for a in self.coil_angles
         ]
         return CoilField(coils)
+
+    def power(self) -> PowerStage | None:
+        """Return the simulated boards, None where currents come as messages."""
+        if self.power_stage == "topic":
+            return None
+        return PowerStage(self.power_stage_ports, self.supply_voltage, self.coil_resistance, self.coil_inductance)
 
     def dynamics(self) -> RigDynamics:
         """Return needle and thread at their start, in the field of the coils."""

@@ -8,6 +8,8 @@ import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 from std_msgs.msg import String
 
+from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
@@ -56,12 +58,12 @@ def test_nothing_moves_without_a_current_then_the_needle_is_pulled(graph):
     needles = graph.listen_later(topics.TRUE_NEEDLE)
     graph.add(RigSimulatorNode, faults=["dim 0.0 60.0"], **SMALL)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.CURRENTS, currents(graph, 0, 0, 0, 0))
+    graph.publish(topics.RIG_CURRENTS, currents(graph, 0, 0, 0, 0))
     graph.wait(lambda: len(needles) > 5, "frames")
     assert needles[-1].pose.position.x == pytest.approx(0.003, abs=1e-8)
 
     def pulled() -> bool:
-        graph.publish(topics.CURRENTS, currents(graph, 5, 0, -2, 0))
+        graph.publish(topics.RIG_CURRENTS, currents(graph, 5, 0, -2, 0))
         return needles[-1].pose.position.x > 0.0035
 
     graph.wait(pulled, "the needle to move")
@@ -78,14 +80,14 @@ def refusals(diagnostics) -> list[str]:
 def test_bad_currents_are_refused_and_said(graph, bad):
     diagnostics = graph.listen_later(topics.DIAGNOSTICS)
     graph.add(RigSimulatorNode, **SMALL)
-    graph.publish(topics.CURRENTS, currents(graph, *bad))
+    graph.publish(topics.RIG_CURRENTS, currents(graph, *bad))
     graph.wait(lambda: any("4 finite numbers" in text for text in refusals(diagnostics)), "a refusal")
 
 
 def test_currents_beyond_all_measure_end_nothing(graph):
     node = graph.add(RigSimulatorNode, **SMALL)
     needles = graph.listen(topics.TRUE_NEEDLE)
-    graph.publish(topics.CURRENTS, currents(graph, 1e160, -1e300, 0, 0))
+    graph.publish(topics.RIG_CURRENTS, currents(graph, 1e160, -1e300, 0, 0))
     graph.wait(lambda: node.rig.running > 0.05, "the currents")
     count = len(needles)
     graph.wait(lambda: len(needles) > count + 3, "frames")
@@ -96,7 +98,7 @@ def test_currents_beyond_all_measure_end_nothing(graph):
 def test_where_the_simulation_fails_the_coils_go_off_and_it_is_said(graph, monkeypatch):
     node = graph.add(RigSimulatorNode, **SMALL)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.CURRENTS, currents(graph, 3, 0, 0, 0))
+    graph.publish(topics.RIG_CURRENTS, currents(graph, 3, 0, 0, 0))
     graph.wait(lambda: node.rig.running > 0.0, "the currents")
 
     def fail(*_: object) -> None:
@@ -110,7 +112,7 @@ def test_where_the_simulation_fails_the_coils_go_off_and_it_is_said(graph, monke
 def test_a_fault_can_be_asked_for_now(graph):
     node = graph.add(RigSimulatorNode, **SMALL)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.CURRENTS, currents(graph, 0.01, 0, 0, 0))
+    graph.publish(topics.RIG_CURRENTS, currents(graph, 0.01, 0, 0, 0))
     graph.publish(topics.FAULT_REQUEST, String(data="glare 60"))
     graph.wait(lambda: any("with glare" in d.status[0].message for d in diagnostics), "the fault")
     graph.publish(topics.FAULT_REQUEST, String(data="sunshine 60"))
@@ -121,11 +123,33 @@ def test_a_fault_can_be_asked_for_now(graph):
 def test_late_frames_come_late_with_their_own_stamps(graph):
     frames, needles = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.TRUE_NEEDLE)
     node = graph.add(RigSimulatorNode, faults=["late_frames 0 60"], **SMALL)
-    graph.publish(topics.CURRENTS, currents(graph, 0.01, 0, 0, 0))
+    graph.publish(topics.RIG_CURRENTS, currents(graph, 0.01, 0, 0, 0))
     graph.wait(lambda: node.rig.running > 0.0, "the fault's time")
     frames.clear()
     graph.wait(lambda: len(frames) > 2 and len(needles) > 2, "frames")
     assert node.get_clock().now().nanoseconds - nanoseconds(frames[-1].header.stamp) > 0.05e9
+
+
+def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
+    needles = graph.listen_later(topics.TRUE_NEEDLE)
+    ports = (str(tmp_path / "a"), str(tmp_path / "b"))
+    node = graph.add(RigSimulatorNode, power_stage="roboclaw", power_stage_ports=list(ports), **SMALL)
+    driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=ports))
+    driver.open()
+    try:
+        graph.wait(lambda: driver.state().ready and len(needles) > 3, "the boards")
+        assert needles[-1].pose.position.x == pytest.approx(0.003, abs=1e-8)
+
+        def pulled() -> bool:
+            driver.apply(np.array([5.0, 0.0, -2.0, 0.0]))
+            return bool(needles[-1].pose.position.x > 0.0035)
+
+        graph.wait(pulled, "the needle to move")
+    finally:
+        driver.close()
+    graph.wait(lambda: bool(np.abs(node.rig.currents).max() < 1e-3), "the currents to go")
+    graph.remove(node)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_simulated_clock_runs_at_its_pace(graph):

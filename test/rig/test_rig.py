@@ -136,6 +136,9 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"polygon_sizes": (3,)}, "corners of all"),
         ({"thread_attachment": "sewn"}, "pinned, glued"),
         ({"viscosity": 0.0}, "from 0.0001"),
+        ({"power_stage": "battery"}, "topic, roboclaw"),
+        ({"power_stage": "roboclaw"}, "a path for two of the 4 coils"),
+        ({"power_stage": "roboclaw", "power_stage_ports": ("/tmp/a",)}, "a path for two of the 4 coils"),
     ],
 )
 def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], words: str):

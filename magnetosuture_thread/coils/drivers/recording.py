@@ -7,6 +7,8 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.coils.drivers.protocol import DriverState
+
 KEPT = 10_000
 
 
@@ -33,14 +35,17 @@ class RecordingDriver:
         """Keep the currents of all coils, shape (coils,) [A].
 
         Raises:
-            RuntimeError: the driver is not open.
             ValueError: the number of currents is wrong.
         """
         if not self._open:
-            raise RuntimeError("the recording driver is not open")
+            return
         if currents.shape != (self._coils,):
             raise ValueError(f"{self._coils} currents expected, got shape {currents.shape}")
         self.applied.append(currents.copy())
+
+    def state(self) -> DriverState:
+        """Return that it is ready while it is open."""
+        return DriverState(self._open, "" if self._open else "not open")
 
     def close(self) -> None:
         """Set all currents to zero and stop to accept any."""

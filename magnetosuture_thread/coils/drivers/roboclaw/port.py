@@ -1,0 +1,74 @@
+"""A serial port whose exchanges take a bounded time."""
+
+from __future__ import annotations
+
+import errno
+import time
+from typing import Any
+
+import serial
+
+ANSWER_TIMEOUT = 0.03  # s that a board has for an answer; over USB it takes 1 or 2 ms
+
+
+class DeviceError(Exception):
+    """A board or its line that does not work; its text is for a person."""
+
+
+class ExchangePort(serial.Serial):
+    """A port for one question and one answer at a time, that only one process can have.
+
+    What is written is kept until the answer is read, so that a packet goes out in one piece: a board drops one
+    with a gap of 10 ms in it, and the maker's library writes a packet in up to five pieces.
+
+    Attributes:
+        answer: the bytes that were read since `begin`.
+    """
+
+    def __init__(self, path: str, baud_rate: int) -> None:
+        self._packet = bytearray()
+        self.answer = bytearray()
+        self._until = 0.0
+        try:
+            # The lock comes before anything is changed at the port, and so does not disturb who has it.
+            super().__init__(path, baud_rate, timeout=ANSWER_TIMEOUT, write_timeout=ANSWER_TIMEOUT, exclusive=True)
+        except (serial.SerialException, ValueError) as error:
+            raise DeviceError(_why_not(path, error)) from error
+
+    def begin(self) -> None:
+        """Begin an exchange: what came too late for the last one is not the answer to this one."""
+        self.reset_input_buffer()
+        self._packet.clear()
+        self.answer.clear()
+        self._until = time.monotonic() + ANSWER_TIMEOUT
+
+    def write(self, b: Any, /) -> int:
+        """Keep bytes of a packet until the answer is read."""
+        self._packet += b
+        return len(b)
+
+    def read(self, size: int = 1, /) -> bytes:
+        """Send the packet if it has not been sent, and return up to `size` bytes of the answer.
+
+        An exchange, however many reads it has, takes at most twice the time that a board has for an answer.
+        """
+        if self._packet:
+            packet = bytes(self._packet)
+            self._packet.clear()
+            super().write(packet)
+        if time.monotonic() >= self._until:
+            return b""
+        data = super().read(size)
+        self.answer += data
+        return data
+
+
+def _why_not(path: str, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return f"{path} is held by another process"
+    if number == errno.ENOENT:
+        return f"there is no {path}"
+    if number == errno.EACCES:
+        return f"no permission for {path}; its group is usually dialout"
+    return f"cannot open {path}: {error}"

@@ -1,0 +1,44 @@
+"""What the simulated rig publishes: frames, and the truth behind them."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+from rclpy.time import Time
+
+from magnetosuture_thread.nodes import camera_messages, messages, topics
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
+from magnetosuture_thread.rig.rig import Frame
+from magnetosuture_thread.rig.settings import RigSettings
+
+
+class FramePublisher:
+    """Publishes frames as a camera does, and where needle and thread really are.
+
+    Args:
+        node: that publishes.
+        camera: that the frames are from.
+        settings: of the rig.
+    """
+
+    def __init__(self, node: Node, camera: DishCamera, settings: RigSettings) -> None:
+        self._quality = settings.jpeg_quality
+        self._compressed = topics.COMPRESSED_IMAGE.publisher(node)
+        self._raw = topics.IMAGE.publisher(node)
+        self._info = topics.CAMERA_INFO.publisher(node)
+        self._needle = topics.TRUE_NEEDLE.publisher(node)
+        self._thread = topics.TRUE_THREAD.publisher(node)
+        self._camera = camera_messages.camera_info(Time().to_msg(), camera.size, camera.view, settings.camera_distance)
+        self._path = messages.PathMaker()
+
+    def publish(self, nanoseconds: int, frame: Frame) -> None:
+        """Publish a frame with its stamp [ns]; one that got lost has its truth all the same."""
+        stamp = Time(nanoseconds=nanoseconds).to_msg()
+        if frame.image is not None:
+            data = encode_jpeg(frame.image, self._quality)
+            self._compressed.publish(camera_messages.compressed_image(stamp, data))
+            if self._raw.get_subscription_count():
+                self._raw.publish(camera_messages.image(stamp, frame.image))
+            self._camera.header.stamp = stamp
+            self._info.publish(self._camera)
+        self._needle.publish(messages.placed(stamp, frame.tail, frame.heading))
+        self._thread.publish(self._path.message(stamp, frame.thread))

@@ -1,0 +1,63 @@
+"""The whole power stage: boards on their lines, and the currents they give."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.rig.power.board import RoboClawBoard
+from magnetosuture_thread.rig.power.line import Line
+
+FIRST_ADDRESS = 0x80
+
+
+class PowerStage:
+    """Boards with two coils each, in the order of their ports.
+
+    Args:
+        ports: the path at which each board is to be found; boards with the same path share a line, with
+            addresses that count up from 128.
+        supply: of each board [V].
+        resistance: of each coil [ohm].
+        inductance: of each coil [H].
+
+    Attributes:
+        boards: in the order of their ports.
+        lines: in the order of their first boards.
+    """
+
+    def __init__(self, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
+        by_path: dict[str, list[RoboClawBoard]] = defaultdict(list)
+        self.boards = []
+        for path in ports:
+            board = RoboClawBoard(FIRST_ADDRESS + len(by_path[path]), supply, resistance, inductance)
+            by_path[path].append(board)
+            self.boards.append(board)
+        self.lines = [Line(path, boards) for path, boards in by_path.items()]
+
+    def open(self) -> None:
+        """Let the boards be found.
+
+        Raises:
+            ConfigurationError: a path cannot be used.
+        """
+        try:
+            for line in self.lines:
+                line.plug()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Take the lines away."""
+        for line in self.lines:
+            line.unplug()
+
+    def currents(self) -> NDArray[np.float64]:
+        """Return the coils' currents now, shape (2 boards,) [A]."""
+        for line in self.lines:
+            line.advance()
+        return np.array([current for board in self.boards for current in board.currents])

@@ -1,0 +1,221 @@
+"""One board through the maker's library, with a test at the other end of the line."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import serial
+
+from magnetosuture_thread.coils.drivers.roboclaw import port as port_module
+from magnetosuture_thread.coils.drivers.roboclaw import rules
+from magnetosuture_thread.coils.drivers.roboclaw.board import Board
+from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
+from magnetosuture_thread.rig.power.board import RoboClawBoard
+from magnetosuture_thread.rig.power.packets import checksum
+
+
+class Peer:
+    """The other end of a line: what comes in, and a thread that answers."""
+
+    def __init__(self) -> None:
+        self.host, self._device = os.openpty()
+        tty.setraw(self._device)
+        self.path = os.ttyname(self._device)
+        self.heard: list[bytes] = []
+        self._ends = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def answer(self, reply: Callable[[bytes], bytes]) -> None:
+        """Answer each packet."""
+
+        def serve() -> None:
+            os.set_blocking(self.host, False)
+            while not self._ends.wait(0.0005):
+                try:
+                    packet = os.read(self.host, 1000)
+                except BlockingIOError:
+                    continue
+                self.heard.append(packet)
+                os.write(self.host, reply(packet))
+
+        self._start(serve)
+
+    def trickle(self, period: float) -> None:
+        """Send a byte again and again."""
+
+        def serve() -> None:
+            while not self._ends.wait(period):
+                os.write(self.host, b"A")
+
+        self._start(serve)
+
+    def _start(self, serve: Callable[[], None]) -> None:
+        self._threads.append(threading.Thread(target=serve))
+        self._threads[-1].start()
+
+    def close(self) -> None:
+        """End."""
+        self._ends.set()
+        for thread in self._threads:
+            thread.join()
+        os.close(self.host)
+        os.close(self._device)
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    """The other end of a line."""
+    made = Peer()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give boards that do answer all the time they may need on a busy machine."""
+    monkeypatch.setattr(port_module, "ANSWER_TIMEOUT", 5.0)
+
+
+@pytest.fixture
+def port(peer: Peer) -> Iterator[ExchangePort]:
+    """Our end of it."""
+    made = ExchangePort(peer.path, 115200)
+    yield made
+    made.close()
+
+
+def board(port: ExchangePort, tenths: int = 2, hurries: bool = False) -> Board:
+    """Return the board on a line."""
+    return Board(port, 128, "board 0", tenths, 10.0, 1.0, lambda: hurries)
+
+
+def whole_round(made: Board) -> None:
+    """Ask everything once, and the first again."""
+    for _ in range(len(rules.ROUND) + 1):
+        made.poll()
+
+
+def simulated(made: RoboClawBoard) -> Callable[[bytes], bytes]:
+    """Return what answers as a board does."""
+    return lambda packet: made.receive(packet, time.monotonic())
+
+
+def test_a_packet_goes_out_in_one_piece(port, monkeypatch):
+    written: list[bytes] = []
+    monkeypatch.setattr(serial.Serial, "write", lambda _, data: written.append(data))
+    with pytest.raises(DeviceError):
+        board(port, hurries=True).write_zero()
+    packet = bytes((128, 34, 0, 0, 0, 0))
+    assert written == [packet + checksum(packet).to_bytes(2, "big")]
+
+
+def test_an_acknowledgement_that_came_too_late_is_not_one_for_the_next_command(peer, port):
+    os.write(peer.host, b"\xff" * 8)
+    with pytest.raises(DeviceError, match="board 0: no valid answer to DutyM1M2"):
+        board(port).write_zero()
+
+
+@pytest.mark.parametrize("reply", [b"\x00", b"\x7f", b"\xfe"])
+def test_only_the_right_byte_acknowledges(peer, port, reply: bytes):
+    peer.answer(lambda _: reply)
+    with pytest.raises(DeviceError, match="no valid answer to DutyM1M2"):
+        board(port).write_zero()
+
+
+def test_one_packet_may_get_lost(peer, port, monkeypatch):
+    monkeypatch.setattr(port_module, "ANSWER_TIMEOUT", 0.5)
+    replies = iter([b"", b"\xff"])
+    peer.answer(lambda _: next(replies))
+    board(port).write_zero()
+    assert len(peer.heard) == 2
+
+
+def test_nothing_is_tried_twice_in_a_hurry(peer, port):
+    peer.answer(lambda _: b"")
+    with pytest.raises(DeviceError):
+        board(port, hurries=True).write_zero()
+    assert len(peer.heard) == 1
+
+
+def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
+    peer.trickle(0.02)
+    with pytest.raises(DeviceError, match="no valid answer to ReadVersion"):
+        board(port).set_up()
+    assert len(port.answer) < 48  # which the library would wait for
+
+
+@pytest.mark.parametrize("tenths", range(1, 11))
+def test_every_tenth_of_a_second_gets_to_the_board(peer, patient, port, tenths: int):
+    there = RoboClawBoard()
+    peer.answer(simulated(there))
+    board(port, tenths).set_up()
+    assert there.timeout == tenths
+    assert there.limits == [1000, 1000]
+
+
+def test_it_knows_what_the_board_says(peer, patient, port):
+    there = RoboClawBoard(supply=12.3)
+    there.duties, there.timeout = (5000, -5000), 0
+    peer.answer(simulated(there))
+    made = board(port)
+    made.set_up()
+    assert made.version.startswith("RoboClaw simulated")
+    assert made.voltage == 12.3
+    assert there.duties == (0, 0)
+
+
+def test_a_lost_write_is_written_again_before_it_is_a_fault(peer, patient, port):
+    there = RoboClawBoard()
+    peer.answer(simulated(there))
+    made = board(port)
+    made.set_up()
+    there.ignored.add(34)
+    made.write(np.array([3.0, 0.0]))
+    made.poll()  # the first of a round looks at the duties
+    there.ignored.clear()
+    made.write(np.array([3.0, 0.0]))
+    made.poll()  # again, at once
+    there.ignored.add(34)
+    made.write(np.array([5.0, 0.0]))
+    with pytest.raises(DeviceError, match=r"has duties \(4095, 0\) instead of \(6826, 0\)"):
+        whole_round(made)
+
+
+def test_a_current_is_counted_the_way_that_its_duty_goes(peer, patient, port):
+    there = RoboClawBoard()
+    peer.answer(simulated(there))
+    made = board(port)
+    made.set_up()
+    deadline = time.monotonic() + 10.0
+    while abs(made.currents[1] + 6.0) > 0.05:
+        assert time.monotonic() < deadline
+        made.write(np.array([3.0, -6.0]))
+        made.poll()
+    assert made.currents == pytest.approx((3.0, -6.0), abs=0.05)
+
+
+def test_a_port_is_locked(peer, port):
+    with pytest.raises(DeviceError, match="is held by another process"):
+        ExchangePort(peer.path, 115200)
+
+
+def test_what_is_no_port_is_named(tmp_path, monkeypatch):
+    def forbid(*_: object) -> int:
+        raise PermissionError(errno.EACCES, "denied")
+
+    with pytest.raises(DeviceError, match="there is no"):
+        ExchangePort(str(tmp_path / "none"), 115200)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", forbid)
+        with pytest.raises(DeviceError, match=r"no permission for .*dialout"):
+            ExchangePort("/dev/ttyACM0", 115200)
+    (tmp_path / "file").touch()
+    with pytest.raises(DeviceError, match="cannot open"):
+        ExchangePort(str(tmp_path / "file"), 115200)

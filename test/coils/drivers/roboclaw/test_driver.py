@@ -1,0 +1,403 @@
+"""The driver against simulated boards, through the maker's library and a pseudo-terminal."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver, port
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.errors import DriverError
+from magnetosuture_thread.rig.power import packets
+
+CURRENTS = (3.0, -6.0, 1.5, 0.0)
+DUTIES = [(4095, -8191), (2047, 0)]
+
+ANOTHER = """
+import sys, time
+import numpy as np
+from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+
+driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=sys.argv[1:], roboclaw_timeout=0.3))
+driver.open()
+while True:
+    driver.apply(np.array([3.0, -6.0, 1.5, 0.0]))
+    time.sleep(0.005)
+"""
+
+
+def test_coils_stay_at_zero_until_currents_are_asked_for(bench):
+    driver = bench.open()
+    state = driver.state()
+    assert (state.problem, state.warnings, state.voltages) == ("", (), (24.0, 24.0))
+    for number in (0, 1):
+        bench.heard(number)
+        assert not bench.boards[number].timeline
+
+
+def test_currents_get_to_the_coils_as_duties(bench):
+    driver = bench.open()
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties")
+
+        def measured() -> bool:
+            currents = driver.state().currents
+            return currents is not None and np.allclose(currents, CURRENTS, atol=0.02)
+
+        bench.wait(measured, "the currents")
+    np.testing.assert_allclose(bench.boards[0].currents, CURRENTS[:2], atol=0.1)
+
+
+def test_currents_beyond_the_limit_are_cut_at_it(bench):
+    driver = bench.open(max_current=3.0)
+    with bench.held(driver, 100.0, -100.0, 0.0, 0.0):
+        bench.wait(lambda: bench.duties(0) == (4095, -4095), "the duties")
+
+
+def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
+    driver = bench.open(command_timeout=0.1, roboclaw_timeout=1.0)
+    bench.wait(lambda: driver.apply(np.array(CURRENTS)) or bench.duties(0) == DUTIES[0], "the duties")
+    bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
+    (zero_at, _) = bench.boards[0].timeline[-1]
+    assert zero_at < bench.boards[0].heard + 1.0  # it was told, and has not stopped by its own timeout
+    assert any("coils at zero" in warning for warning in driver.state().warnings)
+    assert driver.state().ready
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties again")
+        assert driver.state().warnings == ()
+
+
+def test_what_stays_in_force_is_written_often_enough(bench, monkeypatch):
+    monkeypatch.setattr(port, "ANSWER_TIMEOUT", 5.0)  # no loss on a busy machine
+    driver = bench.open(patience=60.0, roboclaw_timeout=0.5)
+    driver.apply(np.array(CURRENTS))
+    bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
+    since = bench.boards[0].timeline[0][0]
+    bench.wait(lambda: bench.boards[0].heard > since + 1.2, "twice the timeout to pass")
+    assert [duties for _, duties in bench.boards[0].timeline] == [DUTIES[0]]
+
+
+def test_boards_stop_by_themselves_where_the_process_is_killed(bench):
+    bench.stage.open()
+    process = subprocess.Popen([sys.executable, "-c", ANOTHER, *bench.settings().roboclaw_ports])
+    try:
+        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties", 30.0)
+        killed_at = time.monotonic()
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
+    finally:
+        process.kill()
+        process.wait()
+    for board in bench.boards:
+        zero_at, duties = board.timeline[-1]
+        assert duties == (0, 0)
+        assert zero_at == pytest.approx(board.heard + 0.3)
+        assert zero_at > killed_at
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"deaf": True},
+        {"silent": True},
+        {"garbage": True},
+        {"wrong_checksum": True},
+        {"lateness": 0.2},
+        {"lose_in": 3},
+        {"lose_out": 3},
+    ],
+    ids=lambda fault: next(iter(fault)),
+)
+def test_where_one_line_fails_all_coils_are_at_zero_until_it_is_back(bench, fault: dict[str, Any]):
+    driver = bench.open()
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: bench.duties(1) == DUTIES[1], "the duties")
+        vars(bench.stage.lines[0].faults).update(fault)
+        bench.wait(lambda: not driver.state().ready, "the loss")
+        assert "board 0" in driver.state().problem
+        assert driver.state().losses >= 1
+        bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
+        bench.heard(1, 10)  # the other one is still written to
+        assert bench.duties(1) == (0, 0)
+        assert not driver.state().ready
+        vars(bench.stage.lines[0].faults).update(dict.fromkeys(fault, 0))
+        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties again")
+
+
+def test_a_port_that_goes_and_comes_back_begins_at_zero(bench):
+    driver = bench.open()
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
+        bench.stage.lines[0].unplug()
+        bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
+        losses = driver.state().losses
+        assert losses >= 1
+        bench.wait(lambda: "there is no" in driver.state().problem, "the port to be missed")
+    bench.boards[0].timeline.clear()
+    bench.boards[1].timeline.clear()
+    bench.stage.lines[0].plug()
+    bench.wait(lambda: driver.state().ready, "the driver to be back")
+    bench.heard(0)
+    bench.heard(1)
+    assert not bench.boards[0].timeline  # nothing that was asked for before, or meanwhile
+    assert not bench.boards[1].timeline
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties again")
+
+
+@pytest.mark.parametrize(
+    ("bits", "words"),
+    [(0x0001, "Emergency Stop"), (0x0040, "Motor 1 Driver Fault"), (0x1002, "Temperature Sensor 1 Error, Motor 1 C")],
+)
+def test_errors_of_a_board_are_losses_in_the_makers_words(bench, bits: int, words: str):
+    driver = bench.open()
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: bench.duties(1) == DUTIES[1], "the duties")
+        bench.boards[0].errors = bits
+        bench.wait(lambda: words in driver.state().problem, "the error")
+        bench.wait(lambda: bench.duties(1) == (0, 0), "zero")
+        bench.boards[0].errors = 0
+        bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties again")
+
+
+def test_warnings_of_a_board_are_said_and_it_goes_on(bench):
+    driver = bench.open()
+    bench.boards[1].warnings = 0x0010
+    bench.wait(lambda: bool(driver.state().warnings), "the warning")
+    assert driver.state().warnings[0].endswith("address 128): Temperature Warning")
+    assert "board 1" in driver.state().warnings[0]
+    bench.wait(lambda: driver.state().ready, "the driver to be ready")
+
+
+def test_too_much_current_is_a_loss(bench):
+    driver = bench.open()
+    bench.boards[0].mismeasured = 11.9
+    bench.heard(0, 30)
+    bench.wait(lambda: driver.state().ready, "the driver to be ready")
+    bench.boards[0].mismeasured = 12.5
+    bench.wait(lambda: "a current of 12.50 A, more than 10 A" in driver.state().problem, "the excess")
+    losses = driver.state().losses
+    bench.heard(0, 5)  # it is tried again
+    assert driver.state().losses == losses  # but not ready while it lasts
+    bench.boards[0].mismeasured = 0.0
+    bench.wait(lambda: driver.state().ready, "the driver to be back")
+
+
+def test_a_board_that_limits_a_current_does_not_count_as_disobedient(bench):
+    for board in bench.boards:
+        board.resistance = 0.5
+    driver = bench.open()
+    with bench.held(driver, 9.0, 0.0, 0.0, 0.0):
+        bench.wait(lambda: any("at its limit" in text for text in driver.state().warnings), "the warning")
+        for _ in range(30):
+            bench.heard(0, 1)
+            assert "has duties" not in driver.state().problem
+        assert bench.boards[0].currents[0] == 10.0
+
+
+def test_a_supply_that_is_too_low_for_the_currents_is_said(bench):
+    for board in bench.boards:
+        board.supply = 6.0
+    driver = bench.open()
+    with bench.held(driver, 7.0, 0.0, 0.0, 0.0):
+        bench.wait(lambda: bench.duties(0) == (32767, 0), "the duties")
+        bench.wait(lambda: any("6 V is too low" in text for text in driver.state().warnings), "the warning")
+
+
+def test_a_supply_that_cannot_be_one_is_a_problem(bench):
+    bench.boards[0].supply = 3.0
+    driver = bench.open(ready=False)
+    bench.wait(lambda: "a supply of 3 V" in driver.state().problem, "the problem")
+
+
+def test_a_board_is_looked_after_however_often_currents_are_asked_for(bench):
+    driver = bench.open()
+    wake = driver._lines[0]._wake
+    wake.clear = lambda: None  # as if there always were something new
+    wake.set()
+    bench.boards[0].errors = 1
+    bench.wait(lambda: "Emergency Stop" in driver.state().problem, "the error")
+
+
+def test_whatever_happens_in_its_thread_it_comes_back(bench, monkeypatch):
+    driver = bench.open()
+    with monkeypatch.context() as patch:
+        patch.setattr(driver._lines[0], "_report", lambda: 1 / 0)
+        bench.wait(lambda: "ZeroDivisionError" in driver.state().problem, "the failure")
+    bench.wait(lambda: driver.state().ready, "the driver to be back")
+
+
+def test_a_supply_that_breaks_down_is_a_loss(bench):
+    driver = bench.open()
+    bench.boards[0].supply = 3.0
+    bench.wait(lambda: "a supply of 3 V" in driver.state().problem, "the problem")
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (packets.SET_TIMEOUT, "serial timeout in tenths of a second 0 instead of 2"),
+        (packets.SET_LIMIT_1, "current limit in 10 mA 3000 instead of 1000"),
+        (packets.SET_LIMIT_2, "current limit in 10 mA 3000 instead of 1000"),
+    ],
+)
+def test_a_board_that_does_not_take_its_limits_is_never_ready(bench, command: int, words: str):
+    bench.boards[0].ignored.add(command)
+    driver = bench.open(ready=False)
+    bench.wait(lambda: words in driver.state().problem, "the problem")
+    bench.heard(0, 3)  # it is tried again
+    assert not driver.state().ready
+    assert driver.state().losses == 0
+    assert bench.boards[1].timeout == 2
+
+
+def test_a_board_that_acknowledges_duties_and_does_not_take_them_is_found(bench):
+    driver = bench.open()
+    bench.boards[0].ignored.add(packets.SET_DUTIES)
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: "has duties (0, 0) instead of (4095, -8191)" in driver.state().problem, "the problem")
+        bench.wait(lambda: bench.duties(1) == (0, 0), "zero")
+
+
+def test_a_board_that_does_not_go_to_zero_at_the_start_is_never_ready(bench):
+    bench.boards[0].duties = (100, 0)
+    bench.boards[0].ignored.add(packets.SET_DUTIES)
+    driver = bench.open(ready=False)
+    bench.wait(lambda: "duties 100 and 0 instead of 0 and 0" in driver.state().problem, "the problem")
+
+
+def test_a_port_belongs_to_one_writer(bench):
+    first = bench.open()
+    with bench.held(first, *CURRENTS):
+        second = bench.open(ready=False)
+        bench.wait(lambda: "held by another process" in second.state().problem, "the refusal")
+        bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
+    first.close()
+    bench.wait(lambda: second.state().ready, "the other one to be ready")
+
+
+def test_two_boards_can_share_a_port(bench):
+    bench.share()
+    driver = bench.open()
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties")
+        bench.stage.lines[0].faults.mute = frozenset({129})
+        bench.wait(lambda: "board 1" in driver.state().problem, "the loss")
+        bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
+        bench.stage.lines[0].faults.mute = frozenset()
+        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties again")
+
+
+def test_closing_leaves_zero_and_the_port_free(bench):
+    driver = bench.open(roboclaw_timeout=1.0)
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties")
+    driver.close()
+    for board in bench.boards:
+        zero_at, duties = board.timeline[-1]
+        assert duties == (0, 0)
+        assert zero_at == board.heard  # it was the last that it was told
+    assert not driver.state().ready
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("roboclaw")]
+    driver.close()
+    driver.open()
+    bench.wait(lambda: driver.state().ready, "the driver to be ready again")
+
+
+def test_closing_takes_no_longer_where_nobody_answers(bench):
+    bench.share()
+    driver = bench.open()
+    bench.stage.lines[0].faults.silent = True
+    bench.wait(lambda: not driver.state().ready, "the loss")
+    began = time.monotonic()
+    driver.close()
+    assert time.monotonic() - began < 2.0
+    bench.wait(lambda: not any(t.name.startswith("roboclaw") for t in threading.enumerate()), "the thread to end")
+
+
+def test_closing_while_it_connects_frees_the_port(bench):
+    bench.boards[0].ignored.add(packets.SET_TIMEOUT)
+    driver = bench.open(ready=False)
+    driver.close()
+    bench.boards[0].ignored.clear()
+    assert bench.open().state().ready
+
+
+def test_nothing_waits_for_a_board(bench):
+    driver = bench.open()
+    for line in bench.stage.lines:
+        line.faults.deaf = True
+    longest = 0.0
+    for _ in range(200):
+        began = time.perf_counter()
+        driver.apply(np.array(CURRENTS))
+        driver.state()
+        longest = max(longest, time.perf_counter() - began)
+        time.sleep(0.001)
+    assert not driver.state().ready
+    assert longest < 1.0  # of 200 calls, each of which would have waited
+
+
+def test_a_dead_board_floods_no_log(bench, caplog):
+    with caplog.at_level(logging.WARNING):
+        driver = bench.open()
+        bench.stage.lines[0].faults.deaf = True
+        bench.wait(lambda: not driver.state().ready, "the loss")
+        driver.close()
+    assert caplog.records == []
+
+
+def test_what_is_no_current_is_refused(bench):
+    driver = bench.open()
+    for currents in (np.zeros(3), np.array([math.nan, 0.0, 0.0, 0.0]), np.full(4, math.inf)):
+        with pytest.raises(ValueError, match="4 finite currents"):
+            driver.apply(currents)
+    assert driver.state().ready
+
+
+def test_it_does_nothing_before_it_is_opened(bench):
+    driver = RoboClawDriver(bench.settings())
+    driver.apply(np.zeros(4))
+    assert driver.state().problem == "not open"
+    driver.close()
+
+
+def test_a_port_that_is_not_there_is_waited_for(bench):
+    driver = RoboClawDriver(bench.settings())
+    bench.drivers.append(driver)
+    driver.open()
+    bench.wait(lambda: f"there is no {bench.stage.lines[0].path}" in driver.state().problem, "the problem")
+    bench.stage.open()
+    bench.wait(lambda: driver.state().ready, "the driver to be ready")
+    assert driver.state().losses == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "roboclaw_ports is empty"),
+        ({"roboclaw_ports": ("/dev/a",)}, "has 1, expected one for two of the 4 coils"),
+        ({"roboclaw_ports": ("/dev/a", "/dev/b", "/dev/c")}, "has 3, expected one for two of the 4 coils"),
+        (
+            {"roboclaw_ports": ("/dev/a", "/dev/b"), "roboclaw_addresses": (128,)},
+            "has 1, expected one for each of the 2",
+        ),
+        ({"roboclaw_ports": ("/dev/a", "/dev/a")}, "two boards on /dev/a have address 128"),
+        ({"roboclaw_ports": ("/dev/a", "/dev/b"), "roboclaw_timeout": 0.25}, "0.25, expected tenths of a second"),
+        ({"roboclaw_ports": ("/dev/a", "/dev/b"), "roboclaw_baud_rate": 9600}, "9600, expected at least 38400"),
+    ],
+)
+def test_settings_that_can_never_work_are_refused(changes: dict[str, Any], words: str):
+    with pytest.raises(DriverError, match=words):
+        RoboClawDriver(CoilBridgeSettings(**changes))

@@ -1,0 +1,60 @@
+"""What the driver decides without a device; more stands in the rules' own examples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.drivers.roboclaw import rules
+from magnetosuture_thread.coils.drivers.roboclaw.rules import Question
+
+
+def test_pauses_double_up_to_two_seconds():
+    pauses = [rules.pause(failures) for failures in range(1, 20)]
+    assert pauses[:5] == [0.1, 0.2, 0.4, 0.8, 1.6]
+    assert set(pauses[5:]) == {2.0}
+
+
+@pytest.mark.parametrize(
+    ("current", "resistance", "voltage", "duty", "short"),
+    [
+        (0.0, 1.0, 24.0, 0, False),
+        (24.0, 1.0, 24.0, 32767, False),
+        (-24.1, 1.0, 24.0, -32767, True),
+        (2.0, 3.0, 12.0, 16383, False),
+    ],
+)
+def test_a_duty_is_the_share_of_the_supply(current: float, resistance: float, voltage: float, duty: int, short: bool):
+    assert rules.duties(np.array([current]), resistance, voltage) == ((duty,), short)
+
+
+def test_every_question_is_asked_and_duties_most_of_all():
+    assert set(rules.ROUND) == set(Question)
+    assert rules.ROUND[0] is Question.DUTIES
+    assert rules.ROUND.count(Question.DUTIES) == 2
+
+
+@pytest.mark.parametrize(
+    ("written", "has", "current", "expected"),
+    [
+        (1000, 1000, 0.0, True),
+        (1000, 1100, 0.0, True),  # rounded
+        (1000, 1200, 0.0, False),
+        (1000, 0, 0.0, False),
+        (1000, -1000, 0.0, False),
+        (0, 1, 0.0, False),  # zero is zero
+        (20000, 9000, 9.0, True),  # taken back at the limit
+        (-20000, -9000, -9.0, True),
+        (20000, 9000, 7.0, False),
+        (20000, 21000, 9.0, False),
+        (20000, -9000, 9.0, False),
+        (0, 9000, 9.0, False),
+    ],
+)
+def test_a_board_must_have_what_was_written(written: int, has: int, current: float, expected: bool):
+    assert rules.holds((written, 0), (has, 0), (current, 0.0), 10.0) is expected
+    assert rules.holds((0, written), (0, has), (0.0, current), 10.0) is expected
+
+
+def test_supplies_are_between_five_and_eighty_volts():
+    assert [rules.plausible(voltage) for voltage in (0.0, 4.9, 5.0, 80.0, 80.1)] == [False, False, True, True, False]

@@ -1,0 +1,143 @@
+"""Boards behind a pseudo-terminal."""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.rig.power.board import RoboClawBoard
+from magnetosuture_thread.rig.power.line import Line
+from magnetosuture_thread.rig.power.packets import checksum
+from magnetosuture_thread.rig.power.stage import PowerStage
+
+QUESTION = bytes((128, 24))
+ANSWER = b"\x00\xf0" + checksum(QUESTION + b"\x00\xf0").to_bytes(2, "big")
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Line]:
+    """A line with one board."""
+    made = Line(tmp_path / "board", [RoboClawBoard()])
+    made.plug()
+    yield made
+    made.unplug()
+
+
+def ask(path: Path, enough: int, patience: float = 10.0, question: bytes = QUESTION) -> bytes:
+    """Return what comes back, once it is enough or the patience is over."""
+    device = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        os.write(device, question)
+        answer, until = b"", time.monotonic() + patience
+        while len(answer) < enough and (left := until - time.monotonic()) > 0.0:
+            if select.select([device], [], [], left)[0]:
+                answer += os.read(device, 100)
+        return answer
+    finally:
+        os.close(device)
+
+
+def test_a_board_answers_at_the_path(line):
+    for _ in range(3):  # nobody has it open in between
+        assert ask(line.path, 4) == ANSWER
+
+
+@pytest.mark.parametrize("fault", [{"deaf": True}, {"silent": True}, {"mute": frozenset({128})}])
+def test_there_may_be_no_answer(line, fault: dict[str, Any]):
+    vars(line.faults).update(fault)
+    assert ask(line.path, 1, 0.1) == b""
+    assert (line.boards[0].heard > 0.0) is ("silent" in fault)
+
+
+def test_an_answer_may_be_other_bytes(line):
+    line.faults.garbage = True
+    answer = ask(line.path, 7)
+    assert len(answer) == 7
+    assert not answer.startswith(ANSWER)
+
+
+def test_an_answer_may_have_a_wrong_checksum(line):
+    line.faults.wrong_checksum = True
+    answer = ask(line.path, 4)
+    assert answer[:3] == ANSWER[:3]
+    assert answer[3] != ANSWER[3]
+
+
+def test_an_answer_may_be_late(line):
+    line.faults.lateness = 0.2
+    began = time.monotonic()
+    assert ask(line.path, 4) == ANSWER
+    assert time.monotonic() - began >= 0.2
+
+
+def test_bytes_may_get_lost_on_either_way(line):
+    line.faults.lose_out = 3
+    assert ask(line.path, 3) == ANSWER[:2] + ANSWER[3:]
+    line.faults.lose_out, line.faults.lose_in = 0, 2
+    assert ask(line.path, 1, 0.1) == b""
+
+
+def test_a_line_that_is_taken_away_hangs_up_and_can_come_back(line):
+    device = os.open(line.path, os.O_RDWR | os.O_NOCTTY)
+    line.unplug()
+    line.unplug()
+    assert not line.path.is_symlink()
+    with pytest.raises(OSError, match="error"):
+        os.write(device, QUESTION)
+    os.close(device)
+    line.plug()
+    line.plug()
+    assert ask(line.path, 4) == ANSWER
+
+
+def test_boards_go_on_without_their_line(line):
+    now = time.monotonic()
+    line.boards[0].timeout, line.boards[0].heard, line.boards[0].duties = 1, now, (100, 0)
+    line.unplug()
+    while line.boards[0].duties != (0, 0):
+        assert time.monotonic() < now + 10.0
+        line.advance()
+    assert line.boards[0].timeline[-1][0] == pytest.approx(now + 0.1)
+
+
+def test_what_a_killed_simulation_left_is_replaced_and_anything_else_stays(tmp_path):
+    (tmp_path / "left").symlink_to("/dev/pts/999999")
+    line = Line(tmp_path / "left", [RoboClawBoard()])
+    line.plug()
+    assert ask(line.path, 4) == ANSWER
+    line.unplug()
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(ConfigurationError, match="a path for a symbolic link"):
+        Line(tmp_path / "file", [RoboClawBoard()]).plug()
+    assert (tmp_path / "file").read_text() == "mine"
+    with pytest.raises(ConfigurationError, match="No such file"):
+        Line(tmp_path / "nowhere" / "board", [RoboClawBoard()]).plug()
+
+
+def test_a_stage_has_two_coils_on_each_board_in_order(tmp_path):
+    paths = [str(tmp_path / name) for name in ("a", "b", "a")]
+    stage = PowerStage(paths, 24.0, 1.0, 0.01)
+    assert [board.address for board in stage.boards] == [128, 128, 129]
+    assert [line.boards for line in stage.lines] == [(stage.boards[0], stage.boards[2]), (stage.boards[1],)]
+    stage.open()
+    for number, board in enumerate(stage.boards):
+        board.inductance = 1e9
+        board.advance(time.monotonic())
+        board.currents = (number + 0.25, number + 0.5)
+    assert stage.currents() == pytest.approx([0.25, 0.5, 1.25, 1.5, 2.25, 2.5], rel=1e-3)
+    stage.close()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_stage_that_cannot_open_leaves_nothing(tmp_path):
+    stage = PowerStage([str(tmp_path / "a"), str(tmp_path / "nowhere" / "b")], 24.0, 1.0, 0.01)
+    with pytest.raises(ConfigurationError):
+        stage.open()
+    assert not list(tmp_path.iterdir())
