@@ -1,17 +1,18 @@
 """Starts the nodes on a robot: `ros2 launch magnetosuture_thread magnetosuture.launch.py setup:=NAME`.
 
-With `simulated:=true` a rig in software and a path follower come with them.
+The coil bridge goes as far as the set-up says; on hardware a person arms it. With `simulated:=true` a rig in
+software and a path follower come with them, and the bridge drives that rig and arms itself.
 """
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
+from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = "magnetosuture_thread"
-NODES = ("vision_tracker", "thread_model", "coil_bridge")
+NODES = ("vision_tracker", "thread_model")
 RIG_NODES = ("rig_simulator", "path_follower")
 
 
@@ -22,25 +23,20 @@ def generate_launch_description() -> LaunchDescription:
         PathJoinSubstitution([FindPackageShare(PACKAGE), "config", file_name]),
         {"use_sim_time": LaunchConfiguration("use_sim_time")},
     ]
+    with_rig, without = (condition(LaunchConfiguration("simulated")) for condition in (IfCondition, UnlessCondition))
+
+    def node(name: str, *more: dict[str, str], **options: object) -> Node:
+        given = [*parameters, *more]
+        return Node(package=PACKAGE, executable=name, name=name, parameters=given, output="screen", **options)
+
     return LaunchDescription(
         [
             DeclareLaunchArgument("setup", default_value="petri_35mm_polyamide", description="name of a set-up"),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="take the time from /clock"),
             DeclareLaunchArgument("simulated", default_value="false", description="with a rig in software"),
-            *(
-                Node(package=PACKAGE, executable=name, name=name, parameters=parameters, output="screen")
-                for name in NODES
-            ),
-            *(
-                Node(
-                    package=PACKAGE,
-                    executable=name,
-                    name=name,
-                    parameters=parameters,
-                    output="screen",
-                    condition=IfCondition(LaunchConfiguration("simulated")),
-                )
-                for name in RIG_NODES
-            ),
+            *(node(name) for name in NODES),
+            node("coil_bridge", condition=without),
+            node("coil_bridge", {"driver": "simulated", "autostart": "armed"}, condition=with_rig),
+            *(node(name, condition=with_rig) for name in RIG_NODES),
         ]
     )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import NeedleMechanics
+from magnetosuture_thread.coils.sources import SourceWatch
 from magnetosuture_thread.coils.stamps import check_stamp
 from magnetosuture_thread.errors import InvalidInputError
 
@@ -46,21 +47,24 @@ class NeedleWatch:
         self._stamp = -math.inf
         self._arrival = -math.inf
         self._velocity = np.zeros(2)
+        self._sources = SourceWatch()
 
-    def see(self, tail: Vector, heading: Vector, stamp: float, now: float, arrival: float) -> None:
+    def see(self, tail: Vector, heading: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
         """Take a measured pose.
 
         Args:
             tail: shape (2,) [m].
             heading: unit vector, shape (2,).
             stamp: when it was measured [s].
+            number: of the message, counted by its publisher.
             now: the same clock now [s].
             arrival: a monotonic clock now [s].
 
         Raises:
-            InvalidInputError: it is not finite, not among the coils, too old, from the future, or older than
-                the last one.
+            InvalidInputError: it is not finite, not among the coils, too old, from the future, older than
+                the last one, or somebody else says where the needle is too.
         """
+        speaking = self._sources.hear(number, arrival)
         if not (np.all(np.isfinite(tail)) and np.all(np.isfinite(heading))):
             raise InvalidInputError("needle/measured_cp.pose", [*tail.tolist(), *heading.tolist()], "finite numbers")
         tip = tail + self._needle.chord * self._needle.chord_direction(heading)
@@ -68,7 +72,21 @@ class NeedleWatch:
             ends = f"{tail.tolist()} to {tip.tolist()}"
             raise InvalidInputError("needle/measured_cp.pose", ends, f"within {self._reach:g} m of the dish's centre")
         check_stamp("needle/measured_cp", stamp, now, self._stamp, self._timeout)
+        if speaking > 1:
+            raise InvalidInputError("needle/measured_cp", f"{speaking} publishers at once", "one")
         self._pose, self._stamp, self._arrival = Pose(tail, heading), stamp, arrival
+
+    def lost(self, now: float, arrival: float) -> str:
+        """Say why the pose is not to be used at a time of the stamps' clock and a monotonic time [s]; empty if it is.
+
+        It ends by its stamp as by its arrival, whichever comes first.
+        """
+        if self._sources.count(arrival) > 1:
+            return "several publishers of needle/measured_cp at once"
+        if self._pose is None:
+            return "no needle pose yet"
+        good = max(arrival - self._arrival, now - self._stamp) <= self._timeout
+        return "" if good else f"no needle pose for {self._timeout:g} s"
 
     def move(self, velocity: Vector) -> None:
         """Say which tip velocity the coils give from now on, shape (2,) [m/s]."""
@@ -76,7 +94,7 @@ class NeedleWatch:
 
     def pose(self, now: float, arrival: float) -> Pose | None:
         """Return the pose as it is at a time of the stamps' clock and a monotonic time [s]; None if too old."""
-        if self._pose is None or arrival - self._arrival > self._timeout:
+        if self._pose is None or self.lost(now, arrival):
             return None
         ahead = min(FURTHEST, max(0.0, now - self._stamp))
         tail, heading = self._pose.tail, self._pose.heading

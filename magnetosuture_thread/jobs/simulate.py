@@ -30,6 +30,8 @@ PATIENCE = 3.0  # times the path's own duration, and ...
 SPARE = 20.0  # s of simulated time besides: then a run that never ends is ended
 LOOK = 0.02  # s between two looks at the nodes
 
+SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
+
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
 
@@ -107,7 +109,7 @@ def _run(
     )
     from magnetosuture_thread.nodes.recorder import Recorder
 
-    arguments = ["--params-file", str(setup.path.resolve()), "-p", "coil_bridge:driver:=recording"]
+    arguments = ["--params-file", str(setup.path.resolve()), *SIMULATED_COILS]
     if pace is not None:
         arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:pace:={float(pace)}"]
     notes = {

@@ -5,113 +5,145 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
+from rclpy.timer import Timer
 
-from magnetosuture_thread.coils.allocation import Allocation
+from magnetosuture_thread.coils.bridge import Bridge
 from magnetosuture_thread.coils.drivers import make_driver
-from magnetosuture_thread.coils.gate import CommandGate, Setpoint
-from magnetosuture_thread.coils.needle import NeedleWatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.coils.station import CoilStation
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes import messages, topics
-from magnetosuture_thread.nodes.diagnostics import Health
-from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes import coil_messages, messages, topics
+from magnetosuture_thread.nodes.coil_report import CoilReport
+from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scheduling import take_priority
+from magnetosuture_thread.nodes.switches import Switches
+
+UNUSABLE = (InvalidInputError, ArithmeticError, ValueError)  # the last two where a check has been forgotten
 
 
-class CoilBridgeNode(Node):
-    """Forwards velocity commands to the coils, and zeros as soon as they cease."""
+class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
+    """Forwards velocity commands to the coils while active and armed, and zeros as soon as they cease."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("coil_bridge", automatically_declare_parameters_from_overrides=True, **options)
-        settings = declare(self, CoilBridgeSettings)
-        self._coils = settings.allocation()
-        self._needle = NeedleWatch(settings.needle(), settings.pose_timeout, settings.reach)
-        self._gate = CommandGate(settings.command_timeout, settings.max_speed, settings.zero_hold)
-        self.driver = make_driver(settings)
-        self._health = Health(self)
+        super().__init__("coil_bridge", CoilBridgeSettings, **options)
+        self.station = CoilStation()
+        self._stamp: Any = None  # of a good command that has not gone to the coils yet
+        self._resumes = False  # whether a reset makes the node active again
         # The watchdog runs on a clock of its own: simulated time may stand still, the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._setpoints = topics.NEEDLE_SETPOINT.publisher(self)
-        self._currents = topics.CURRENTS.publisher(self)
-        topics.NEEDLE_POSE.subscribe(self, self.on_pose)
-        topics.NEEDLE_COMMAND.subscribe(self, self.on_command)
-        self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
-        self._following = False
-        self._period, self._applied = 1.0 / settings.rate, 0.0
-        self._health.ok("no command yet", driver=settings.driver)
-        self.driver.open()  # last, so that nothing can fail and leave it open
+        self._watchdog: Timer | None = None
+        self._report = CoilReport(self, self.station, self._steady)
+        topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
+        topics.NEEDLE_COMMAND.subscribe_numbered(self, self.on_command)
+        Switches(self, self.arm, self.stop, self.reset)
+        if self.get_parameter_or("autostart").value != "unconfigured":
+            self.require(self.trigger_configure)
+            if self.settings is not None and self.settings.autostart != "inactive":
+                self.require(self.trigger_activate)
 
-    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def begin(self, settings: CoilBridgeSettings) -> None:
+        """Open the driver; from now on it is told zero again and again."""
+        bridge = Bridge(settings, self.station.latch)
+        driver = make_driver(settings, len(bridge.coils), self._report.to_rig, self._report.rigs)
+        self.station.open(settings, bridge, driver)
+        self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
+
+    def resume(self) -> None:
+        """Let the bridge be armed."""
+        self.station.latch.activate()
+
+    def pause(self) -> None:
+        """Stop at once, and pass nothing until somebody activates and arms again."""
+        self.station.latch.deactivate()
+        self._step()
+
+    def end(self) -> None:
+        """Leave the coils at zero."""
+        if self._watchdog is not None:
+            self.destroy_timer(self._watchdog)
+            self._watchdog = None
+        self.station.close()
+
+    def arm(self, asked: bool) -> None:
+        """Let commands pass that come from now on, or none."""
+        self.station.arm(asked)
+        self._step()
+
+    def stop(self) -> None:
+        """Press the emergency stop, in whatever state."""
+        self.station.latch.stop()
+        self._step()
+
+    def reset(self) -> None:
+        """Forget the emergency stop and faults; a node that they made inactive is active again, but not armed."""
+        self.station.reset()
+        if self._resumes and self.stage == "inactive":
+            self.require(self.trigger_activate)
+        self._resumes = False
+        self._step()
+
+    def on_pose(self, message: PoseWithCovarianceStamped, number: int) -> None:
         """Take the needle's pose, for the next currents."""
+        if self.station.bridge is None:
+            return
         try:
             pose = messages.needle_pose(message)
-            self._needle.see(pose.tail, pose.heading, pose.stamp, self._now(), self._arrival())
-        except InvalidInputError as error:
-            self._health.refuse(error)
+            self.station.bridge.needle.see(pose.tail, pose.heading, pose.stamp, number, *self._times())
+        except UNUSABLE as error:
+            self._report.refuse(error)
 
-    def on_command(self, message: TwistStamped) -> None:
-        """Take a velocity command and apply it at once."""
-        try:
-            velocity = messages.command_velocity(message)
-            self._gate.accept(velocity, messages.seconds(message.header.stamp), self._now(), self._arrival())
-        except InvalidInputError as error:
-            self._health.refuse(error)
+    def on_command(self, message: TwistStamped, number: int) -> None:
+        """Take a velocity command, for the next currents."""
+        if self.station.bridge is None:
             return
-        self._following = True
-        self._apply(message.header.stamp)
+        try:
+            velocity, stamp = coil_messages.command_velocity(message), messages.seconds(message.header.stamp)
+            self.station.bridge.gate.accept(velocity, stamp, number, *self._times())
+        except UNUSABLE as error:
+            self._report.refuse(error)
+        else:
+            self._stamp = message.header.stamp
 
     def on_watchdog(self) -> None:
-        """Lay the field along the needle as it lies now; stop when no good command or pose has come for too long."""
-        # A command has just been applied: two in a row would only cost time.
-        if self._arrival() - self._applied > 0.9 * self._period:
-            self._apply(self.get_clock().now().to_msg())
+        """Ask the coils for what the last good command and pose amount to now."""
+        self.station.rhythm.tick(self._times()[1])
+        self._step()
+        if self.station.latch.latched and self.stage == "active":
+            self._resumes = True
+            self.trigger_deactivate()
+
+    def take_priority(self) -> None:
+        """Let the loop not wait for other processes, where that is allowed; meant for a process of its own."""
+        asked = self.get_parameter_or("realtime_priority").value
+        self._report.scheduled(take_priority(CoilBridgeSettings.realtime_priority if asked is None else asked))
 
     def destroy_node(self) -> None:
         """Leave the coils at zero."""
         try:
-            self.driver.close()
+            self.end()
         finally:
             super().destroy_node()
 
-    def _apply(self, stamp: Time) -> None:
-        setpoint = self._gate.setpoint(self._arrival())
-        if not setpoint.send:
-            return
-        allocation, stop = self._allocate(setpoint)
-        if stop and self._following:
-            self._health.warn(f"stopped: {stop}")
-        elif self._following:
-            self._health.ok("following commands", saturated=allocation.saturated)
-        self._following = not setpoint.stop
-        self.driver.apply(allocation.currents)
-        self._applied = self._arrival()
-        self._needle.move(allocation.velocity)
-        self._currents.publish(messages.currents_message(stamp, self._coils.names, allocation, stop))
-        self._setpoints.publish(messages.twist_message(stamp, allocation.velocity))
+    def _step(self) -> None:
+        """Apply what the bridge says now, and tell."""
+        outcome = self.station.step(*self._times())
+        if outcome is not None and outcome.publish:
+            stamp = None if outcome.reasons else self._stamp
+            self._report.applied(stamp or self.get_clock().now().to_msg(), outcome)
+            self._stamp = None
+        self._report.state(anyway=False)
 
-    def _allocate(self, setpoint: Setpoint) -> tuple[Allocation, str]:
-        """Return the currents for a setpoint, and why they are zero, if they are a stop."""
-        if setpoint.stop:
-            return self._coils.zero(), setpoint.stop
-        pose = self._needle.pose(self._now(), self._arrival())
-        if pose is None:
-            return self._coils.zero(), "no needle pose"
-        return self._coils.allocate(setpoint.velocity, pose.tail, pose.heading), ""
-
-    def _now(self) -> float:
-        return float(self.get_clock().now().nanoseconds * 1e-9)
-
-    def _arrival(self) -> float:
-        return float(self._steady.now().nanoseconds * 1e-9)
+    def _times(self) -> tuple[float, float]:
+        """Return the time of the stamps' clock and a monotonic time [s]."""
+        return self.get_clock().now().nanoseconds * 1e-9, self._steady.now().nanoseconds * 1e-9
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node as a program."""
-    return run(CoilBridgeNode, arguments)
+    return run(CoilBridgeNode, arguments, CoilBridgeNode.take_priority)
 
 
 if __name__ == "__main__":

@@ -49,6 +49,10 @@ class Health:
         """Say that the node cannot do its work."""
         self._set(DiagnosticStatus.ERROR, text, values)
 
+    def note(self, **values: object) -> None:
+        """Keep values for the next report."""
+        self._values.update(values)
+
     def refuse(self, problem: Exception, **values: object) -> None:
         """Say that an input was refused; the node itself goes on."""
         self._refused += 1

@@ -17,12 +17,11 @@ from geometry_msgs.msg import (
     TwistStamped,
     Vector3,
 )
-from magnetosuture_msgs.msg import BarrierMargin, CoilCurrents, PredictedThread, SafetyMargins, TrackerState
+from magnetosuture_msgs.msg import BarrierMargin, PredictedThread, SafetyMargins, TrackerState
 from nav_msgs.msg import Path
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from magnetosuture_thread.coils.allocation import Allocation
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, triangulate
 from magnetosuture_thread.interface import DISH_FRAME
@@ -107,10 +106,11 @@ def needle_pose(message: PoseWithCovarianceStamped) -> NeedlePose:
     require_dish_frame(message.header.frame_id, "needle/measured_cp")
     position, q = message.pose.pose.position, message.pose.pose.orientation
     tail = np.array([position.x, position.y])
-    size = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
+    # Not by squares: Python raises an error for those of what a hostile message may hold.
+    size = math.hypot(q.x, q.y, q.z, q.w)
     if not abs(size - 1.0) < 1e-3:
         raise InvalidInputError("needle/measured_cp.pose.orientation", f"norm {size:g}", "a unit quaternion")
-    along = np.array([1.0 - 2.0 * (q.y**2 + q.z**2), 2.0 * (q.x * q.y + q.w * q.z)])
+    along = np.array([1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + q.w * q.z)])
     length = float(np.linalg.norm(along))
     if length < 1e-3:
         raise InvalidInputError(
@@ -153,32 +153,11 @@ def path_points(message: Path) -> np.ndarray:
     return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
 
 
-def command_velocity(message: TwistStamped) -> np.ndarray:
-    """Return a velocity command in the dish plane, shape (2,) [m/s].
-
-    Raises:
-        InvalidInputError: wrong frame.
-    """
-    require_dish_frame(message.header.frame_id, "needle/servo_cv")
-    return np.array([message.twist.linear.x, message.twist.linear.y])
-
-
 def twist_message(stamp: Time, velocity: np.ndarray) -> TwistStamped:
     """Return a velocity of shape (2,) [m/s] as a stamped twist."""
     message = TwistStamped(header=header(stamp))
     message.twist.linear = Vector3(x=float(velocity[0]), y=float(velocity[1]))
     return message
-
-
-def currents_message(stamp: Time, names: Sequence[str], allocation: Allocation, stop: str) -> CoilCurrents:
-    """Return applied coil currents; `stop` says why they are zero."""
-    return CoilCurrents(
-        header=header(stamp),
-        coil=list(names),
-        current=allocation.currents.tolist(),
-        stop=stop,
-        saturated=allocation.saturated,
-    )
 
 
 def prediction_message(stamp: Time, prediction: Prediction, material: str, step_time: float) -> PredictedThread:

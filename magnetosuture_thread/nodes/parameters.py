@@ -29,12 +29,17 @@ def _type(about: Described) -> Parameter.Type:
     return _ARRAYS[about.entry] if about.kind is tuple else _TYPES[about.kind]
 
 
-def declare(node: Node, cls: type[C]) -> C:
-    """Declare every field of a configuration class, read-only, and return the settings in force.
+def declare(node: Node, cls: type[C], *, read_only: bool = True) -> C:
+    """Declare every field of a configuration class and return the settings in force.
 
     The node must have been made with `automatically_declare_parameters_from_overrides=True`: only so
     is a parameter that was set from outside but that the node does not know, a slip of the pen,
     noticed.
+
+    Args:
+        node: that gets the parameters.
+        cls: the configuration class.
+        read_only: whether they stay as they are for good; else they can be declared again.
 
     Raises:
         ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds.
@@ -50,7 +55,7 @@ def declare(node: Node, cls: type[C]) -> C:
         if about.name in given:
             node.undeclare_parameter(about.name)
         parameter = Parameter(about.name, _type(about), values[about.name])
-        node.declare_parameter(about.name, parameter.value, _descriptor(about), ignore_override=True)
+        node.declare_parameter(about.name, parameter.value, _descriptor(about, read_only), ignore_override=True)
     return settings
 
 
@@ -59,14 +64,14 @@ def _plain(value: Any) -> Any:
     return list(value) if hasattr(value, "typecode") or isinstance(value, tuple) else value
 
 
-def _descriptor(about: Described) -> ParameterDescriptor:
+def _descriptor(about: Described, read_only: bool) -> ParameterDescriptor:
     quantity = about.quantity
     descriptor = ParameterDescriptor(
         name=about.name,
         type=_type(about).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
         additional_constraints=quantity.expectation(about.kind),
-        read_only=True,
+        read_only=read_only,
     )
     if quantity.minimum is not None and quantity.maximum is not None:
         if about.kind is float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -14,13 +15,18 @@ from rclpy.node import Node
 
 from magnetosuture_thread.errors import MagnetosutureError
 
+N = TypeVar("N", bound=Node)
 
-def run(make: Callable[[], Node], arguments: Sequence[str] | None = None) -> int:
+
+def run(
+    make: Callable[[], N], arguments: Sequence[str] | None = None, made: Callable[[N], None] = lambda node: None
+) -> int:
     """Run a node until it is interrupted.
 
     Args:
         make: makes the node.
         arguments: of the command line; those of the process if None.
+        made: called with the node once it is made; for what concerns the whole process.
 
     Returns:
         0 when it was asked to end, 1 when it could not start.
@@ -33,6 +39,7 @@ def run(make: Callable[[], Node], arguments: Sequence[str] | None = None) -> int
     node = None
     try:
         node = make()
+        made(node)
         # The multi-threaded executor loses messages in the wheels of Jazzy.
         executor = SingleThreadedExecutor()
         executor.add_node(node)

@@ -8,54 +8,64 @@ import pytest
 from magnetosuture_thread.coils.gate import CommandGate
 from magnetosuture_thread.errors import InvalidInputError
 
-TIMEOUT, SPEED, HOLD = 0.1, 0.02, 1.0
+TIMEOUT, SPEED = 0.1, 0.02
 EAST = np.array([0.01, 0.0])
 
 
 def gate() -> CommandGate:
     """Return a gate with the limits above."""
-    return CommandGate(TIMEOUT, SPEED, HOLD)
+    return CommandGate(TIMEOUT, SPEED)
 
 
-def test_before_any_command_it_stops():
-    setpoint = gate().setpoint(5.0)
-    assert setpoint.stop == "no command yet"
-    assert setpoint.velocity.tolist() == [0.0, 0.0]
+def test_before_any_command_it_is_closed():
+    assert gate().closed(15.0, 5.0) == "no command yet"
 
 
 def test_a_good_command_is_followed_until_it_times_out():
     held = gate()
-    held.accept(EAST, stamp=10.0, now=10.0, arrival=0.0)
-    assert held.setpoint(0.0).velocity.tolist() == EAST.tolist()
-    assert held.setpoint(0.0999).stop == ""
-    late = held.setpoint(0.1001)
-    assert late.stop.startswith("no command for 0.100")
-    assert late.velocity.tolist() == [0.0, 0.0]
+    held.accept(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    assert held.velocity.tolist() == EAST.tolist()
+    assert held.closed(10.0 + 0.0999, 0.0999) == ""
+    assert held.closed(10.0 + 0.1001, 0.1001) == "no command for 0.1 s"
 
 
-def test_after_a_stop_zeros_are_sent_for_a_while_and_then_no_more():
+def test_it_opens_with_the_next_good_command():
     held = gate()
-    held.accept(EAST, stamp=10.0, now=10.0, arrival=0.0)
-    assert held.setpoint(0.2).send
-    assert held.setpoint(1.1).send
-    assert not held.setpoint(1.3).send
+    held.accept(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    assert held.closed(10.0 + 3.0, 3.0)
+    held.accept(EAST, stamp=13.0, number=2, now=13.0, arrival=3.0)
+    assert held.closed(10.0 + 3.0, 3.0) == ""
 
 
-def test_it_resumes_with_the_next_good_command():
+def test_what_a_command_took_to_get_here_counts():
     held = gate()
-    held.accept(EAST, stamp=10.0, now=10.0, arrival=0.0)
-    assert held.setpoint(3.0).stop
-    held.accept(EAST, stamp=13.0, now=13.0, arrival=3.0)
-    resumed = held.setpoint(3.0)
-    assert resumed.stop == ""
-    assert resumed.send
-    assert held.setpoint(3.2).send  # and its zeros are sent anew
+    held.accept(EAST, stamp=9.94, number=1, now=10.0, arrival=0.0)
+    assert held.closed(10.03, 0.03) == ""
+    assert held.closed(10.05, 0.05) == "no command for 0.1 s"
+
+
+def test_it_closes_although_the_stamps_clock_stands_still():
+    held = gate()
+    held.accept(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    assert held.closed(10.0, 0.09) == ""
+    assert held.closed(10.0, 0.11) == "no command for 0.1 s"
+
+
+def test_what_it_forgot_does_not_count_and_what_comes_then_does():
+    held = gate()
+    held.accept(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    held.forget()
+    assert held.closed(10.0 + 0.01, 0.01) == "no command yet"
+    held.accept(EAST, stamp=10.01, number=2, now=10.01, arrival=0.01)
+    assert held.closed(10.0 + 0.01, 0.01) == ""
 
 
 def test_speed_is_limited_and_direction_kept():
     held = gate()
-    held.accept(np.array([3.0, 4.0]), stamp=0.0, now=0.0, arrival=0.0)
-    np.testing.assert_allclose(held.setpoint(0.0).velocity, [0.012, 0.016])
+    held.accept(np.array([3.0, 4.0]), stamp=0.0, number=1, now=0.0, arrival=0.0)
+    assert held.velocity.tolist() == pytest.approx([0.012, 0.016])
+    held.accept(np.array([-1e308, 1e308]), stamp=0.0, number=2, now=0.0, arrival=0.0)
+    assert held.velocity.tolist() == pytest.approx([-0.02 / 2**0.5, 0.02 / 2**0.5])
 
 
 @pytest.mark.parametrize(
@@ -73,16 +83,38 @@ def test_a_bad_command_is_refused_and_does_not_keep_the_needle_moving(
     velocity: tuple[float, float], stamp: float, words: str
 ):
     held = gate()
-    held.accept(EAST, stamp=9.98, now=9.98, arrival=0.0)
+    held.accept(EAST, stamp=9.98, number=1, now=9.98, arrival=0.0)
     with pytest.raises(InvalidInputError, match=words):
-        held.accept(np.array(velocity), stamp=stamp, now=10.0, arrival=0.02)
-    assert held.setpoint(0.05).velocity.tolist() == EAST.tolist()
-    assert held.setpoint(0.11).stop
+        held.accept(np.array(velocity), stamp=stamp, number=2, now=10.0, arrival=0.02)
+    assert held.velocity.tolist() == EAST.tolist()
+    assert held.closed(9.98 + 0.05, 0.05) == ""
+    assert held.closed(9.98 + 0.11, 0.11) == "no command for 0.1 s"
 
 
 def test_time_set_back_does_not_lock_the_gate():
     """A bag that is played again starts with earlier stamps; so does a simulation."""
     held = gate()
-    held.accept(EAST, stamp=100.0, now=100.0, arrival=0.0)
-    held.accept(EAST, stamp=5.0, now=5.0, arrival=1.0)
-    assert held.setpoint(1.0).stop == ""
+    held.accept(EAST, stamp=100.0, number=1, now=100.0, arrival=0.0)
+    held.accept(EAST, stamp=5.0, number=1, now=5.0, arrival=1.0)
+    assert held.closed(5.0, 1.0) == ""
+
+
+def test_two_that_command_at_once_close_it_until_one_is_silent():
+    held = gate()
+    for k in range(10):
+        at = 0.02 * k
+        held.accept(EAST, stamp=at, number=500 + k, now=at, arrival=at)
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        held.accept(-EAST, stamp=0.185, number=1, now=0.185, arrival=0.185)
+    assert held.velocity.tolist() == EAST.tolist()
+    assert held.closed(0.186, 0.186) == "several publishers of needle/servo_cv at once"
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        held.accept(EAST, stamp=0.2, number=510, now=0.2, arrival=0.2)
+    for k in range(11, 40):
+        at = 0.02 * k
+        if at < 0.68:
+            with pytest.raises(InvalidInputError, match="publishers"):
+                held.accept(EAST, stamp=at, number=500 + k, now=at, arrival=at)
+        elif at > 0.7:
+            held.accept(EAST, stamp=at, number=500 + k, now=at, arrival=at)
+            assert held.closed(at, at) == ""

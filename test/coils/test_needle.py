@@ -16,7 +16,7 @@ EAST = np.array([1.0, 0.0])
 def watch() -> NeedleWatch:
     """Return a watch that has seen a needle at time 1."""
     made = NeedleWatch(NEEDLE, 0.2, 0.045)
-    made.see(np.zeros(2), EAST, 1.0, 1.0, 50.0)
+    made.see(np.zeros(2), EAST, 1.0, 1, 1.0, 50.0)
     return made
 
 
@@ -49,7 +49,8 @@ def test_a_velocity_across_turns_the_needle_about_its_middle():
 
 
 def test_a_pose_is_not_carried_far():
-    seen = watch()
+    seen = NeedleWatch(NEEDLE, 1.0, 0.045)
+    seen.see(np.zeros(2), EAST, 1.0, 1, 1.0, 50.0)
     seen.move(np.array([0.005, 0.0]))
     pose = seen.pose(1.9, 50.1)
     assert pose is not None
@@ -72,7 +73,23 @@ def test_a_pose_is_not_carried_far():
 def test_a_bad_pose_is_refused_and_the_last_stays(tail, heading, stamp, words):
     seen = watch()
     with pytest.raises(InvalidInputError, match=words):
-        seen.see(tail, heading, stamp, 1.0, 50.0)
+        seen.see(tail, heading, stamp, 2, 1.0, 50.0)
     pose = seen.pose(1.0, 50.1)
     assert pose is not None
     np.testing.assert_allclose(pose.tail, [0.0, 0.0])
+
+
+def test_a_pose_ends_by_its_stamp_too_and_says_why():
+    seen = watch()
+    assert seen.lost(1.19, 50.0) == ""
+    assert seen.lost(1.21, 50.0) == "no needle pose for 0.2 s"
+    assert seen.lost(1.0, 50.21) == "no needle pose for 0.2 s"
+    assert NeedleWatch(NEEDLE, 0.2, 0.045).lost(1.0, 50.0) == "no needle pose yet"
+
+
+def test_two_that_say_where_the_needle_is_are_one_too_many():
+    seen = watch()
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        seen.see(np.array([0.01, 0.0]), EAST, 1.0, 7777, 1.0, 50.01)
+    assert seen.lost(1.0, 50.02) == "several publishers of needle/measured_cp at once"
+    assert seen.pose(1.0, 50.02) is None

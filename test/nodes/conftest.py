@@ -33,6 +33,7 @@ class Graph:
         self._subscriptions: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
         self._failure: BaseException | None = None
+        self._spinning = threading.Lock()
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
@@ -45,10 +46,11 @@ class Graph:
         return node
 
     def remove(self, node: Node) -> None:
-        """Take a node out of the graph and destroy it."""
-        self.executor.remove_node(node)
-        self.nodes.remove(node)
-        node.destroy_node()
+        """Take a node out of the graph and destroy it, once no callback of it is at work."""
+        with self._spinning:
+            self.executor.remove_node(node)
+            self.nodes.remove(node)
+            node.destroy_node()
 
     def listen(self, topic: Topic) -> list[Any]:
         """Return the list that grows with every message on a topic, once somebody publishes it."""
@@ -103,7 +105,9 @@ class Graph:
     def _spin(self) -> None:
         try:
             while self.context.ok():
-                self.executor.spin_once(timeout_sec=0.05)
+                with self._spinning:
+                    self.executor.spin_once(timeout_sec=0.05)
+                time.sleep(1e-4)  # who waits to remove a node gets its turn
         except rclpy.executors.ExternalShutdownException:
             pass
         except BaseException as error:

@@ -15,7 +15,7 @@ from magnetosuture_msgs.msg import BarrierMargin
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.model.barriers import BarrierKind
-from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes import coil_messages, messages, topics
 from magnetosuture_thread.resources import share
 from magnetosuture_thread.study.replayed import KINDS
 
@@ -38,6 +38,15 @@ def test_a_needle_that_stands_upright_has_no_heading():
         messages.needle_pose(message)
 
 
+@pytest.mark.parametrize("value", [0.5, 1e200, 1e308, -1e308, float("inf"), float("nan")])
+@pytest.mark.parametrize("axis", ["x", "y", "z", "w"])
+def test_an_orientation_that_is_none_is_refused_whatever_it_holds(value: float, axis: str):
+    message = messages.pose_message(STAMP, np.zeros(2), np.array([0.6, 0.8]))
+    setattr(message.pose.pose.orientation, axis, value)
+    with pytest.raises(InvalidInputError, match="a unit quaternion"):
+        messages.needle_pose(message)
+
+
 def test_a_path_is_made_anew_in_the_message_of_the_last():
     maker, points = messages.PathMaker(), np.random.default_rng(1).normal(size=(9, 2))
     maker.message(STAMP, points)
@@ -52,7 +61,7 @@ def test_paths_and_velocities_go_there_and_back():
     np.testing.assert_array_equal(messages.path_points(messages.PathMaker().message(STAMP, points)), points)
     assert messages.path_points(messages.PathMaker().message(STAMP, np.empty((0, 2)))).shape == (0, 2)
     np.testing.assert_array_equal(
-        messages.command_velocity(messages.twist_message(STAMP, np.array([1.0, -2.0]))), [1.0, -2.0]
+        coil_messages.command_velocity(messages.twist_message(STAMP, np.array([1.0, -2.0]))), [1.0, -2.0]
     )
 
 
@@ -63,7 +72,7 @@ def test_every_topic_has_a_type_that_bags_know(topic: topics.Topic):
 
 def test_the_bags_and_the_graph_have_the_same_own_messages():
     """The same bytes mean the same in both: a type that was rebuilt in one place only would differ."""
-    for topic in (topics.PREDICTED_THREAD, topics.MARGINS, topics.CURRENTS):
+    for topic in (topics.PREDICTED_THREAD, topics.MARGINS, topics.CURRENTS, topics.BRIDGE_STATE):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())
 

@@ -1,0 +1,141 @@
+"""A managed node: its parameters are checked when it is configured, and stay as they are while it is."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.exceptions import ParameterException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+
+from magnetosuture_thread.configuration import OF_ROS, Configuration
+from magnetosuture_thread.errors import ConfigurationError, GraphError, MagnetosutureError
+from magnetosuture_thread.nodes.parameters import declare
+
+C = TypeVar("C", bound=Configuration)
+
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+class ManagedNode(LifecycleNode, Generic[C]):
+    """A lifecycle node with the states of ROS 2: unconfigured, inactive, active, finalized.
+
+    Args:
+        name: of the node.
+        settings: its configuration class.
+        options: for rclpy's node.
+
+    Attributes:
+        settings: in force; None while unconfigured.
+        problem: why the last transition failed.
+    """
+
+    def __init__(self, name: str, settings: type[C], **options: Any) -> None:
+        super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+        self._class = settings
+        self.settings: C | None = None
+        self.problem: Exception | None = None
+        self.add_on_set_parameters_callback(self._keep)
+        self._guard_transitions()
+
+    @abstractmethod
+    def begin(self, settings: C) -> None:
+        """Take what the settings ask for; raise `MagnetosutureError` where that cannot be."""
+
+    @abstractmethod
+    def resume(self) -> None:
+        """Become active; raise `MagnetosutureError` where that cannot be."""
+
+    @abstractmethod
+    def pause(self) -> None:
+        """Become inactive; must not fail."""
+
+    @abstractmethod
+    def end(self) -> None:
+        """Give all back that was taken in `begin`, also if that did not get to its end; must not fail."""
+
+    @property
+    def stage(self) -> str:
+        """The state's name in ROS."""
+        return str(self._state_machine.current_state[1])
+
+    def require(self, go: Callable[[], TransitionCallbackReturn]) -> None:
+        """Make a transition.
+
+        Raises:
+            MagnetosutureError: it failed; the node stays before it.
+        """
+        self.problem = None
+        if go() is not SUCCESS:
+            raise self.problem or GraphError(f"{self.get_name()}: the transition from {self.stage} failed")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the parameters and take what they ask for."""
+        try:
+            settings = declare(self, self._class, read_only=False)
+            self.begin(settings)
+        except (MagnetosutureError, ParameterException) as error:
+            self.end()
+            return self._failed(error)
+        self.settings = settings
+        return SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Become active."""
+        try:
+            self.resume()
+        except MagnetosutureError as error:
+            return self._failed(error)
+        return SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Become inactive."""
+        self.pause()
+        return SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give all back; the parameters can be set again."""
+        self.end()
+        self.settings = None
+        return SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give all back for good."""
+        self.pause()
+        return self.on_cleanup(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After an error that nobody foresaw, give all back."""
+        return self.on_shutdown(state)
+
+    def _failed(self, error: Exception) -> TransitionCallbackReturn:
+        self.problem = error
+        self.get_logger().error(str(error))
+        return FAILURE
+
+    def _keep(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Refuse to change settings under a configured node."""
+        held = [p.name for p in parameters if p.name.split(".")[0] not in OF_ROS]
+        if self.settings is None or not held:
+            return SetParametersResult(successful=True)
+        error = ConfigurationError(held[0], "a change while configured", "a cleaned-up node")
+        return SetParametersResult(successful=False, reason=str(error))
+
+    def _guard_transitions(self) -> None:
+        """Answer a transition that is not possible now by "no": rclpy would end the node."""
+        service = self._service_change_state
+        change = service.callback
+
+        def guarded(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except rclpy_implementation.RCLError as error:
+                self.get_logger().warning(f"transition {request.transition.id} refused: {error}")
+                response.success = False
+                return response
+
+        service.callback = guarded

@@ -1,0 +1,346 @@
+"""What the bridge promises: as collision_monitor, diff_drive_controller and Servo promise it of a base or an arm.
+
+A plant in Python: a clock, a commander, a tracker and a driver, each of which can fail. Nothing waits here.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magnetosuture_thread.coils.bridge import Bridge, Outcome
+from magnetosuture_thread.coils.drivers import DriverState
+from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.errors import InvalidInputError
+
+PERIOD = 0.005
+READY = DriverState(True)
+EAST, TAIL = np.array([1.0, 0.0]), np.array([-0.0035, 0.0])
+
+
+@dataclass
+class Plant:
+    """A bridge under a clock; commands come at 50 Hz and poses at 60, unless they are switched off."""
+
+    settings: CoilBridgeSettings = field(default_factory=CoilBridgeSettings)
+    time: float = 100.0
+    velocity: tuple[float, float] | None = (0.005, 0.002)
+    tail: NDArray[np.float64] | None = field(default_factory=lambda: TAIL.copy())
+    driver: DriverState = READY
+    outcomes: list[tuple[float, Outcome]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Make the bridge, not active yet."""
+        self.bridge = Bridge(self.settings, ArmingLatch())
+        self.commands = self.poses = 0
+        self._next_command = self._next_pose = self.time
+
+    def ready(self) -> Plant:
+        """Activate and arm."""
+        self.bridge.latch.activate()
+        self.bridge.arm(self.driver)
+        return self
+
+    def run(self, duration: float) -> list[Outcome]:
+        """Let time go on; return what each step asked of the coils."""
+        begin = len(self.outcomes)
+        for _ in range(round(duration / PERIOD)):
+            self.time += PERIOD
+            if self.tail is not None and self.time >= self._next_pose:
+                self.poses += 1
+                self.bridge.needle.see(self.tail, EAST, self.time, self.poses, self.time, self.time)
+                self._next_pose = self.time + 1.0 / 60.0
+            if self.velocity is not None and self.time >= self._next_command:
+                self.command(self.velocity)
+                self._next_command = self.time + 0.02
+            self.outcomes.append((self.time, self.bridge.step(self.time, self.time, self.driver)))
+        return [outcome for _, outcome in self.outcomes[begin:]]
+
+    def command(self, velocity: tuple[float, float], stamp: float | None = None, number: int | None = None) -> None:
+        """Send one command now."""
+        self.commands += 1
+        stamp = self.time if stamp is None else stamp
+        self.bridge.gate.accept(np.array(velocity), stamp, number or self.commands, self.time, self.time)
+
+
+def still(outcome: Outcome) -> bool:
+    """Return whether no coil has a current."""
+    return not np.any(outcome.allocation.currents)
+
+
+def stopped_after(plant: Plant, since: float) -> float:
+    """Return how long after a time the coils first were at zero, for good [s]."""
+    moving = [time for time, outcome in plant.outcomes if not still(outcome)]
+    return max(0.0, moving[-1] + PERIOD - since)
+
+
+def test_while_all_is_well_it_drives():
+    outcomes = Plant().ready().run(1.0)
+    assert not any(still(outcome) for outcome in outcomes[4:])
+    assert outcomes[-1].reasons == ()
+    assert outcomes[-1].allocation.velocity.tolist() == pytest.approx([0.005, 0.002], rel=0.02)
+
+
+def test_no_false_stops():
+    """A minute of commands and poses that come late, but in time: not one zero."""
+    plant = Plant().ready()
+    plant.run(0.2)
+    jitter = np.random.default_rng(3)
+    plant.velocity = plant.tail = None
+    at = {"command": plant.time + 0.04, "pose": plant.time + 0.04}
+    numbers = {"command": plant.commands, "pose": plant.poses}
+    for _ in range(12_000):
+        plant.time += PERIOD
+        for name in ("command", "pose"):
+            if plant.time >= at[name]:
+                numbers[name] += 1
+                age = float(jitter.uniform(0.0, 0.03))
+                if name == "command":
+                    plant.command((0.004, -0.001), plant.time - age, numbers[name])
+                else:
+                    stamp = plant.time - age
+                    plant.bridge.needle.see(TAIL, EAST, stamp, numbers[name], plant.time, plant.time)
+                at[name] = plant.time + float(jitter.uniform(0.04, 0.055))
+        assert not still(plant.bridge.step(plant.time, plant.time, READY))
+
+
+@pytest.mark.parametrize("timeout", [0.05, 0.1, 0.4])
+def test_source_timeout_and_time_to_stop(timeout: float):
+    plant = Plant(CoilBridgeSettings(command_timeout=timeout)).ready()
+    plant.run(0.5)
+    plant.velocity, last = None, plant.bridge.gate.stamp
+    outcomes = plant.run(1.0)
+    assert outcomes[-1].reasons == (f"no command for {timeout:g} s",)
+    assert timeout - 2 * PERIOD < stopped_after(plant, last) <= timeout + 1e-9
+
+
+def test_a_lost_pose_stops_while_commands_go_on():
+    plant = Plant().ready()
+    plant.run(0.5)
+    plant.tail, last = None, plant.time
+    assert plant.run(1.0)[-1].reasons == ("no needle pose for 0.2 s",)
+    assert stopped_after(plant, last) <= 0.2 + 1e-9
+
+
+@pytest.mark.parametrize("lost", ["velocity", "tail"])
+def test_source_returns_and_time_to_resume(lost: str):
+    plant = Plant().ready()
+    plant.run(0.5)
+    kept = getattr(plant, lost)
+    setattr(plant, lost, None)
+    assert still(plant.run(1.0)[-1])
+    setattr(plant, lost, kept)
+    resumed = plant.run(0.5)
+    assert not still(resumed[1])
+    assert resumed[-1].reasons == ()
+
+
+def test_cease_after_stop():
+    """Zeros are told for a while, then no more; the coils are held at zero all the time."""
+    plant = Plant(CoilBridgeSettings(zero_hold=0.3)).ready()
+    plant.run(0.5)
+    plant.velocity = None
+    outcomes = plant.run(2.0)
+    zeros = [outcome for outcome in outcomes if still(outcome)]
+    assert sum(outcome.publish for outcome in zeros) == pytest.approx(0.3 / PERIOD, abs=2)
+    assert not zeros[-1].publish
+    plant.velocity = (0.005, 0.0)
+    assert plant.run(0.1)[-1].publish
+
+
+@pytest.mark.parametrize("how_far", ["inactive", "active"])
+def test_inactive_and_disarmed_pass_nothing(how_far: str):
+    plant = Plant()
+    if how_far == "active":
+        plant.bridge.latch.activate()
+    outcomes = plant.run(1.0)
+    assert all(still(outcome) for outcome in outcomes)
+    assert outcomes[-1].reasons == ("inactive" if how_far == "inactive" else "disarmed",)
+
+
+def test_what_was_commanded_before_arming_does_not_count():
+    plant = Plant()
+    plant.bridge.latch.activate()
+    plant.run(0.1)
+    plant.velocity = None
+    plant.bridge.arm(READY)
+    assert plant.run(0.02)[-1].reasons == ("no command yet",)
+    plant.velocity = (0.005, 0.0)
+    assert not still(plant.run(0.05)[-1])
+
+
+@pytest.mark.parametrize("press", ["stop", "disarm", "deactivate", "trip"])
+def test_whatever_is_pressed_works_with_the_next_step_and_stays(press: str):
+    plant = Plant().ready()
+    assert not still(plant.run(0.5)[-1])
+    getattr(plant.bridge.latch, press)(*(["a fault"] if press == "trip" else []))
+    assert all(still(outcome) for outcome in plant.run(1.0))
+
+
+@pytest.mark.parametrize("gone", [DriverState(False, "no answer", 1), DriverState(True, "", 1)])
+def test_a_driver_that_was_lost_even_for_a_moment_is_a_fault_until_a_reset(gone: DriverState):
+    plant = Plant().ready()
+    plant.run(0.5)
+    plant.driver = gone
+    outcomes = plant.run(0.2)
+    assert all(still(outcome) for outcome in outcomes)
+    assert outcomes[-1].reasons[0].startswith("driver: ")
+    plant.driver = DriverState(True, "", 1)  # back by itself
+    assert all(still(outcome) for outcome in plant.run(1.0))
+    plant.bridge.reset(plant.driver)
+    assert all(still(outcome) for outcome in plant.run(0.1))
+    plant.bridge.arm(plant.driver)
+    assert not still(plant.run(0.1)[-1])
+
+
+def test_stops_are_at_once_and_starts_are_not():
+    """Acceleration and slew are limited while the needle is driven; a stop may take no time."""
+    settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
+    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
+    outcomes = plant.run(1.0)
+    plant.velocity = (-0.015, 0.0)
+    outcomes += plant.run(1.0)
+    for before, after in itertools.pairwise(outcomes):
+        assert np.linalg.norm(after.applied - before.applied) <= 0.1 * 2 * PERIOD + 1e-12
+        assert np.abs(after.allocation.currents - before.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
+    steps = [np.linalg.norm(b.applied - a.applied) for a, b in itertools.pairwise(outcomes[1:])]
+    assert max(steps) == pytest.approx(0.1 * PERIOD, rel=1e-6)
+    assert not still(outcomes[-1])
+    plant.velocity = (0.0, 0.0)
+    at_rest = plant.run(0.05)
+    assert at_rest[-1].reasons == ()
+    assert at_rest[-1].publish
+    assert [still(outcome) for outcome in at_rest[4:]] == [True] * (len(at_rest) - 4)
+    assert not any(0.0 < np.linalg.norm(outcome.applied) < 0.014 for outcome in at_rest)
+
+
+def test_a_late_step_changes_no_more_than_two_in_time():
+    plant = Plant(CoilBridgeSettings(max_acceleration=0.1), velocity=(0.015, 0.0)).ready()
+    plant.run(0.02)
+    before = plant.outcomes[-1][1].applied
+    plant.time += 0.08
+    plant.command((0.015, 0.0))
+    after = plant.bridge.step(plant.time, plant.time, READY).applied
+    assert np.linalg.norm(after - before) <= 0.1 * 2 * PERIOD + 1e-12
+
+
+def test_currents_stay_within_their_limit_and_saturation_is_said():
+    plant = Plant(CoilBridgeSettings(max_current=1.5, max_speed=0.5), velocity=(0.4, 0.1)).ready()
+    outcomes = plant.run(1.0)
+    assert max(np.abs(outcome.allocation.currents).max() for outcome in outcomes) <= 1.5
+    assert outcomes[-1].allocation.saturated
+    assert np.linalg.norm(outcomes[-1].allocation.velocity) < np.linalg.norm(outcomes[-1].applied)
+
+
+def test_two_that_command_at_once_stop_it_until_one_is_silent():
+    plant = Plant().ready()
+    plant.run(0.5)
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        plant.command((-0.01, 0.0), number=7777)
+    plant.velocity = None
+    assert plant.run(0.05)[-1].reasons == ("several publishers of needle/servo_cv at once",)
+
+
+def test_two_that_say_where_the_needle_is_stop_it():
+    plant = Plant().ready()
+    plant.run(0.5)
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        plant.bridge.needle.see(-TAIL, EAST, plant.time, 7777, plant.time, plant.time)
+    plant.tail = None
+    assert plant.run(0.05)[-1].reasons == ("several publishers of needle/measured_cp at once",)
+
+
+@pytest.mark.parametrize("towards", [(1.0, 0.0), (0.7, 0.7), (0.0, 1.0), (-1.0, 0.0), (0.3, -0.9)])
+@pytest.mark.parametrize("obstacles", [(), (0.006, 0.0, 0.002)])
+def test_the_needle_never_comes_closer_than_it_may(towards: tuple[float, float], obstacles: tuple[float, ...]):
+    """Told to go on for ever, it comes to rest before the wall or the obstacle, by what its coils give it."""
+    settings = CoilBridgeSettings(disc_obstacles=obstacles)
+    plant = Plant(settings, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
+    plant.tail = None
+    tail, heading = TAIL - np.array([0.004, 0.0]), EAST
+    needle, workspace = settings.needle(), settings.workspace()
+    least = np.inf
+    for number in range(1, 1200):
+        plant.bridge.needle.see(tail, heading, plant.time, number, plant.time, plant.time)
+        outcome = plant.run(PERIOD)[0]
+        # As the bridge has it: along the chord the needle is driven, across it turns about its middle.
+        e = needle.chord_direction(heading)
+        n = np.array([-e[1], e[0]])
+        middle = tail + 0.5 * needle.chord * e + float(outcome.allocation.velocity @ e) * PERIOD * e
+        angle = float(outcome.allocation.velocity @ n) / (0.5 * needle.chord) * PERIOD
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        heading = turn @ heading
+        tail = middle - 0.5 * needle.chord * (turn @ e)
+        least = min(least, workspace.clearance(tail, heading))
+    assert least > settings.keep_out - 5e-6
+    assert least < 0.003  # it did get there
+
+
+def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: pytest.MonkeyPatch):
+    plant = Plant().ready()
+    plant.run(0.2)
+
+    def broken(*_: object) -> None:
+        raise FloatingPointError("no such number")
+
+    monkeypatch.setattr(plant.bridge, "_allocate", broken)
+    outcomes = plant.run(0.2)
+    assert all(still(outcome) for outcome in outcomes)
+    assert plant.bridge.latch.fault == "internal error: FloatingPointError: no such number"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"command_timeout": 0.0},
+        {"pose_timeout": 0.0},
+        {"max_speed": 0.0},
+        {"max_current": float("nan")},
+        {"autostart": "armed", "driver": "roboclaw"},
+        {"max_acceleration": -1.0},
+        {"rate": 0.0},
+        {"roboclaw_timeout": 0.0},
+        {"keep_out": 0.03},
+    ],
+)
+def test_bad_settings_are_refused(change: dict[str, object]):
+    make: Callable[..., CoilBridgeSettings] = CoilBridgeSettings
+    with pytest.raises(Exception, match="coil_bridge\\."):
+        make(**change)
+
+
+def test_10000_hostile_inputs_and_not_one_current_outside_of_the_limits():
+    source = np.random.default_rng(11)
+    settings = CoilBridgeSettings(max_current_slew=500.0)
+    plant = Plant(settings, velocity=None, tail=None).ready()
+    odd = np.array([0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 0.01, -0.02, 1e-6])
+    before, driven = np.zeros(4), 0
+    number = {"command": 0, "pose": 0}
+    for k in range(10_000):
+        plant.time += float(source.choice([0.0, 1e-4, PERIOD, 0.03]))
+        hostile = source.uniform() < 0.3
+        stamp = plant.time + (float(source.choice([-1e9, -1.0, 0.2, 1e9])) if hostile and k % 3 == 0 else 0.0)
+        values = source.choice(odd, 4) if hostile else np.array([*source.uniform(-0.03, 0.03, 2), 1.0, 0.0])
+        name = "command" if k % 2 else "pose"
+        number[name] += int(source.choice([-5, 0, 200])) if source.uniform() < 0.002 else 1
+        try:
+            if name == "command":
+                plant.bridge.gate.accept(values[:2], stamp, number[name], plant.time, plant.time)
+            else:
+                plant.bridge.needle.see(0.4 * values[:2], values[2:], stamp, number[name], plant.time, plant.time)
+        except InvalidInputError:
+            pass
+        currents = plant.bridge.step(plant.time, plant.time, READY).allocation.currents
+        assert np.all(np.isfinite(currents))
+        assert np.abs(currents).max() <= settings.max_current
+        if currents.any():
+            assert np.abs(currents - before).max() <= settings.max_current_slew * 2 * PERIOD + 1e-9
+        before, driven = currents, driven + bool(currents.any())
+        assert plant.bridge.latch.fault == ""
+    assert driven > 500  # there was something to go wrong
