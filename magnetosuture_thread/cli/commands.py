@@ -179,8 +179,36 @@ def calibrate_camera(options: argparse.Namespace) -> int:
     return DONE
 
 
+def calibrate_coils(options: argparse.Namespace) -> int:
+    """Find the coils' properties from probe measurements."""
+    from magnetosuture_thread.jobs.calibrate_coils import calibrate_coils as calibrate
+    from magnetosuture_thread.study.coil_table import coil_lines, coil_table
+
+    console = Console(highlight=False)
+    found = calibrate(options.measurements, options.output, options.model, options.name).to_json()
+    console.print(coil_table(found))
+    for line in coil_lines(found):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(f"calibration: {options.output}", soft_wrap=True, markup=False)
+    return DONE
+
+
+def coils(options: argparse.Namespace) -> int:
+    """Press a switch of the running coil bridge."""
+    from magnetosuture_thread.jobs.coils import coils as press
+
+    console = Console(highlight=False)
+    state = press(options.action)
+    width = max(len(name) for name in state)
+    for name, value in state.items():
+        console.print(f"{name:{width}}  {value}", soft_wrap=True, markup=False)
+    return DONE
+
+
 def bench(options: argparse.Namespace) -> int:
-    """Time the model."""
+    """Time the model, or the coil bridge."""
+    if options.bridge:
+        return _bench_bridge(options)
     from magnetosuture_thread.study.bench.run import bench as measure
     from magnetosuture_thread.study.bench.table import bench_lines, bench_table
 
@@ -191,6 +219,18 @@ def bench(options: argparse.Namespace) -> int:
     for line in bench_lines(report):
         console.print(line, soft_wrap=True, markup=False)
     _write_json(options.json, report.to_json())
+    return DONE
+
+
+def _bench_bridge(options: argparse.Namespace) -> int:
+    from magnetosuture_thread.jobs.bench_bridge import bench_bridge
+    from magnetosuture_thread.study.bridge_report import bridge_table
+
+    console = Console(highlight=False)
+    with _progress(console, "bench") as progress:
+        report = bench_bridge(options.trials, options.kills, options.hostile, say=_sayer(console), progress=progress)
+    console.print(bridge_table(report))
+    _write_json(options.json, json.dumps(report.to_json(), indent=2, allow_nan=False))
     return DONE
 
 

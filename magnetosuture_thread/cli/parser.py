@@ -7,82 +7,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 from magnetosuture_thread.cli import commands
-
-DESCRIPTION = """\
-Predicts where a suture thread goes behind a magnetically steered needle.
-
-Research software, no medical device. Lengths are in metres and times in seconds throughout.
-"""
-
-RECORD = """\
-Render a reference trajectory as the overhead camera would see it, and write a bag: JPEG frames,
-camera_info, the needle velocity commands that the trajectory amounts to, and the truth. Everything in
-the bag is simulated; its notes say so, and `replay` repeats it.
-"""
-
-REPLAY = """\
-Play an mcap bag through the live graph: vision_tracker, thread_model and coil_bridge run as processes
-of their own, on a ROS domain that nobody else uses, with simulated time on /clock and no hardware.
-
-DIR, which must not exist, gets
-  bag/           all outputs of the graph, an mcap bag
-  summary.json   the figures of the table
-  summary.png    a frame with the predicted thread over the seen one; error and margins over time
-  logs/          what each node printed
-"""
-
-EVALUATE = """\
-Score the thread model on reference trajectories: files DIR/*.npz with the needle's poses and the thread
-that followed (arrays t, pose, X and meta, as for `record`). The model starts from the first thread, is
-driven by the poses and nothing else, with each file's own thread and parameters, and is compared at every
-sample. Errors are mean distances of the nodes in % of the thread's length.
-"""
-
-BENCH = """\
-Time the thread model on this machine: one whole step (barriers, obstacles and solves) and the solve
-alone, by number of segments, dimension, obstacles and solver, with the largest residual beside every
-time. Single thread, wall clock; the machine's other work shows in the 99th percentile.
-"""
-
-SIMULATE = """\
-Run the whole graph without a robot: rig_simulator stands in for coils, dish, needle, thread and camera;
-vision_tracker, thread_model and coil_bridge are the ones that run on a robot; path_follower asks for
-needle velocities along the scenario's path. All are processes of their own, on a ROS domain that nobody
-else uses. Everything is simulated, and the bag says so.
-
-SCENARIO is a set-up with waypoints in its section path_follower. BAG, which must not exist, gets all that
-was said, the truth included, and the nodes' logs; `replay` takes it. Ctrl-C ends the run, and what was
-recorded stays. The first run on a machine compiles for a minute before it begins.
-"""
-
-TRACK = """\
-Find needle and thread in camera frames, without a graph. FRAMES are pictures, a folder of them, or a bag.
-Pictures are looked at one by one; a bag's frames are followed over time, as the node vision_tracker does.
-
---json writes a list with an entry for each frame: file (for a bag, topic and stamp), status (tracked, lost
-or searching) and its reason, tail_m, tip_m and heading_rad (the tangent at the tail), curvature_per_m
-(positive to the left), thread_m from the tail on, all in the dish frame, confidence from 0 to 1, stamp_s,
-and time_s, the processor time to look at the frame, on one core, without reading and decoding it; all is
-compiled before. What has no value is null.
-"""
-
-CALIBRATE_CAMERA = """\
-Find where the dish is in the camera's image: its centre, the scale and, by markers, the rotation. FILE
-gets a section vision_tracker of a ROS 2 parameter file.
-
-Without --markers the dish's rim is used: a mean over all frames. With --markers, ArUco markers 4x4_50 lie
-around the dish, their centres SPACING apart on a square around its centre: 0 at the top left, then
-clockwise, all upright.
-"""
-
-BEHAVIOUR = """\
-Run the paper's two thread-behaviour tests in a closed loop around the simulated rig, a polyamide thread
-of 19 mm and a silk thread of 150 mm in a larger dish, and compare the predicted thread with the truth
-and with what the camera sees. DIR, which must not exist, gets a bag of each, behaviour.json and
-behaviour.png. Everything is simulated. Takes two minutes.
-"""
-
-EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
+from magnetosuture_thread.cli.arguments import number, output_file, segments, whole_number
+from magnetosuture_thread.cli.texts import (
+    BEHAVIOUR,
+    BENCH,
+    CALIBRATE_CAMERA,
+    CALIBRATE_COILS,
+    COILS,
+    DESCRIPTION,
+    EVALUATE,
+    EXIT_CODES,
+    RECORD,
+    REPLAY,
+    SIMULATE,
+    TRACK,
+)
+from magnetosuture_thread.jobs.coils import ACTIONS
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -205,10 +145,38 @@ def make_parser() -> argparse.ArgumentParser:
         help="of the ArUco markers around the dish [m] (default: by the dish's rim)",
     )
     calibrate.add_argument("--output", type=output_file, required=True, metavar="FILE", help="parameter file to write")
+    coils = _command(
+        subparsers,
+        "calibrate-coils",
+        "find the coils' properties from probe measurements",
+        CALIBRATE_COILS,
+        commands.calibrate_coils,
+    )
+    coils.add_argument("measurements", type=Path, metavar="MEASUREMENTS", help="CSV file")
+    coils.add_argument("--output", type=output_file, required=True, metavar="FILE", help="calibration to write (YAML)")
+    coils.add_argument(
+        "--model", choices=("loops", "dipoles"), default="loops", help="field of a coil (default: %(default)s)"
+    )
+    coils.add_argument("--name", default="", metavar="RIG", help="the rig's name (default: the file's)")
+    switch = _command(subparsers, "coils", "arm, disarm, stop or reset the running coil bridge", COILS, commands.coils)
+    switch.add_argument("action", choices=ACTIONS, metavar="ACTION", help=", ".join(ACTIONS))
     bench = _command(subparsers, "bench", "time the model on this machine", BENCH, commands.bench)
     bench.add_argument(
         "--peers", action="store_true", help="time other solvers and simulators too (needs the extra `peers`)"
     )
+    bench.add_argument("--bridge", action="store_true", help="time the coil bridge instead, with simulated boards")
+    for name, default, what in (
+        ("trials", 500, "a commander that falls silent"),
+        ("kills", 20, "kill -9 of each process"),
+        ("hostile", 10_000, "hostile messages"),
+    ):
+        bench.add_argument(
+            f"--{name}",
+            type=whole_number,
+            default=default,
+            metavar="N",
+            help=f"of --bridge: {what} (default: {default})",
+        )
     bench.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to a file")
     return parser
 
@@ -229,41 +197,3 @@ def _command(
     )
     parser.set_defaults(run=run)
     return parser
-
-
-def number(low: float, high: float) -> Callable[[str], float]:
-    """Return an argument type: a number within bounds."""
-
-    def within(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number from {low:g} to {high:g}")
-        return value
-
-    return within
-
-
-def whole_number(text: str) -> int:
-    """Return a whole number of at least 0: an argument type."""
-    if not (text.isascii() and text.isdigit()):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 0")
-    return int(text)
-
-
-def segments(text: str) -> int:
-    """Return a number of segments: an argument type."""
-    count = whole_number(text)
-    if not 3 <= count <= 2000:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of segments from 3 to 2000")
-    return count
-
-
-def output_file(text: str) -> Path:
-    """Return a file to write, in a folder that exists: an argument type."""
-    path = Path(text)
-    if not path.parent.is_dir() or path.is_dir():
-        raise argparse.ArgumentTypeError(f"{text!r} is no file in a folder that exists")
-    return path

@@ -14,10 +14,11 @@ import yaml
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import CAMERA, NEEDLE_COMMAND, NODES, TRUE_THREAD, Channel
+from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NODES, TRUE_THREAD, Channel
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.study.currents import CurrentSeries
 from magnetosuture_thread.study.picture import draw_summary
 from magnetosuture_thread.study.replayed import (
     Collector,
@@ -31,6 +32,8 @@ from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 DEFAULT_SETUP = "petri_35mm_polyamide"
+# A replayed bag never moves a needle, so its bridge may arm itself.
+NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed")
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
 Times = dict[str, dict[int, float]]
@@ -121,7 +124,7 @@ def _play(
     qos = folder / "lossless.yaml"
     qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
     files = [argument for path in (setup.path, qos) for argument in ("--params-file", str(path.resolve()))]
-    arguments = [*files, "-p", "use_sim_time:=true", "-p", "coil_bridge:driver:=recording"]
+    arguments = [*files, "-p", "use_sim_time:=true", *NOTHING_MOVES]
     notes = {**bag.notes, "setup": setup.name, "replayed": str(bag.path)}
     inputs = {topic.channel.recorded for topic in topics.INPUTS}
     played = (inputs & {name for name, count in bag.counts.items() if count}) - {c.recorded for c in CAMERA.values()}
@@ -151,11 +154,15 @@ def _judge(
     folder: Path, bag: Bag, setup: Setup, camera: Channel, published: Times, arrived: Times, say: Say
 ) -> Summary:
     """Put the outputs side by side; write summary.json and summary.png."""
-    collector = Collector(setup.model.length)
-    for record in bag.records({TRUE_THREAD.recorded} & set(bag.topics)):
-        collector.take(record.topic, record.decode())
+    collector, recorded, replayed = Collector(setup.model.length), CurrentSeries(), CurrentSeries()
+    for record in bag.records({TRUE_THREAD.recorded, CURRENTS.recorded} & set(bag.topics)):
+        message = record.decode()
+        collector.take(record.topic, message) if record.topic == TRUE_THREAD.recorded else recorded.take(message)
     for record in Bag(folder / "bag").records():
-        collector.take(record.topic, record.decode())
+        message = record.decode()
+        collector.take(record.topic, message)
+        if record.topic == CURRENTS.recorded:
+            replayed.take(message)
     instants = collector.instants()
     if not instants:
         said = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
@@ -181,6 +188,7 @@ def _judge(
         seen_share=float(np.mean([instant.seen_share for instant in instants])),
         error_seen=error_figures([instant.error_seen for instant in instants]),
         error_truth=error_figures([instant.error_truth for instant in instants]),
+        currents=replayed.against(recorded),
     )
     (folder / "summary.json").write_text(json.dumps(summary.to_json(), indent=2) + "\n", encoding="utf-8")
     if not _draw(folder / "summary.png", bag, setup, camera, instants, summary):

@@ -135,11 +135,19 @@ class NodeProcesses:
                 last = lines[-1] if lines else "it said nothing"
                 raise GraphError(f"{name} ended with exit code {process.returncode}: {last}")
 
-    def start(self, name: str) -> None:
-        """Start one more node."""
-        command = [sys.executable, "-m", f"magnetosuture_thread.nodes.{name}", "--ros-args", *self._arguments]
-        with (self._logs / f"{name}.log").open("wb") as log:
-            self._processes[name] = subprocess.Popen(
+    def start(self, name: str, *, label: str = "", arguments: Sequence[str] = ()) -> None:
+        """Start one more node, or one again that has ended.
+
+        Args:
+            name: of its module.
+            label: what it and its log are called here; as the module if empty.
+            arguments: besides those for all, after `--ros-args`.
+        """
+        label = label or name
+        given = [*self._arguments, *arguments]
+        command = [sys.executable, "-m", f"magnetosuture_thread.nodes.{name}", "--ros-args", *given]
+        with (self._logs / f"{label}.log").open("wb") as log:
+            self._processes[label] = subprocess.Popen(
                 command,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
@@ -148,6 +156,16 @@ class NodeProcesses:
                 start_new_session=True,  # Ctrl-C is ours to pass on
                 preexec_fn=_end_with_parent,
             )
+
+    def kill(self, label: str) -> None:
+        """End a node without a word to it, as a crash would."""
+        process = self._processes.pop(label)
+        process.kill()
+        process.wait()
+
+    def ended(self, label: str) -> bool:
+        """Return whether a node has ended."""
+        return self._processes[label].poll() is not None
 
     def _end(self) -> None:
         for process in self._processes.values():

@@ -21,6 +21,7 @@ from magnetosuture_thread.interface import (
     SEEN_THREAD,
     TRUE_THREAD,
 )
+from magnetosuture_thread.study.currents import CurrentDifference
 from magnetosuture_thread.study.score import prediction_error_percent
 
 # By the number in the message BarrierMargin.
@@ -122,6 +123,7 @@ class Summary:
         seen_share: part of the thread's length that the camera saw, mean over the predicted frames.
         error_seen: prediction error against the seen centreline [% of length], over `count` frames.
         error_truth: the same against the truth, where the bag holds it.
+        currents: difference of the coils' currents from the recorded ones, where the bag holds any.
     """
 
     bag: str
@@ -141,6 +143,7 @@ class Summary:
     seen_share: float
     error_seen: dict[str, float] | None
     error_truth: dict[str, float] | None
+    currents: CurrentDifference | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above."""

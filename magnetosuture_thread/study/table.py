@@ -46,6 +46,11 @@ def summary_table(summary: Summary) -> Table:
         elif figures is not None:
             scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
             table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
+    if (apart := summary.currents) is not None:
+        table.add_section()
+        tail = f"{apart.p99:.2f}, {apart.greatest:.2f} A; recorded: {apart.recorded:.2f} A rms"
+        table.add_row("currents off the recorded", f"{apart.difference:.3f} A", tail)
+        table.add_row("  stopped in one only", f"{100.0 * apart.stopped_apart:.1f} %", f"of {apart.compared}")
     return table
 
 

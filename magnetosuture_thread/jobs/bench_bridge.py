@@ -1,0 +1,259 @@
+"""The job `magnetosuture bench --bridge`: how soon the coils are at zero, whatever fails."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import yaml
+
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.bridge_report import BridgeReport, Delays
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.coil_client import CoilClient
+    from magnetosuture_thread.nodes.processes import NodeProcesses
+
+SETUP = "petri_35mm_polyamide"
+BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
+MOVING = 0.3  # s for which the coils must be driven before something is killed
+PATIENCE = 30.0  # s for anything to happen
+LOOP = 12.0  # s over which the loop's period is looked at; the bridge keeps the last 2000 intervals
+FULL = 32767
+SUPPLY, RESISTANCE, INDUCTANCE = 24.0, 1.0, 0.005  # V, ohm, H of the simulated boards and coils
+
+Say = Callable[[str], None]
+
+
+class BridgeBench:
+    """A bridge with simulated boards on serial lines, and all that can fail around it, as processes.
+
+    Args:
+        stage: the boards.
+        nodes: the processes.
+        client: for the bridge's switches.
+        logs: folder of what the processes print.
+        bound: the command's timeout and one period of the loop [s].
+    """
+
+    def __init__(self, stage: PowerStage, nodes: NodeProcesses, client: CoilClient, logs: Path, bound: float) -> None:
+        self._stage = stage
+        self._nodes = nodes
+        self._client = client
+        self._logs = logs
+        self._bound = bound
+
+    def start(self, name: str, **parameters: float | str) -> None:
+        """Start the bridge, or a stand-in for a commander, a tracker or a vandal."""
+        if name == "coil_bridge":
+            self._nodes.start(name)
+            self._arm()
+            return
+        given = [f"kind:={name}", *(f"{key}:={value}" for key, value in parameters.items())]
+        arguments = ["-r", f"__node:={name}", *(part for each in given for part in ("-p", each))]
+        self._nodes.start("bench_source", label=name, arguments=arguments)
+
+    def stop_trials(self, trials: int, progress: Callable[[float], None]) -> Delays:
+        """Let a commander fall silent again and again; return the times from its last command to zero."""
+        self.start("commander")
+        self._wait(self._driven_for_a_while, "the coils to be driven")
+        self._nodes.kill("commander")
+        self._wait(lambda: not self._driven(), "zero")
+        self.start("commander", burst=BURST, pause=PAUSE)
+        log = self._logs / "commander.log"
+        events: list[tuple[float, bool]] = []
+        delays: list[float] = []
+        deadline = time.monotonic() + PATIENCE + 4.0 * trials * (BURST + PAUSE)
+        while len(delays) < trials:
+            time.sleep(0.2)
+            # Piece by piece: a board forgets what is long past.
+            events += self._events(since=events[-1][0] if events else -1.0)
+            # The last line may be half written, and the coils still driven.
+            delays = _to_zero([float(line) for line in log.read_text().split("\n")[:-1]], events)
+            progress(len(delays) / trials)
+            self._check(deadline)
+        self._nodes.kill("commander")
+        return Delays.of("last command to zero, commander silent", delays[:trials], self._bound)
+
+    def kills(self, name: str, times: int, progress: Callable[[float], None]) -> Delays:
+        """Kill a process again and again while the coils are driven; return the times to zero."""
+        delays = []
+        for done in range(times):
+            self._wait(self._driven_for_a_while, f"the coils to be driven before {name} is killed")
+            began = time.monotonic()
+            self._nodes.kill(name)
+            self._wait(lambda: not self._driven(), f"zero after {name} was killed")
+            delays += _to_zero([began], self._events(since=0.0))
+            progress((done + 1) / times)
+            self.start(name)
+        return Delays.of(f"kill -9 of the {name} to zero", delays, 0.25)
+
+    def vandalism(self, count: int) -> float:
+        """Publish hostile messages and see that the bridge works afterwards.
+
+        Returns:
+            The greatest current asked of a board meanwhile [A].
+
+        Raises:
+            GraphError: it does not.
+        """
+        before = time.monotonic()
+        self.start("vandal", count=count)
+        self._wait(lambda: self._nodes.ended("vandal"), "the vandal to end", PATIENCE + count / 200.0)
+        self._nodes.kill("vandal")  # whose work is done
+        duties = [abs(duty) for board in self._boards() for at, pair in board if at > before for duty in pair]
+        self._arm()
+        self.start("tracker")
+        self.start("commander")
+        self._wait(self._driven_for_a_while, f"the bridge to work after {count} hostile messages")
+        return max(duties, default=0) / FULL * SUPPLY / RESISTANCE
+
+    def _arm(self) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                self._client.do("arm")
+                return
+            except GraphError as error:
+                self._nodes.check()
+                if time.monotonic() > deadline:
+                    raise GraphError(f"the bridge cannot be armed: {error}") from None
+
+    def _boards(self) -> list[list[tuple[float, tuple[int, int]]]]:
+        """Return when each board's duties changed, and to what."""
+        for line in self._stage.lines:
+            line.advance()
+        return [list(board.timeline) for board in self._stage.boards]
+
+    def _events(self, since: float) -> list[tuple[float, bool]]:
+        """Return when all coils together went to zero or left it, as (time, driven), after a time."""
+        changes = sorted((at, index, any(duties)) for index, each in enumerate(self._boards()) for at, duties in each)
+        on = [False] * len(self._stage.boards)
+        found = []
+        for at, index, driven in changes:
+            on[index] = driven
+            found.append((at, any(on)))
+        return [event for event in found if event[0] > since]
+
+    def _driven(self) -> bool:
+        return any(any(board.duties) for board in self._stage.boards)
+
+    def _driven_for_a_while(self) -> bool:
+        zeros = [at for at, driven in self._events(since=0.0) if not driven]
+        return self._driven() and time.monotonic() - max(zeros, default=0.0) > MOVING
+
+    def _wait(self, condition: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
+        deadline = time.monotonic() + patience
+        while not condition():
+            time.sleep(0.01)
+            self._check(deadline, what)
+
+    def _check(self, deadline: float, what: str = "the trials") -> None:
+        if time.monotonic() > deadline:
+            raise GraphError(f"waited in vain for {what}; the bridge says: {self._client.state()}")
+
+
+def bench_bridge(
+    trials: int,
+    kills: int,
+    hostile: int,
+    busy: bool = True,
+    say: Say = lambda text: None,
+    progress: Callable[[float], None] = lambda s: None,
+) -> BridgeReport:
+    """Measure a coil bridge that drives simulated RoboClaw boards, on a machine all of whose cores are busy.
+
+    Args:
+        trials: of a commander that falls silent.
+        kills: of each process.
+        hostile: messages.
+        busy: whether to keep all cores busy meanwhile.
+        say: called with a line for a person at each stage.
+        progress: called with the share of a stage done, 0 to 1.
+    """
+    # Only here, where it is needed: without ROS the other commands still work.
+    from magnetosuture_thread.nodes.coil_client import CoilClient
+    from magnetosuture_thread.nodes.processes import (
+        NodeProcesses,
+        environment_of,
+        graph_environment,
+        reserved_domain,
+    )
+
+    settings = read_setup(SETUP).coils
+    with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
+        folder = Path(name)
+        ports = [str(folder / f"board_{index}") for index in range(2)]
+        stage = PowerStage(ports, SUPPLY, RESISTANCE, INDUCTANCE)
+        parameters = {"driver": "roboclaw", "roboclaw_ports": ports, "coil_resistance": RESISTANCE}
+        file = folder / "parameters.yaml"
+        file.write_text(yaml.safe_dump({"coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
+        arguments = ["--params-file", str(read_setup(SETUP).path), "--params-file", str(file)]
+        environment = graph_environment(domain)
+        stage.open()
+        try:
+            with (
+                environment_of(environment),
+                NodeProcesses((), arguments, environment, folder / "logs") as nodes,
+                CoilClient() as client,
+                _load(busy),
+            ):
+                bound = settings.command_timeout + 1.0 / settings.rate
+                bench = BridgeBench(stage, nodes, client, folder / "logs", bound)
+                bench.start("coil_bridge")
+                bench.start("tracker")
+                say(f"{trials} times a commander that falls silent")
+                delays = [bench.stop_trials(trials, progress)]
+                loop, scheduling = client.loop()
+                bench.start("commander")
+                for victim in ("commander", "tracker", "coil_bridge"):
+                    say(f"{kills} times kill -9 of the {victim}")
+                    delays.append(bench.kills(victim, kills, progress))
+                say(f"{hostile} hostile messages")
+                nodes.kill("commander")
+                nodes.kill("tracker")
+                greatest = bench.vandalism(hostile)
+        finally:
+            stage.close()
+    limit = settings.max_current
+    return BridgeReport(tuple(delays), loop, scheduling, settings.rate, hostile, greatest, limit, alive=True)
+
+
+def _to_zero(ends: Sequence[float], events: Sequence[tuple[float, bool]]) -> list[float]:
+    """Return, for each time that finds the coils driven, how long it took to zero [s].
+
+    Args:
+        ends: times [s].
+        events: when the coils were driven from then on, or were not any more [s].
+    """
+    times = np.array([at for at, _ in events])
+    delays = []
+    for end in ends:
+        after = int(np.searchsorted(times, end, side="right"))
+        if after and events[after - 1][1]:
+            delays += [at - end for at, driven in events[after:] if not driven][:1]
+    return delays
+
+
+@contextmanager
+def _load(busy: bool) -> Iterator[None]:
+    """Keep every core busy, if asked to."""
+    work = [sys.executable, "-c", "while True: pass"]
+    hogs = [subprocess.Popen(work, start_new_session=True) for _ in range((os.cpu_count() or 1) * busy)]
+    try:
+        yield
+    finally:
+        for hog in hogs:
+            hog.send_signal(signal.SIGKILL)
+            hog.wait()

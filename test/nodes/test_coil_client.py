@@ -1,0 +1,58 @@
+"""The switches of a running bridge, pressed from the command line."""
+
+from __future__ import annotations
+
+import pytest
+
+from magnetosuture_thread.cli import main
+from magnetosuture_thread.jobs.coils import ACTIONS
+from magnetosuture_thread.nodes import coil_client
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+
+
+def press(capsys, action: str) -> tuple[int, str]:
+    """Run the command and return its exit code and what it printed."""
+    code = main(["coils", action])
+    printed = capsys.readouterr()
+    return code, printed.out + printed.err
+
+
+def test_every_switch_works_and_shows_the_state(
+    graph, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    node = graph.add(CoilBridgeNode, autostart="unconfigured")
+    code, said = press(capsys, "arm")
+    assert code == 1
+    assert "an unconfigured bridge" in said
+    for action, state in (
+        ("configure", "inactive"),
+        ("activate", "active"),
+        ("arm", "active, armed"),
+        ("stop", "fault"),
+        ("state", "fault"),
+        ("reset", "active"),
+        ("arm", "active, armed"),
+        ("disarm", "active"),
+        ("deactivate", "inactive"),
+        ("cleanup", "unconfigured"),
+    ):
+        code, said = press(capsys, action)
+        assert code == 0, said
+        assert said.splitlines()[0].split(maxsplit=1) == ["state", state]
+    code, said = press(capsys, "deactivate")
+    assert code == 1
+    assert "refuses to deactivate" in said
+    assert node.stage == "unconfigured"
+
+
+def test_without_a_bridge_it_fails_and_says_so(
+    graph, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    monkeypatch.setattr(coil_client, "TIMEOUT", 0.5)
+    for action in ("stop", "state"):
+        code, said = press(capsys, action)
+        assert code == 1
+        assert "no coil_bridge" in said
+    assert set(ACTIONS) >= {"stop", "state"}
