@@ -20,6 +20,8 @@ Vector = NDArray[np.float64]
 
 LONGEST = 2.0  # periods that velocity and currents may change over in one step, however late it comes
 CORRECTIONS = 4  # of what the coils add to a velocity that leads towards the wall
+BLOCKED = "the coils would pull the needle to the wall or an obstacle"
+BLOCKED_FOR = 0.1  # s until it is tried again
 TOLERANCE = 0.005  # of the greatest speed, that they may still add
 
 
@@ -76,6 +78,7 @@ class Bridge:
         self._velocity = np.zeros(2)
         self._stepped = -math.inf
         self._stopped: float | None = None
+        self._blocked = -math.inf
         # Once, so that no step waits for a compiler.
         self._workspace.safe_velocity(np.array([1.0, 0.0]), np.zeros(2), np.array([1.0, 0.0]))
 
@@ -107,27 +110,33 @@ class Bridge:
             return self._step(now, arrival, driver)
         except Exception as error:  # Whatever is wrong in here, the coils go to zero and stay there.
             self.latch.trip(f"internal error: {type(error).__name__}: {error}")
-            return self._rest(arrival, (self.latch.holds,))
+            return self._rest(now, arrival, (self.latch.holds,))
 
     def _step(self, now: float, arrival: float, driver: DriverState) -> Outcome:
         if self.latch.armed and not (driver.ready and driver.losses == self._losses):
             self.latch.trip(f"driver: {driver.problem or 'currents were lost for a moment'}")
         period = 1.0 / self._settings.rate
-        elapsed = min(max(arrival - self._stepped, 0.0), LONGEST * period)
+        late = arrival - self._stepped
         self._stepped = arrival
+        if late > self._settings.command_timeout:
+            self._forget()  # the driver has gone to zero by itself meanwhile
+        elapsed = min(max(late, 0.0), LONGEST * period)
         reasons, pose = self._why_not(now, arrival)
         if reasons or pose is None:
-            return self._rest(arrival, reasons)
+            return self._rest(now, arrival, reasons)
         wanted = self.gate.velocity
         if not wanted.any():
-            return replace(self._rest(arrival, ()), publish=True)
+            outcome = replace(self._rest(now, arrival, ()), publish=True)
+            self._stopped = None
+            return outcome
         velocity = approached(self._velocity, wanted, self._settings.max_acceleration * elapsed)
         velocity = self._workspace.safe_velocity(velocity, pose.tail, pose.heading)
         allocation = self._allocate(velocity, pose, self._settings.max_current_slew * elapsed)
         if allocation is None:
-            return replace(self._rest(arrival, ("the coils would pull the needle to the wall",)), commanded=wanted)
+            self._blocked = arrival
+            return self._rest(now, arrival, (BLOCKED,))
         self._before, self._velocity, self._stopped = allocation, velocity, None
-        self.needle.move(allocation.velocity)
+        self.needle.move(allocation.velocity, now)
         return Outcome(self.coils, allocation, wanted, velocity, (), True)
 
     def _why_not(self, now: float, arrival: float) -> tuple[tuple[str, ...], Pose | None]:
@@ -136,17 +145,22 @@ class Bridge:
         # What would end before the next step ends now: no current outlives what it is for.
         period = 1.0 / self._settings.rate
         ahead = (now + period, arrival + period)
-        reasons = (self.latch.holds, self.gate.closed(*ahead), self.needle.lost(*ahead))
+        blocked = BLOCKED if arrival - self._blocked < BLOCKED_FOR else ""
+        reasons = (self.latch.holds, self.gate.closed(*ahead), self.needle.lost(*ahead), blocked)
         return tuple(reason for reason in reasons if reason), pose
 
-    def _rest(self, arrival: float, reasons: tuple[str, ...]) -> Outcome:
+    def _rest(self, now: float, arrival: float, reasons: tuple[str, ...]) -> Outcome:
         """Return no current, at once."""
         if self._stopped is None:
             self._stopped = arrival
-        self._before, self._velocity = self._coils.zero(), np.zeros(2)
-        self.needle.move(self._velocity)
+        self._forget()
+        self.needle.move(self._velocity, now)
         publish = arrival - self._stopped <= self._settings.zero_hold
         return Outcome(self.coils, self._before, np.zeros(2), self._velocity, reasons, publish)
+
+    def _forget(self) -> None:
+        """Begin anew from no current and no velocity."""
+        self._before, self._velocity = self._coils.zero(), np.zeros(2)
 
     def _allocate(self, velocity: Vector, pose: Pose, largest_change: float) -> Allocation | None:
         """Return currents whose own velocity, drift included, keeps clear; None if none were found."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,6 @@ from magnetosuture_thread.coils.stamps import check_stamp
 from magnetosuture_thread.errors import InvalidInputError
 
 Vector = NDArray[np.float64]
-
-FURTHEST = 0.1  # s; a pose is carried forward no further than this
 
 
 @dataclass(frozen=True)
@@ -29,9 +28,10 @@ class Pose:
 class NeedleWatch:
     """Keeps the needle's last measured pose for as long as it is good.
 
-    A camera's pose is some hundredths of a second old, in which the needle turns by some degrees; the
-    field must be laid along the needle as it lies now. So the pose is carried forward by the tip velocity
-    reached: along the chord it moves the needle, across it turns the needle about its middle.
+    A camera's pose is some hundredths of a second old, in which the needle turns by some degrees and comes
+    closer to the wall; the field must be laid along the needle as it lies now. So the pose is carried
+    forward by the tip velocities that the coils have been given since its stamp: along the chord they move
+    the needle, across it they turn it about its middle.
 
     Args:
         needle: its mechanics.
@@ -43,11 +43,13 @@ class NeedleWatch:
         self._needle = needle
         self._timeout = timeout
         self._reach = reach
-        self._pose: Pose | None = None
+        self._sources = SourceWatch()
         self._stamp = -math.inf
         self._arrival = -math.inf
+        self._carried: Pose | None = None
+        self._until = -math.inf  # the time to which it has been carried
         self._velocity = np.zeros(2)
-        self._sources = SourceWatch()
+        self._past: deque[tuple[float, Vector]] = deque()  # velocities, and since when
 
     def see(self, tail: Vector, heading: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
         """Take a measured pose.
@@ -74,7 +76,11 @@ class NeedleWatch:
         check_stamp("needle/measured_cp", stamp, now, self._stamp, self._timeout)
         if speaking > 1:
             raise InvalidInputError("needle/measured_cp", f"{speaking} publishers at once", "one")
-        self._pose, self._stamp, self._arrival = Pose(tail, heading), stamp, arrival
+        self._stamp, self._arrival = stamp, arrival
+        self._carried, self._until = Pose(tail, heading), stamp
+        times = [since for since, _ in self._past][1:]
+        for (_, velocity), end in zip(self._past, times, strict=False):
+            self._carry(velocity, end)
 
     def lost(self, now: float, arrival: float) -> str:
         """Say why the pose is not to be used at a time of the stamps' clock and a monotonic time [s]; empty if it is.
@@ -83,26 +89,47 @@ class NeedleWatch:
         """
         if self._sources.count(arrival) > 1:
             return "several publishers of needle/measured_cp at once"
-        if self._pose is None:
+        if self._carried is None:
             return "no needle pose yet"
         good = max(arrival - self._arrival, now - self._stamp) <= self._timeout
         return "" if good else f"no needle pose for {self._timeout:g} s"
 
-    def move(self, velocity: Vector) -> None:
-        """Say which tip velocity the coils give from now on, shape (2,) [m/s]."""
+    def move(self, velocity: Vector, now: float) -> None:
+        """Say which tip velocity the coils give from a time on.
+
+        Args:
+            velocity: shape (2,) [m/s].
+            now: time of the stamps' clock [s].
+        """
+        if self._past and now < self._past[-1][0]:
+            self._past.clear()  # time was set back
+        self._carry(self._velocity, now)
         self._velocity = velocity
+        self._past.append((now, velocity))
+        while len(self._past) > 1 and self._past[1][0] < now - self._timeout:
+            self._past.popleft()
 
     def pose(self, now: float, arrival: float) -> Pose | None:
         """Return the pose as it is at a time of the stamps' clock and a monotonic time [s]; None if too old."""
-        if self._pose is None or self.lost(now, arrival):
+        if self._carried is None or self.lost(now, arrival):
             return None
-        ahead = min(FURTHEST, max(0.0, now - self._stamp))
-        tail, heading = self._pose.tail, self._pose.heading
+        self._carry(self._velocity, now)
+        return self._carried
+
+    def _carry(self, velocity: Vector, now: float) -> None:
+        """Carry the pose on to a time, by a tip velocity of shape (2,) [m/s]."""
+        ahead = now - self._until
+        if self._carried is None or ahead <= 0.0:
+            return
+        self._until = now
+        if not velocity.any():
+            return
+        tail, heading = self._carried.tail, self._carried.heading
         e = self._needle.chord_direction(heading)
         n = np.array([-e[1], e[0]])
         lever = 0.5 * self._needle.chord
-        angle = float(self._velocity @ n) / lever * ahead
+        angle = float(velocity @ n) / lever * ahead
         c, s = math.cos(angle), math.sin(angle)
         turned = np.array([[c, -s], [s, c]])
-        middle = tail + lever * e + float(self._velocity @ e) * ahead * e
-        return Pose(middle - turned @ (lever * e), turned @ heading)
+        middle = tail + lever * e + float(velocity @ e) * ahead * e
+        self._carried = Pose(middle - turned @ (lever * e), turned @ heading)

@@ -73,7 +73,11 @@ class CoilBridgeSettings(Configuration):
 
     dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
     keep_out: float = quantity(
-        0.0005, "clearance that the needle keeps of the wall and of obstacles", unit="m", minimum=0.0, maximum=0.05
+        0.0005,
+        "clearance that the needle's axis keeps of the wall and of obstacles; half of its width is within",
+        unit="m",
+        minimum=0.0,
+        maximum=0.05,
     )
     approach_rate: float = quantity(
         10.0,

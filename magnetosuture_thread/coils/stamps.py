@@ -19,9 +19,13 @@ def check_stamp(topic: str, stamp: float, now: float, last: float, oldest: float
         oldest: how old it may be [s].
 
     Raises:
-        InvalidInputError: it is too old, from the future, or older than the last one.
+        InvalidInputError: it is not set, too old, from the future, or older than the last one.
     """
     field = f"{topic}.header.stamp"
+    if stamp <= 0.0 or now <= 0.0:
+        raise InvalidInputError(
+            field, f"{stamp:g} s at the time {now:g} s", "a time: 0 is none in ROS, as before /clock"
+        )
     if now - stamp > oldest:
         raise InvalidInputError(field, f"{now - stamp:.3f} s old", f"at most {oldest:g} s")
     if stamp - now > FUTURE:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from magnetosuture_thread.coils.bridge import Bridge, Outcome
 from magnetosuture_thread.coils.drivers import CoilDriver, DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
@@ -49,11 +51,15 @@ class CoilStation:
         self.driver, self._name = driver, settings.driver
         driver.open()
         self.bridge, self.rhythm = bridge, Rhythm(1.0 / settings.rate)
-        self._arms = settings.autostart == "armed"
+
+    def arm_when_ready(self) -> None:
+        """Arm by itself, once, as soon as the driver is ready; whatever is pressed or fails before calls that off."""
+        self._arms = True
 
     def close(self) -> None:
         """Leave the coils at zero."""
         self.bridge = self.outcome = None
+        self._arms = False
         self._name = "none"
         if self.driver is not None:
             self.driver.close()
@@ -78,10 +84,16 @@ class CoilStation:
         Raises:
             InvalidInputError: the driver is not ready.
         """
+        self._arms = False
         if self.bridge is None:
             self.latch.reset("")
         else:
             self.bridge.reset(self.driver_state)
+
+    def zero(self) -> None:
+        """Tell the driver zero, whatever else may be wrong."""
+        if self.driver is not None and self.outcome is not None:
+            self.driver.apply(np.zeros_like(self.outcome.allocation.currents))
 
     def step(self, now: float, arrival: float) -> Outcome | None:
         """Let the bridge say what the coils get now, and tell the driver; None while unconfigured.
@@ -93,8 +105,8 @@ class CoilStation:
         if self.bridge is None or self.driver is None:
             return None
         state = self.driver.state()
-        # Once, where the settings want it: as soon as it can be.
-        if self._arms and state.ready and self.latch.holds == "disarmed":
+        self._arms = self._arms and self.latch.holds == "disarmed"
+        if self._arms and state.ready:
             self.arm(True)
         self.outcome = self.bridge.step(now, arrival, state)
         self.driver.apply(self.outcome.allocation.currents)

@@ -8,16 +8,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import yaml
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power.watch import DriveWatch
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.bridge_report import BridgeReport, Delays
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SETUP = "petri_35mm_polyamide"
 BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
 MOVING = 0.3  # s for which the coils must be driven before something is killed
+HEARD = 10.0  # s for a process to start and to be heard
 PATIENCE = 30.0  # s for anything to happen
 LOOP = 12.0  # s over which the loop's period is looked at; the bridge keeps the last 2000 intervals
 FULL = 32767
@@ -45,14 +46,18 @@ class BridgeBench:
         client: for the bridge's switches.
         logs: folder of what the processes print.
         bound: the command's timeout and one period of the loop [s].
+
+    Attributes:
+        unheard: how often nobody who was started after a kill was heard, until the bridge was started anew.
     """
 
     def __init__(self, stage: PowerStage, nodes: NodeProcesses, client: CoilClient, logs: Path, bound: float) -> None:
-        self._stage = stage
+        self._watch = DriveWatch(stage)
         self._nodes = nodes
         self._client = client
         self._logs = logs
         self._bound = bound
+        self.unheard = 0
 
     def start(self, name: str, **parameters: float | str) -> None:
         """Start the bridge, or a stand-in for a commander, a tracker or a vandal."""
@@ -67,20 +72,18 @@ class BridgeBench:
     def stop_trials(self, trials: int, progress: Callable[[float], None]) -> Delays:
         """Let a commander fall silent again and again; return the times from its last command to zero."""
         self.start("commander")
-        self._wait(self._driven_for_a_while, "the coils to be driven")
+        self._drive()
         self._nodes.kill("commander")
         self._wait(lambda: not self._driven(), "zero")
         self.start("commander", burst=BURST, pause=PAUSE)
         log = self._logs / "commander.log"
-        events: list[tuple[float, bool]] = []
         delays: list[float] = []
         deadline = time.monotonic() + PATIENCE + 4.0 * trials * (BURST + PAUSE)
         while len(delays) < trials:
             time.sleep(0.2)
-            # Piece by piece: a board forgets what is long past.
-            events += self._events(since=events[-1][0] if events else -1.0)
-            # The last line may be half written, and the coils still driven.
-            delays = _to_zero([float(line) for line in log.read_text().split("\n")[:-1]], events)
+            self._watch.look()
+            # The last line may be half written.
+            delays = self._watch.to_zero([float(line) for line in log.read_text().split("\n")[:-1]])
             progress(len(delays) / trials)
             self._check(deadline)
         self._nodes.kill("commander")
@@ -90,11 +93,11 @@ class BridgeBench:
         """Kill a process again and again while the coils are driven; return the times to zero."""
         delays = []
         for done in range(times):
-            self._wait(self._driven_for_a_while, f"the coils to be driven before {name} is killed")
+            self._drive()
             began = time.monotonic()
             self._nodes.kill(name)
             self._wait(lambda: not self._driven(), f"zero after {name} was killed")
-            delays += _to_zero([began], self._events(since=0.0))
+            delays += self._watch.to_zero([began])
             progress((done + 1) / times)
             self.start(name)
         return Delays.of(f"kill -9 of the {name} to zero", delays, 0.25)
@@ -108,16 +111,30 @@ class BridgeBench:
         Raises:
             GraphError: it does not.
         """
-        before = time.monotonic()
+        self._watch.forget()
         self.start("vandal", count=count)
         self._wait(lambda: self._nodes.ended("vandal"), "the vandal to end", PATIENCE + count / 200.0)
         self._nodes.kill("vandal")  # whose work is done
-        duties = [abs(duty) for board in self._boards() for at, pair in board if at > before for duty in pair]
+        self._watch.look()
+        greatest = self._watch.largest / FULL * SUPPLY / RESISTANCE
         self._arm()
         self.start("tracker")
         self.start("commander")
-        self._wait(self._driven_for_a_while, f"the bridge to work after {count} hostile messages")
-        return max(duties, default=0) / FULL * SUPPLY / RESISTANCE
+        self._drive()
+        return greatest
+
+    def _drive(self) -> None:
+        """Wait until the coils have been driven for a while, and start all anew where they are not."""
+        try:
+            self._wait(self._driven_for_a_while, "the coils to be driven", HEARD)
+        except GraphError:
+            # Who is killed may leave Fast DDS's shared memory such that nobody who starts later is heard.
+            self.unheard += 1
+            for name in ("commander", "tracker", "coil_bridge"):
+                self._nodes.kill(name)
+            for name in ("coil_bridge", "tracker", "commander"):
+                self.start(name)
+            self._wait(self._driven_for_a_while, "the coils to be driven")
 
     def _arm(self) -> None:
         deadline = time.monotonic() + PATIENCE
@@ -130,28 +147,12 @@ class BridgeBench:
                 if time.monotonic() > deadline:
                     raise GraphError(f"the bridge cannot be armed: {error}") from None
 
-    def _boards(self) -> list[list[tuple[float, tuple[int, int]]]]:
-        """Return when each board's duties changed, and to what."""
-        for line in self._stage.lines:
-            line.advance()
-        return [list(board.timeline) for board in self._stage.boards]
-
-    def _events(self, since: float) -> list[tuple[float, bool]]:
-        """Return when all coils together went to zero or left it, as (time, driven), after a time."""
-        changes = sorted((at, index, any(duties)) for index, each in enumerate(self._boards()) for at, duties in each)
-        on = [False] * len(self._stage.boards)
-        found = []
-        for at, index, driven in changes:
-            on[index] = driven
-            found.append((at, any(on)))
-        return [event for event in found if event[0] > since]
-
     def _driven(self) -> bool:
-        return any(any(board.duties) for board in self._stage.boards)
+        self._watch.look()
+        return self._watch.driven
 
     def _driven_for_a_while(self) -> bool:
-        zeros = [at for at, driven in self._events(since=0.0) if not driven]
-        return self._driven() and time.monotonic() - max(zeros, default=0.0) > MOVING
+        return self._driven() and time.monotonic() - self._watch.turns[-1][0] > MOVING
 
     def _wait(self, condition: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
         deadline = time.monotonic() + patience
@@ -227,23 +228,7 @@ def bench_bridge(
         finally:
             stage.close()
     limit = settings.max_current
-    return BridgeReport(tuple(delays), loop, scheduling, settings.rate, hostile, greatest, limit, alive=True)
-
-
-def _to_zero(ends: Sequence[float], events: Sequence[tuple[float, bool]]) -> list[float]:
-    """Return, for each time that finds the coils driven, how long it took to zero [s].
-
-    Args:
-        ends: times [s].
-        events: when the coils were driven from then on, or were not any more [s].
-    """
-    times = np.array([at for at, _ in events])
-    delays = []
-    for end in ends:
-        after = int(np.searchsorted(times, end, side="right"))
-        if after and events[after - 1][1]:
-            delays += [at - end for at, driven in events[after:] if not driven][:1]
-    return delays
+    return BridgeReport(tuple(delays), loop, scheduling, settings.rate, hostile, greatest, limit, bench.unheard)
 
 
 @contextmanager

@@ -31,18 +31,17 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         super().__init__("coil_bridge", CoilBridgeSettings, **options)
         self.station = CoilStation()
         self._stamp: Any = None  # of a good command that has not gone to the coils yet
-        self._resumes = False  # whether a reset makes the node active again
-        # The watchdog runs on a clock of its own: simulated time may stand still, the coils must not stay on.
+        self._resumes = False  # whether a reset makes it active again
+        # A clock of its own for the watchdog: simulated time may stand still, the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog: Timer | None = None
         self._report = CoilReport(self, self.station, self._steady)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
         topics.NEEDLE_COMMAND.subscribe_numbered(self, self.on_command)
         Switches(self, self.arm, self.stop, self.reset)
-        if self.get_parameter_or("autostart").value != "unconfigured":
-            self.require(self.trigger_configure)
-            if self.settings is not None and self.settings.autostart != "inactive":
-                self.require(self.trigger_activate)
+        self.start()
+        if self.settings is not None and self.settings.autostart == "armed":
+            self.station.arm_when_ready()
 
     def begin(self, settings: CoilBridgeSettings) -> None:
         """Open the driver; from now on it is told zero again and again."""
@@ -58,13 +57,14 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def pause(self) -> None:
         """Stop at once, and pass nothing until somebody activates and arms again."""
         self.station.latch.deactivate()
+        self.station.zero()
         self._step()
 
     def end(self) -> None:
         """Leave the coils at zero."""
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
-            self._watchdog = None
+        self._watchdog, self._stamp, self._resumes = None, None, False
         self.station.close()
 
     def arm(self, asked: bool) -> None:
@@ -75,6 +75,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def stop(self) -> None:
         """Press the emergency stop, in whatever state."""
         self.station.latch.stop()
+        self.station.zero()
         self._step()
 
     def reset(self) -> None:
@@ -116,9 +117,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             self.trigger_deactivate()
 
     def take_priority(self) -> None:
-        """Let the loop not wait for other processes, where that is allowed; meant for a process of its own."""
-        asked = self.get_parameter_or("realtime_priority").value
-        self._report.scheduled(take_priority(CoilBridgeSettings.realtime_priority if asked is None else asked))
+        """Let the loop not wait for other processes; meant for a process of its own."""
+        self._report.scheduled(take_priority((self.settings or CoilBridgeSettings()).realtime_priority))
 
     def destroy_node(self) -> None:
         """Leave the coils at zero."""
@@ -131,8 +131,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         """Apply what the bridge says now, and tell."""
         outcome = self.station.step(*self._times())
         if outcome is not None and outcome.publish:
-            stamp = None if outcome.reasons else self._stamp
-            self._report.applied(stamp or self.get_clock().now().to_msg(), outcome)
+            self._report.applied(None if outcome.reasons else self._stamp, outcome)
             self._stamp = None
         self._report.state(anyway=False)
 

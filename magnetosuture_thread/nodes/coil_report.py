@@ -58,8 +58,9 @@ class CoilReport:
         self._refused += 1
         self._health.refuse(problem)
 
-    def applied(self, stamp: Time, outcome: Outcome) -> None:
-        """Say what the coils were told; `stamp` is that of the command if this is its first use."""
+    def applied(self, stamp: Time | None, outcome: Outcome) -> None:
+        """Say what the coils were told; `stamp` is that of the command if this is its first use, else None."""
+        stamp = stamp or self._node.get_clock().now().to_msg()
         self._currents.publish(coil_messages.currents_message(stamp, outcome))
         self._setpoints.publish(messages.twist_message(stamp, outcome.allocation.velocity))
 
@@ -78,8 +79,6 @@ class CoilReport:
             **{key: round(value, 3) for key, value in zip(LOOP, station.rhythm.milliseconds, strict=True)}
         )
         self._health.note(driver=station.driver_name, **{"driver problem": driver.problem or "none"})
-        if not changed:
-            return
         self._told = now
         if latch.latched:
             self._health.error(f"fault: {latch.latched}")

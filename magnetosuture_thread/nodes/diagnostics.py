@@ -54,10 +54,13 @@ class Health:
         self._values.update(values)
 
     def refuse(self, problem: Exception, **values: object) -> None:
-        """Say that an input was refused; the node itself goes on."""
+        """Say that an input was refused; the node itself goes on. An error that it has said before stays said."""
         self._refused += 1
         self._last_refusal = str(problem)
-        self._set(DiagnosticStatus.WARN, f"refused: {problem}", values)
+        if self._level == DiagnosticStatus.ERROR:
+            self._values.update(values)
+        else:
+            self._set(DiagnosticStatus.WARN, f"refused: {problem}", values)
 
     def publish(self) -> None:
         """Publish the state now."""

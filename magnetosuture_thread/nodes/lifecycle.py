@@ -7,18 +7,18 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.exceptions import ParameterException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import OF_ROS, Configuration
-from magnetosuture_thread.errors import ConfigurationError, GraphError, MagnetosutureError
+from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.nodes.parameters import declare
 
 C = TypeVar("C", bound=Configuration)
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+ERROR = TransitionCallbackReturn.ERROR
 
 
 class ManagedNode(LifecycleNode, Generic[C]):
@@ -73,12 +73,24 @@ class ManagedNode(LifecycleNode, Generic[C]):
         if go() is not SUCCESS:
             raise self.problem or GraphError(f"{self.get_name()}: the transition from {self.stage} failed")
 
+    def start(self) -> None:
+        """Go as far as the parameter `autostart` says: unconfigured, inactive, or else active.
+
+        Raises:
+            MagnetosutureError: a transition failed.
+        """
+        if self.get_parameter_or("autostart").value == "unconfigured":
+            return
+        self.require(self.trigger_configure)
+        if self.get_parameter("autostart").value != "inactive":
+            self.require(self.trigger_activate)
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and take what they ask for."""
         try:
             settings = declare(self, self._class, read_only=False)
             self.begin(settings)
-        except (MagnetosutureError, ParameterException) as error:
+        except Exception as error:  # rclpy would swallow it, and what was taken would stay
             self.end()
             return self._failed(error)
         self.settings = settings
@@ -88,13 +100,18 @@ class ManagedNode(LifecycleNode, Generic[C]):
         """Become active."""
         try:
             self.resume()
-        except MagnetosutureError as error:
+        except Exception as error:
             return self._failed(error)
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Become inactive."""
-        self.pause()
+        """Become inactive; where even that fails, give all back."""
+        try:
+            self.pause()
+        except Exception as error:
+            self.on_cleanup(state)
+            self._failed(error)
+            return ERROR
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -105,11 +122,14 @@ class ManagedNode(LifecycleNode, Generic[C]):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give all back for good."""
-        self.pause()
+        try:
+            self.pause()
+        except Exception as error:
+            self._failed(error)
         return self.on_cleanup(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """After an error that nobody foresaw, give all back."""
+        """After an error that nobody foresaw, give all back; the node can be configured again."""
         return self.on_shutdown(state)
 
     def _failed(self, error: Exception) -> TransitionCallbackReturn:

@@ -52,7 +52,7 @@ class BridgeReport:
         hostile: messages sent.
         greatest_current: asked of a board meanwhile [A].
         max_current: its limit [A].
-        alive: whether the bridge worked afterwards.
+        unheard: how often nobody who was started after a kill was heard, until the bridge was started anew.
     """
 
     delays: tuple[Delays, ...]
@@ -62,7 +62,7 @@ class BridgeReport:
     hostile: int
     greatest_current: float
     max_current: float
-    alive: bool
+    unheard: int
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above."""
@@ -83,6 +83,7 @@ def bridge_table(report: BridgeReport) -> Table:
     table.add_row("loop off its period", *(f"{value:.2f} ms" for value in report.loop), "2.00 ms", "")
     table.add_section()
     found = f"{report.greatest_current:.2f} A"
-    table.add_row(f"{report.hostile} hostile messages", "", "", found, f"{report.max_current:.2f} A", "")
-    table.add_row("  the bridge afterwards", "", "", "works" if report.alive else "dead", "", "")
+    table.add_row(f"{report.hostile} hostile messages", "", "", found, f"{report.max_current:.2f} A", "works after")
+    kills = sum(each.count for each in report.delays[1:])
+    table.add_row("started after a kill and not heard", "", "", "", "", f"{report.unheard} of {kills}")
     return table

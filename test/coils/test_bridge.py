@@ -220,6 +220,55 @@ def test_stops_are_at_once_and_starts_are_not():
     assert not any(0.0 < np.linalg.norm(outcome.applied) < 0.014 for outcome in at_rest)
 
 
+def test_after_a_stop_the_needle_starts_from_rest():
+    """Neither speed nor currents nor the motion that a pose is carried on by outlive a stop."""
+    settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
+    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
+    plant.run(1.0)
+    plant.bridge.latch.disarm()
+    plant.run(PERIOD)
+    plant.tail = None
+    at_rest = plant.bridge.needle.pose(plant.time, plant.time)
+    later = plant.bridge.needle.pose(plant.time + 0.05, plant.time + 0.05)
+    assert at_rest is not None
+    assert later is not None
+    assert later.tail.tolist() == at_rest.tail.tolist()
+    plant.bridge.arm(READY)
+    plant.command((0.015, 0.0))
+    first = plant.run(PERIOD)[0]
+    assert 0.0 < np.linalg.norm(first.applied) <= 0.1 * 2 * PERIOD + 1e-12
+    assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
+
+
+def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
+    settings = CoilBridgeSettings(max_current_slew=100.0, command_timeout=0.1)
+    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
+    assert np.abs(plant.run(1.0)[-1].allocation.currents).max() > 3.0
+    plant.time += 0.15
+    plant.bridge.needle.see(TAIL, EAST, plant.time, plant.poses + 1, plant.time, plant.time)
+    plant.command((0.015, 0.0))
+    after = plant.bridge.step(plant.time, plant.time, READY)
+    assert np.abs(after.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
+
+
+def test_a_silence_after_a_rest_is_told_as_any_other():
+    plant = Plant(CoilBridgeSettings(zero_hold=0.3), velocity=(0.0, 0.0)).ready()
+    assert all(outcome.publish for outcome in plant.run(2.0))
+    plant.velocity = None
+    told = [outcome for outcome in plant.run(2.0) if outcome.publish and outcome.reasons]
+    assert len(told) == pytest.approx(0.3 / PERIOD, abs=2)
+
+
+def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(monkeypatch: pytest.MonkeyPatch):
+    plant = Plant().ready()
+    plant.run(0.2)
+    monkeypatch.setattr(plant.bridge, "_allocate", lambda *_: None)
+    assert plant.run(PERIOD)[0].reasons == ("the coils would pull the needle to the wall or an obstacle",)
+    monkeypatch.undo()
+    assert all(still(outcome) for outcome in plant.run(0.08))
+    assert not still(plant.run(0.1)[-1])
+
+
 def test_a_late_step_changes_no_more_than_two_in_time():
     plant = Plant(CoilBridgeSettings(max_acceleration=0.1), velocity=(0.015, 0.0)).ready()
     plant.run(0.02)
@@ -257,17 +306,29 @@ def test_two_that_say_where_the_needle_is_stop_it():
 
 
 @pytest.mark.parametrize("towards", [(1.0, 0.0), (0.7, 0.7), (0.0, 1.0), (-1.0, 0.0), (0.3, -0.9)])
-@pytest.mark.parametrize("obstacles", [(), (0.006, 0.0, 0.002)])
-def test_the_needle_never_comes_closer_than_it_may(towards: tuple[float, float], obstacles: tuple[float, ...]):
-    """Told to go on for ever, it comes to rest before the wall or the obstacle, by what its coils give it."""
+@pytest.mark.parametrize(
+    ("obstacles", "latency", "interval"),
+    [((), 0, 1), ((0.006, 0.0, 0.002), 0, 1), ((), 16, 7), ((0.006, 0.0, 0.002), 30, 6)],
+)
+def test_the_needle_never_comes_closer_than_it_may(
+    towards: tuple[float, float], obstacles: tuple[float, ...], latency: int, interval: int
+):
+    """Told to go on for ever, it comes to rest before the wall or the obstacle, by what its coils give it.
+
+    Also where poses come late, and seldom; both in periods.
+    """
     settings = CoilBridgeSettings(disc_obstacles=obstacles)
     plant = Plant(settings, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
     plant.tail = None
     tail, heading = TAIL - np.array([0.004, 0.0]), EAST
     needle, workspace = settings.needle(), settings.workspace()
     least = np.inf
-    for number in range(1, 1200):
-        plant.bridge.needle.see(tail, heading, plant.time, number, plant.time, plant.time)
+    poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
+    for number in range(1, 1000):
+        poses.append((plant.time, tail, heading))
+        if number > latency and number % interval == 0:
+            then, old_tail, old_heading = poses[number - 1 - latency]
+            plant.bridge.needle.see(old_tail, old_heading, then, number, plant.time, plant.time)
         outcome = plant.run(PERIOD)[0]
         # As the bridge has it: along the chord the needle is driven, across it turns about its middle.
         e = needle.chord_direction(heading)

@@ -31,7 +31,7 @@ def test_a_pose_ends_by_the_monotonic_clock_whatever_the_other_says():
 
 def test_a_pose_is_carried_along_the_needle():
     seen = watch()
-    seen.move(np.array([0.005, 0.0]))
+    seen.move(np.array([0.005, 0.0]), 1.0)
     pose = seen.pose(1.04, 50.04)
     assert pose is not None
     np.testing.assert_allclose(pose.tail, [0.0002, 0.0], atol=1e-12)
@@ -40,7 +40,7 @@ def test_a_pose_is_carried_along_the_needle():
 
 def test_a_velocity_across_turns_the_needle_about_its_middle():
     seen = watch()
-    seen.move(np.array([0.0, 0.0035]))  # one length in two seconds: 1 rad/s
+    seen.move(np.array([0.0, 0.0035]), 1.0)  # one length in two seconds: 1 rad/s
     pose = seen.pose(1.05, 50.05)
     assert pose is not None
     np.testing.assert_allclose(pose.heading, [np.cos(0.05), np.sin(0.05)])
@@ -48,13 +48,25 @@ def test_a_velocity_across_turns_the_needle_about_its_middle():
     np.testing.assert_allclose(middle, [0.0035, 0.0], atol=1e-12)
 
 
-def test_a_pose_is_not_carried_far():
-    seen = NeedleWatch(NEEDLE, 1.0, 0.045)
-    seen.see(np.zeros(2), EAST, 1.0, 1, 1.0, 50.0)
-    seen.move(np.array([0.005, 0.0]))
-    pose = seen.pose(1.9, 50.1)
+def test_a_late_pose_is_carried_by_all_that_the_coils_gave_since_its_stamp():
+    seen = NeedleWatch(NEEDLE, 0.3, 0.045)
+    seen.move(np.array([0.02, 0.0]), 1.0)
+    seen.move(np.array([0.01, 0.0]), 1.1)
+    seen.move(np.zeros(2), 1.15)
+    seen.see(np.zeros(2), EAST, 1.05, 1, 1.17, 50.0)
+    pose = seen.pose(1.2, 50.03)
     assert pose is not None
-    np.testing.assert_allclose(pose.tail, [0.0005, 0.0], atol=1e-12)
+    np.testing.assert_allclose(pose.tail, [0.02 * 0.05 + 0.01 * 0.05, 0.0], atol=1e-12)
+
+
+def test_where_time_is_set_back_a_pose_is_carried_from_there():
+    seen = NeedleWatch(NEEDLE, 0.3, 0.045)
+    seen.move(np.array([0.02, 0.0]), 100.0)
+    seen.move(np.array([0.01, 0.0]), 1.0)
+    seen.see(np.zeros(2), EAST, 1.05, 1, 1.1, 50.0)
+    pose = seen.pose(1.15, 50.05)
+    assert pose is not None
+    np.testing.assert_allclose(pose.tail, [0.001, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -64,6 +76,7 @@ def test_a_pose_is_not_carried_far():
         (np.zeros(2), np.array([np.inf, 0.0]), 1.0, "finite numbers"),
         (np.zeros(2), EAST, 0.5, "0.500 s old"),
         (np.zeros(2), EAST, 1.5, "0.500 s ahead"),
+        (np.zeros(2), EAST, 0.0, "0 is none in ROS"),
         (np.zeros(2), EAST, 0.95, "no earlier than the last one's"),
         (np.array([1e200, 0.0]), EAST, 1.0, "within 0.045 m"),
         (np.array([0.05, 0.025]), EAST, 1.0, "within 0.045 m"),

@@ -82,12 +82,8 @@ POSE = {
 def test_the_kinematics_here_are_those_of_the_watch():
     watch = NeedleWatch(NEEDLE, 0.2, 0.045)
     velocity, tail, heading = np.array([0.004, 0.009]), np.array([0.001, 0.002]), direction(0.4)
-    watch._pose, watch._stamp, watch._arrival = (
-        dataclasses.make_dataclass("Pose", ["tail", "heading"])(tail, heading),
-        1.0,
-        1.0,
-    )
-    watch.move(velocity)
+    watch.see(tail, heading, 1.0, 1, 1.0, 1.0)
+    watch.move(velocity, 1.0)
     pose = watch.pose(1.02, 1.02)
     assert pose is not None
     turned, moved = carried(NEEDLE, tail, heading, velocity, 0.02)

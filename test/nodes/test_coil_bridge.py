@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from magnetosuture_msgs.msg import CoilBridgeState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -27,7 +29,7 @@ TAIL = np.array([-0.0035, 0.0])
 LONG = {"command_timeout": 1.0, "pose_timeout": 1.0}  # one command and one pose last through a test
 
 
-def armed(graph, **parameters: Any) -> CoilBridgeNode:
+def armed(graph, **parameters: Any) -> Any:
     """Return a bridge that passes commands."""
     node = graph.add(CoilBridgeNode, autostart="armed", **parameters)
     graph.wait(lambda: node.station.latch.armed, "the bridge to be armed")
@@ -106,8 +108,8 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
     assert list(last.coil) == ["coil_0", "coil_1", "coil_2", "coil_3"]
     assert not last.saturated
     graph.wait(lambda: bool(setpoints) and setpoints[-1].twist.linear.x == pytest.approx(0.005, rel=0.02), "setpoint")
-    graph.wait(lambda: states[-1].armed and not states[-1].reasons, "the state")
-    graph.wait(lambda: states[-1].reached.x == pytest.approx(0.005, rel=0.02), "the velocity reached")
+    graph.wait(lambda: bool(states) and states[-1].armed and not states[-1].reasons, "the state")
+    graph.wait(lambda: bool(states) and states[-1].reached.x == pytest.approx(0.005, rel=0.02), "the velocity reached")
     assert states[-1].state == CoilBridgeState.STATE_ACTIVE
     assert states[-1].commanded.x == states[-1].applied.x == 0.005
     assert (states[-1].driver, states[-1].driver_ready) == ("recording", True)
@@ -194,11 +196,22 @@ def test_cease_after_stop(graph):
 
 
 def test_the_watchdog_does_not_depend_on_simulated_time(graph):
-    """With /clock standing still the coils must stop all the same."""
+    """With /clock standing still the coils must stop all the same; before it runs nothing is good."""
     node = armed(graph, use_sim_time=True)
-    graph.publish(topics.NEEDLE_POSE, messages.pose_message(Time(), TAIL, EAST))
-    still = messages.twist_message(Time(), np.array([0.01, 0.0]))  # time 0, as the clock that never came
-    graph.publish(topics.NEEDLE_COMMAND, still)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_COMMAND, messages.twist_message(Time(), np.array([0.01, 0.0])))
+    graph.wait(lambda: any("0 is none in ROS" in str(d.status[0].values) for d in diagnostics), "a refusal")
+    now = Time(sec=50)
+    clock = graph.probe.create_publisher(Clock, "/clock", topics.CLOCK.qos)
+    graph.wait(lambda: clock.get_subscription_count() > 0, "who wants the time")
+
+    def running() -> bool:
+        clock.publish(Clock(clock=now))
+        return bool(node.get_clock().now().nanoseconds == 50 * 10**9)
+
+    graph.wait(running, "the time")
+    graph.publish(topics.NEEDLE_POSE, messages.pose_message(now, TAIL, EAST))
+    graph.publish(topics.NEEDLE_COMMAND, messages.twist_message(now, np.array([0.01, 0.0])))
     graph.wait(lambda: driven(node), "a current")
     graph.wait(lambda: not applied(node)[-1].any(), "zero current")
 
@@ -315,7 +328,9 @@ def test_inactive_passes_nothing(graph, how_far):
     if node.station.driver is not None:
         assert not driven(node)
     assert press(graph, EMERGENCY_STOP).success
-    graph.wait(lambda: states[-1].state == CoilBridgeState.STATE_FAULT, "the stop to be latched here too")
+    graph.wait(
+        lambda: bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT, "the stop to be latched here too"
+    )
     assert press(graph, RESET).success
     assert stage(graph) == how_far
 
@@ -341,6 +356,94 @@ def test_the_lifecycle_there_and_back(graph):
     assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert stage(graph) == "finalized"
     assert not node.station.driver.state().ready
+
+
+def test_a_reset_never_arms_whatever_came_between(graph):
+    """Armed by itself once, at its start, and never again."""
+    node = armed(graph, **LONG)
+    assert press(graph, EMERGENCY_STOP).success
+    graph.wait(lambda: stage(graph) == "inactive", "the lifecycle to say so")
+    assert change(graph, Transition.TRANSITION_CLEANUP)
+    assert change(graph, Transition.TRANSITION_CONFIGURE)
+    assert press(graph, RESET).success
+    assert stage(graph) == "inactive"  # where the operator has left it
+    assert change(graph, Transition.TRANSITION_ACTIVATE)
+    drive(graph)
+    told = len(applied(node))
+    graph.wait(lambda: len(applied(node)) > told + 30, "some steps")
+    assert not node.station.latch.armed
+    assert not driven(node)
+
+
+def test_a_stop_calls_off_what_would_arm_by_itself(graph):
+    node = graph.add(CoilBridgeNode, driver="simulated", autostart="armed", **LONG)
+    assert press(graph, EMERGENCY_STOP).success
+    graph.listen(topics.RIG_CURRENTS)
+    graph.wait(lambda: node.station.driver.state().ready, "the rig to be found")
+    assert press(graph, RESET).success
+    states = graph.listen(topics.BRIDGE_STATE)
+    graph.wait(lambda: len(states) > 3, "some states")
+    assert stage(graph) == "active"
+    assert not states[-1].armed
+
+
+def test_a_bad_message_does_not_hide_an_emergency_stop(graph):
+    graph.add(CoilBridgeNode)
+    diagnostics, states = graph.listen(topics.DIAGNOSTICS), graph.listen(topics.BRIDGE_STATE)
+    assert press(graph, EMERGENCY_STOP).success
+    graph.wait(lambda: any(d.status[0].level == DiagnosticStatus.ERROR for d in diagnostics), "the fault")
+    bad = command(graph)
+    bad.header.frame_id = "map"
+    graph.publish(topics.NEEDLE_COMMAND, bad)
+    graph.wait(lambda: bool(states) and states[-1].refused == 1, "the refusal")
+    heard = len(diagnostics)
+    graph.wait(lambda: len(diagnostics) > heard, "another report")
+    assert diagnostics[-1].status[0].level == DiagnosticStatus.ERROR
+    assert diagnostics[-1].status[0].message == "fault: emergency stop"
+
+
+@pytest.mark.parametrize("transition", [Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVE_SHUTDOWN])
+def test_an_error_in_a_transition_leaves_the_coils_at_zero_and_the_driver_closed(graph, monkeypatch, transition):
+    node = armed(graph, **LONG)
+    drive(graph)
+    graph.wait(lambda: driven(node), "a current")
+
+    def broken() -> None:
+        raise RuntimeError("nobody foresaw this")
+
+    monkeypatch.setattr(node.station.latch, "deactivate", broken)
+    change(graph, transition)
+    assert not node.station.driver.state().ready
+    assert not applied(node)[-1].any()
+    assert "nobody foresaw this" in str(node.problem)
+    assert stage(graph) in ("unconfigured", "finalized")
+
+
+def test_what_was_taken_is_given_back_where_configuring_fails(graph, monkeypatch):
+    node = graph.add(CoilBridgeNode, autostart="unconfigured")
+
+    def broken(*_: Any, **__: Any) -> None:
+        raise RuntimeError("no timer")
+
+    monkeypatch.setattr(node, "create_timer", broken)
+    assert not change(graph, Transition.TRANSITION_CONFIGURE)
+    assert node.station.bridge is None
+    assert not node.station.driver.state().ready
+    monkeypatch.undo()
+    assert change(graph, Transition.TRANSITION_CONFIGURE)
+
+
+def test_a_message_that_breaks_arithmetic_does_not_end_the_node(graph, monkeypatch):
+    node = armed(graph, **LONG)
+    states = graph.listen(topics.BRIDGE_STATE)
+
+    def broken(*_: Any) -> None:
+        raise OverflowError("a check that was forgotten")
+
+    monkeypatch.setattr(node.station.bridge.gate, "accept", broken)
+    monkeypatch.setattr(node.station.bridge.needle, "see", broken)
+    drive(graph)
+    graph.wait(lambda: bool(states) and states[-1].refused == 2, "both refused")
 
 
 def set_parameter(graph, name: str, value: float) -> Any:

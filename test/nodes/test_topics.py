@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from magnetosuture_thread.coils.sources import SourceWatch
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
@@ -47,3 +50,26 @@ def test_the_overrides_take_effect(graph):
     assert QoSProfile(depth=1).durability == DurabilityPolicy.VOLATILE
     own = next(s for s in node.subscriptions if s.topic_name == "/needle/measured_cp")
     assert own.qos_profile.depth == 123
+
+
+@pytest.mark.parametrize("unknown", [None, 2**64 - 1])
+@pytest.mark.parametrize(("publishers", "speaking"), [(1, 1), (2, 20)])
+def test_where_nobody_numbers_messages_the_publishers_are_counted(graph, monkeypatch, unknown, publishers, speaking):
+    taken: list[int] = []
+    callbacks: list[Any] = []
+
+    class Counted:
+        def get_publisher_count(self) -> int:
+            return publishers
+
+    def subscribe(kind: Any, name: str, callback: Any, *_: Any, **__: Any) -> Counted:
+        callbacks.append(callback)
+        return Counted()
+
+    monkeypatch.setattr(graph.probe, "create_subscription", subscribe)
+    topics.NEEDLE_COMMAND.subscribe_numbered(graph.probe, lambda message, number: taken.append(number))
+    watch = SourceWatch()
+    for index in range(20):
+        callbacks[0](None, {"publication_sequence_number": unknown})
+        watch.hear(taken[-1], 0.01 * index)
+    assert watch.count(0.2) == speaking
