@@ -74,6 +74,7 @@ def simulate(options: argparse.Namespace) -> int:
                 options.output,
                 duration=options.duration,
                 pace=options.pace,
+                boards=options.boards,
                 say=say,
                 progress=progress,
             )

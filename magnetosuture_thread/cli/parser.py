@@ -67,10 +67,14 @@ def make_parser() -> argparse.ArgumentParser:
     simulate.add_argument(
         "--duration", type=number(0.1, 1e5), help="end after this many seconds (default: at the end of the path)"
     )
-    simulate.add_argument(
+    either = simulate.add_mutually_exclusive_group()
+    either.add_argument(
         "--pace",
         type=number(0.5, 5.0),
         help="run with a simulated clock, this much faster than real time (default: in real time)",
+    )
+    either.add_argument(
+        "--boards", action="store_true", help="drive simulated RoboClaw boards, by the driver for real ones"
     )
     simulate.add_argument("--json", type=output_file, metavar="FILE", help="write the figures to a file")
     behaviour = _command(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +46,14 @@ class NeedleMechanics:
     drag_across: float
     turning_drag: float
 
+    @cached_property
+    def _chord(self) -> tuple[float, Vector]:
+        return needle_chord(self.length, self.curvature)
+
     @property
     def chord(self) -> float:
         """Distance from tail to tip [m]."""
-        return needle_chord(self.length, self.curvature)[0]
+        return self._chord[0]
 
     @property
     def pole(self) -> float:
@@ -57,7 +62,7 @@ class NeedleMechanics:
 
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
-        return np.asarray(needle_chord(self.length, self.curvature)[1] @ heading)
+        return np.asarray(self._chord[1] @ heading)
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,6 +44,7 @@ def simulate(
     *,
     duration: float | None = None,
     pace: float | None = None,
+    boards: bool = False,
     say: Say = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> LoopSummary:
@@ -57,6 +60,8 @@ def simulate(
         duration: the run ends after this many seconds of the scenario's time, wherever the needle is then;
             when the path is done if None.
         pace: how much faster than real time, with a simulated clock; in real time if None.
+        boards: whether the bridge drives the rig through simulated RoboClaw boards on pseudo-terminals, by the
+            driver for real ones; they keep real time, so not with `pace`.
         say: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
@@ -75,7 +80,7 @@ def simulate(
             "vision_tracker.image_transport", setup.vision.image_transport, expectation, str(setup.path)
         )
     with whole_folder(output) as folder:
-        problem = _run(setup, folder, output.name, duration, pace, say, progress)
+        problem = _run(setup, folder, output.name, duration, pace, boards, say, progress)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
     if problem:
@@ -96,11 +101,19 @@ def judge(bag: Bag, setup: Setup) -> LoopCollector:
 
 
 def _run(
-    setup: Setup, folder: Path, name: str, duration: float | None, pace: float | None, say: Say, progress: Progress
+    setup: Setup,
+    folder: Path,
+    name: str,
+    duration: float | None,
+    pace: float | None,
+    boards: bool,
+    say: Say,
+    progress: Progress,
 ) -> str:
     """Run the graph and record it; return what went wrong, so that the bag stays."""
     # Only here, where it is needed: without ROS the other commands still work.
     from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.coil_client import CoilClient
     from magnetosuture_thread.nodes.processes import (
         NodeProcesses,
         environment_of,
@@ -109,7 +122,7 @@ def _run(
     )
     from magnetosuture_thread.nodes.recorder import Recorder
 
-    arguments = ["--params-file", str(setup.path.resolve()), *SIMULATED_COILS]
+    arguments = ["--params-file", str(setup.path.resolve())]
     if pace is not None:
         arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:pace:={float(pace)}"]
     notes = {
@@ -122,8 +135,10 @@ def _run(
     with (
         reserved_domain() as domain,
         BagWriter(folder, notes, name=name) as bag,
+        TemporaryDirectory() as ports,
     ):
         environment = graph_environment(domain)
+        arguments += _wired(ports, len(setup.coils.coil_angles)) if boards else SIMULATED_COILS
         for topic in taken:
             bag.add_topic(topic.channel.recorded, topic.channel.type_name)
         say(f"starting rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
@@ -151,6 +166,9 @@ def _run(
                     nodes.check,
                     {topics.NEEDLE_COMMAND.name, topics.TIP_SETPOINT.name, topics.FAULT_REQUEST.name},
                 )
+                if boards:
+                    with CoilClient() as client:
+                        client.do("arm")
                 say("running" if pace is None else f"running at {pace:g} times the speed")
                 running = True
                 nodes.start("path_follower")
@@ -161,6 +179,17 @@ def _run(
                 return INTERRUPTED  # passed on once the bag is whole
             finally:
                 recorder.close()
+
+
+def _wired(folder: str, coils: int) -> list[str]:
+    """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
+    ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
+    both = {
+        "coil_bridge": {"driver": "roboclaw", "autostart": "active", "roboclaw_ports": ports},
+        "rig_simulator": {"power_stage": "roboclaw", "power_stage_ports": ports},
+    }
+    given = [f"{node}:{name}:={value}" for node, values in both.items() for name, value in values.items()]
+    return [part for each in given for part in ("-p", each)]
 
 
 def _wait(recorder: Recorder, check: Callable[[], None], later: set[str]) -> None:

@@ -66,6 +66,16 @@ def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     assert shares[-1] == 1.0
 
 
+def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: Path, tmp_path: Path):
+    summary = simulate(str(scenario), tmp_path / "bag", boards=True)
+    assert summary.path_error < 2e-3
+    states = [r.decode() for r in Bag(tmp_path / "bag").records({"/coils/state"})]
+    following = [state for state in states if not state.reasons]
+    assert following
+    assert {state.driver for state in following} == {"roboclaw"}
+    assert max(abs(current) for state in following for current in state.measured_current) > 0.5
+
+
 def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     bag = Bag(run[0])
     bag.check()

@@ -12,6 +12,7 @@ from magnetosuture_thread.rig.power.packets import Parser
 FULL = 32767  # duty of the whole supply voltage
 VERSION = b"RoboClaw simulated 2x15A v4.2.4\n\x00"
 FACTORY_LIMIT = 3000  # in units of 10 mA
+FACTORY_TIMEOUT = 0  # none
 EMERGENCY_STOP = 0x0001
 AT_LIMIT = 0.999
 KEPT = 10_000
@@ -42,6 +43,7 @@ class RoboClawBoard:
         warnings: bits that do not.
         ignored: commands that it acknowledges and does not obey.
         mismeasured: what it adds to the currents it reports [A].
+        broken: channels, 0 or 1, whose coil has a broken wire and so no current.
         timeline: when the duties changed, and to what.
         heard: when the last packet for it came.
     """
@@ -53,11 +55,12 @@ class RoboClawBoard:
         self.supply, self.resistance, self.inductance = supply, resistance, inductance
         self.duties = (0, 0)
         self.currents = (0.0, 0.0)
-        self.timeout = 0
+        self.timeout = FACTORY_TIMEOUT
         self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
         self.errors = self.warnings = 0
         self.ignored: set[int] = set()
         self.mismeasured = 0.0
+        self.broken: set[int] = set()
         self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=KEPT)
         self.heard = -math.inf
         self._parser = Parser()
@@ -82,6 +85,13 @@ class RoboClawBoard:
             self._set((0, 0), self._time)
         self._move(time)
 
+    def power_cycle(self) -> None:
+        """Let its supply go and come back at once: duties zero, timeout and limits as it was delivered."""
+        self._set((0, 0), self._time)
+        self.timeout = FACTORY_TIMEOUT
+        self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
+        self._parser = Parser()
+
     @property
     def outputs(self) -> tuple[int, int]:
         """What is left of the duties where a coil is at its limit."""
@@ -100,9 +110,10 @@ class RoboClawBoard:
             return
         share = math.exp(-(time - self._time) * self.resistance / self.inductance)
         moved = []
-        for current, duty, limit in zip(self.currents, self.duties, self.limits, strict=True):
+        for channel, (current, duty, limit) in enumerate(zip(self.currents, self.duties, self.limits, strict=True)):
             goal = duty / FULL * self.supply / self.resistance
-            moved.append(max(-0.01 * limit, min(0.01 * limit, goal + (current - goal) * share)))
+            limited = max(-0.01 * limit, min(0.01 * limit, goal + (current - goal) * share))
+            moved.append(0.0 if channel in self.broken else limited)
         self.currents = (moved[0], moved[1])
         self._time = time
 

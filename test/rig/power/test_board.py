@@ -168,6 +168,32 @@ def test_a_command_may_be_acknowledged_and_not_obeyed():
     assert board.duties == (0, 0)
 
 
+def test_a_board_whose_power_was_gone_is_as_it_was_delivered():
+    board = RoboClawBoard()
+    for command in (133, 134):
+        board.receive(packet(command, 500, 0, form=">II"), 1.0)
+    board.receive(packet(14, 3, form=">B") + packet(34, 1000, -2000) + packet(34, 7, 7)[:4], 1.0)
+    board.power_cycle()
+    assert board.timeline[-1] == (1.0, (0, 0))
+    assert board.receive(packet(34, 5, 6)[4:], 1.0) == b""  # it does not know what a packet began with
+    assert asked(board, 48, ">hh", 1.1) == (0, 0)
+    assert asked(board, 15, ">B", 1.1) == (0,)
+    assert asked(board, 135, ">II", 1.1) == asked(board, 136, ">II", 1.1) == (3000, 0)
+
+
+def test_a_coil_with_a_broken_wire_has_no_current():
+    board = RoboClawBoard()
+    board.broken.add(1)
+    board.receive(packet(34, FULL // 4, FULL // 4), 1.0)
+    board.advance(2.0)
+    assert board.currents == (pytest.approx(6.0, abs=0.01), 0.0)
+    assert asked(board, 48, ">hh", 2.0) == (FULL // 4, FULL // 4)
+    assert asked(board, 49, ">hh", 2.0)[1] == 0
+    board.broken.clear()
+    board.advance(3.0)
+    assert board.currents[1] == pytest.approx(6.0, abs=0.01)
+
+
 def test_the_timeline_does_not_grow_for_ever():
     board = RoboClawBoard()
     for number in range(11_000):

@@ -22,17 +22,22 @@ CLOSING = 0.3  # s
 class RoboClawDriver:
     """Drives boards of two coils each: coils 0 and 1 are on the first board, 2 and 3 on the second.
 
-    d = I R / U with the duty d from -1 to 1, the current I [A], the coil's resistance R [ohm] and the voltage U
-    [V] of the board's supply as it measures it. A board sets the mean voltage at a coil and no current: the
-    current settles with the coil's L / R, and is too small by as much as the coil is warmer than R says. Above
-    U / R the duty is clipped, and a warning says so.
+    d = I R / U with the duty d from -1 to 1, the current I [A], the resistance R [ohm] of that coil, from the
+    calibration or else `coil_resistance`, and the voltage U [V] of the board's supply as it measures it. A board
+    sets the mean voltage at a coil and no current: the current settles with the coil's L / R, and is too small
+    by as much as the coil is warmer than R says. Above U / R the duty is clipped, and a warning says so. Another
+    names a coil whose measured current stays under half of what its duty should give, of at least 0.5 A, as
+    where its wire is broken; it goes when they agree or less is asked.
 
     A thread for each serial port is the only one that talks to it. It keeps the newest currents in force while
     every board is ready, and zero otherwise: where one board fails, where `apply` is not called for `patience`,
-    and after every loss until the first `apply` that comes once all are ready again.
+    and after every loss until the first `apply` that comes once all are ready again. Currents are taken anew for
+    each board and each attempt to write to it, so that a stop gets in between.
 
     Every board holds a limit of its own on the currents, and stops by itself when it hears nothing for
-    `roboclaw_timeout`; a board that does not confirm both is never ready.
+    `roboclaw_timeout`; a board that does not confirm both is never ready. It is asked for both again and again,
+    with two boards on a line within about a second: one whose supply breaks down forgets them, which is a loss
+    however soon it is back.
 
     Args:
         settings: of the bridge.

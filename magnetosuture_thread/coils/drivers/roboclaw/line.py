@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import suppress
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from magnetosuture_thread.coils.drivers.roboclaw import rules
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board
 from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox, Report
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
+from magnetosuture_thread.coils.drivers.roboclaw.rules import Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 KEEP_ALIVE = 0.02  # s between two writes at the most; a board's own timeout is at least five times as long
@@ -85,16 +87,14 @@ class LineThread:
             self._ends.wait(rules.pause(failures))
 
     def _connect(self, port: ExchangePort) -> None:
-        settings = self._settings
         self._leaves = False
         self._boards = {
             number: Board(
                 port,
+                number,
                 address,
                 f"board {number} ({self._path}, address {address})",
-                round(10.0 * settings.roboclaw_timeout),
-                settings.max_current,
-                settings.coil_resistance,
+                self._settings,
                 self._hurries,
             )
             for number, address in self._addresses.items()
@@ -108,17 +108,18 @@ class LineThread:
         while not self._ends.is_set():
             self._wake.wait(KEEP_ALIVE)
             self._wake.clear()
-            currents = self._mailbox.take(time.monotonic())
             for number, board in self._boards.items():
-                if currents is None:
-                    board.write_zero()
-                else:
-                    board.write(currents[2 * number : 2 * number + 2])
+                board.write(partial(self._newest, number))
             # What is new goes first, but what goes on must be known all the same.
             if not self._wake.is_set() or time.monotonic() - polled_at > POLL_PERIOD:
                 list(self._boards.values())[turn % len(self._boards)].poll()
                 turn, polled_at = turn + 1, time.monotonic()
                 self._mailbox.report(self._number, self._report())
+
+    def _newest(self, number: int) -> Vector | None:
+        """Return the currents that a board is to give now, shape (2,) [A]; None is zero in both its coils."""
+        currents = self._mailbox.take(time.monotonic())
+        return None if currents is None else currents[2 * number : 2 * number + 2]
 
     def _leave(self, port: ExchangePort) -> None:
         """Ask every board for zero; one that does not hear stops by its own timeout, as nobody writes to it."""

@@ -17,6 +17,11 @@ ROUNDED = 164  # of a duty, by which a board may round one that is not zero: 0.5
 AT_LIMIT = 0.8  # of the greatest current, from which on a board may take its duty back
 EXCESS = 1.2  # of the greatest current, that is too much
 EXCESSES = 3  # in a row, that are too many
+LEAST_ASKED = 0.5  # A that a coil should have before anybody can tell that they are missing
+SHORT = 0.5  # of the current that a coil should have, below which it is not only warm
+# Measurements in a row that must be too small: a fifth of a second and more at 200 Hz, so that neither a change of
+# the current nor the coil's L / R looks like a broken wire.
+SHORTFALLS = 12
 MISMATCHES = 2  # in a row, that are too many: the first may be a packet that got lost
 
 # Errors that the boards' manual knows and the maker's library does not.
@@ -30,15 +35,26 @@ class Question(enum.Enum):
     CURRENTS = enum.auto()
     STATUS = enum.auto()
     VOLTAGES = enum.auto()
+    TIMEOUT = enum.auto()
+    LIMIT_1 = enum.auto()
+    LIMIT_2 = enum.auto()
 
 
-ROUND = (
-    Question.DUTIES,
-    Question.CURRENTS,
-    Question.STATUS,
-    Question.DUTIES,
-    Question.CURRENTS,
-    Question.VOLTAGES,
+# What a board forgets when its supply breaks down; if that was short, nothing else tells.
+SET = (Question.TIMEOUT, Question.LIMIT_1, Question.LIMIT_2)
+# In turn; with a question each 20 to 25 ms, two boards on a line have told everything within about a second.
+ROUND = tuple(
+    question
+    for setting in SET
+    for question in (
+        Question.DUTIES,
+        Question.CURRENTS,
+        Question.STATUS,
+        Question.DUTIES,
+        Question.CURRENTS,
+        Question.VOLTAGES,
+        setting,
+    )
 )
 
 
@@ -51,7 +67,7 @@ def pause(failures: int) -> float:
     return min(LONGEST_PAUSE, FIRST_PAUSE * 2.0 ** min(failures - 1, 10))
 
 
-def duties(currents: Vector, resistance: float, voltage: float) -> tuple[tuple[int, ...], bool]:
+def duties(currents: Vector, resistances: Vector, voltage: float) -> tuple[tuple[int, ...], bool]:
     """Return the duties that give currents, and whether the supply is too low for them.
 
     d = I R / U, clipped to -1 ... 1, times 32767 and cut to a whole number, as no current may be greater than it
@@ -60,15 +76,43 @@ def duties(currents: Vector, resistance: float, voltage: float) -> tuple[tuple[i
 
     Args:
         currents: I, shape (m,) [A].
-        resistance: R, of a coil with its cable [ohm].
+        resistances: R, of each coil with its cable, shape (m,) [ohm].
         voltage: U, of the board's supply [V].
 
-    >>> duties(np.array([3.0, -6.0, 30.0]), 1.0, 24.0)
-    ((4095, -8191, 32767), True)
+    >>> duties(np.array([3.0, -6.0, 30.0]), np.array([1.0, 0.5, 1.0]), 24.0)
+    ((4095, -4095, 32767), True)
     """
-    share = currents * resistance / voltage
+    share = currents * resistances / voltage
     short = bool(np.any(np.abs(share) > 1.0))
     return tuple(np.trunc(FULL * np.clip(share, -1.0, 1.0)).astype(int).tolist()), short
+
+
+def settled(duties: Sequence[int], resistances: Vector, voltage: float) -> tuple[float, ...]:
+    """Return the currents that duties give in the end [A].
+
+    I = d U / R, see `duties`.
+
+    >>> settled((32767, 0), np.array([1.0, 2.0]), 24.0)
+    (24.0, 0.0)
+    """
+    return tuple((np.array(duties) / FULL * voltage / resistances).tolist())
+
+
+def falls_short(due: float, measured: float) -> bool:
+    """Return whether a coil has so much less current than it should that its wire may be broken.
+
+    One that is warm has a fifth or two fifths less. The sign does not count.
+
+    Args:
+        due: the current that its duty gives in the end [A].
+        measured: the current that it has [A].
+
+    >>> [falls_short(4.0, measured) for measured in (0.03, 2.4, -4.0)]
+    [True, False, False]
+    >>> falls_short(0.4, 0.0)
+    False
+    """
+    return abs(due) >= LEAST_ASKED and abs(measured) < SHORT * abs(due)
 
 
 def meanings(bits: int, descriptions: Mapping[int, str], kind: str) -> tuple[str, ...]:

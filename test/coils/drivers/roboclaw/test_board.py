@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
+import struct
 import threading
 import time
 import tty
@@ -17,6 +19,8 @@ from magnetosuture_thread.coils.drivers.roboclaw import port as port_module
 from magnetosuture_thread.coils.drivers.roboclaw import rules
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.rig.power import packets
 from magnetosuture_thread.rig.power.board import RoboClawBoard
 from magnetosuture_thread.rig.power.packets import checksum
 
@@ -93,7 +97,12 @@ def port(peer: Peer) -> Iterator[ExchangePort]:
 
 def board(port: ExchangePort, tenths: int = 2, hurries: bool = False) -> Board:
     """Return the board on a line."""
-    return Board(port, 128, "board 0", tenths, 10.0, 1.0, lambda: hurries)
+    return Board(port, 0, 128, "board 0", CoilBridgeSettings(roboclaw_timeout=0.1 * tenths), lambda: hurries)
+
+
+def give(made: Board, *currents: float) -> None:
+    """Ask for currents."""
+    made.write(lambda: np.array(currents))
 
 
 def whole_round(made: Board) -> None:
@@ -102,9 +111,10 @@ def whole_round(made: Board) -> None:
         made.poll()
 
 
-def simulated(made: RoboClawBoard) -> Callable[[bytes], bytes]:
-    """Return what answers as a board does."""
-    return lambda packet: made.receive(packet, time.monotonic())
+def simulated(made: RoboClawBoard, step: float | None = None) -> Callable[[bytes], bytes]:
+    """Return what answers as a board does; with a step, each packet comes so much later than the last [s]."""
+    steps = itertools.count(1)
+    return lambda packet: made.receive(packet, time.monotonic() if step is None else step * next(steps))
 
 
 def test_a_packet_goes_out_in_one_piece(port, monkeypatch):
@@ -177,13 +187,13 @@ def test_a_lost_write_is_written_again_before_it_is_a_fault(peer, patient, port)
     made = board(port)
     made.set_up()
     there.ignored.add(34)
-    made.write(np.array([3.0, 0.0]))
+    give(made, 3.0, 0.0)
     made.poll()  # the first of a round looks at the duties
     there.ignored.clear()
-    made.write(np.array([3.0, 0.0]))
+    give(made, 3.0, 0.0)
     made.poll()  # again, at once
     there.ignored.add(34)
-    made.write(np.array([5.0, 0.0]))
+    give(made, 5.0, 0.0)
     with pytest.raises(DeviceError, match=r"has duties \(4095, 0\) instead of \(6826, 0\)"):
         whole_round(made)
 
@@ -196,9 +206,100 @@ def test_a_current_is_counted_the_way_that_its_duty_goes(peer, patient, port):
     deadline = time.monotonic() + 10.0
     while abs(made.currents[1] + 6.0) > 0.05:
         assert time.monotonic() < deadline
-        made.write(np.array([3.0, -6.0]))
+        give(made, 3.0, -6.0)
         made.poll()
     assert made.currents == pytest.approx((3.0, -6.0), abs=0.05)
+
+
+def test_a_second_attempt_takes_what_is_newest(peer, port, monkeypatch):
+    monkeypatch.setattr(port_module, "ANSWER_TIMEOUT", 0.5)
+    replies = iter([b"", b"\xff"])
+    peer.answer(lambda _: next(replies))
+    made = board(port)
+    made.voltage = 24.0
+    newest = iter([np.array([3.0, -6.0]), None])  # stopped after the first
+    made.write(lambda: next(newest))
+    assert [packet[2:6] for packet in peer.heard] == [struct.pack(">hh", 4095, -8191), bytes(4)]
+    assert made.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (packets.SET_TIMEOUT, "serial timeout in tenths of a second 0 instead of 2"),
+        (packets.SET_LIMIT_1, "current limit in 10 mA 3000 instead of 1000"),
+        (packets.SET_LIMIT_2, "current limit in 10 mA 3000 instead of 1000"),
+    ],
+)
+def test_what_a_board_forgets_is_found_within_a_round(peer, patient, port, command: int, words: str):
+    there = RoboClawBoard()
+    peer.answer(simulated(there))
+    made = board(port)
+    made.set_up()
+    whole_round(made)
+    timeout, limits = there.timeout, list(there.limits)
+    there.power_cycle()
+    if command != packets.SET_TIMEOUT:  # else that is what is found first
+        there.timeout = timeout
+        there.limits[packets.SET_LIMIT_2 - command] = limits[0]
+    with pytest.raises(DeviceError, match=words):
+        whole_round(made)
+
+
+def spoken_to(made: Board, *currents: float, rounds: int = 5) -> tuple[str, ...]:
+    """Return the warnings after some rounds of questions, with a write before each as the line does."""
+    for _ in range(rounds * len(rules.ROUND)):
+        give(made, *currents)
+        made.poll()
+    return made.warnings
+
+
+def test_a_broken_wire_is_named_until_the_currents_agree(peer, patient, port):
+    there = RoboClawBoard()
+    peer.answer(simulated(there, 0.005))
+    made = board(port)
+    made.set_up()
+    assert spoken_to(made, 4.0, -4.0) == ()
+    there.broken.add(1)
+    found = {spoken_to(made, 4.0, -4.0, rounds=1) for _ in range(5)}
+    assert found == {(), ("coil 1: 0.00 A measured, -4.00 A asked",)}
+    assert spoken_to(made, 5.0, -5.0) == ("coil 1: 0.00 A measured, -4.00 A asked",)  # as it was found
+    there.broken.clear()
+    assert spoken_to(made, 4.0, -4.0) == ()
+    there.broken.add(0)
+    assert spoken_to(made, 4.0, -4.0) == ("coil 0: 0.00 A measured, 4.00 A asked",)
+    assert spoken_to(made, 0.0, 0.0) == ()
+
+
+@pytest.mark.parametrize("warmth", [1.25, 1.67])
+def test_a_warm_coil_has_no_broken_wire(peer, patient, port, warmth: float):
+    there = RoboClawBoard(resistance=warmth)
+    peer.answer(simulated(there, 0.005))
+    made = board(port)
+    made.set_up()
+    assert spoken_to(made, 4.0, -4.0) == ()
+    assert made.currents == pytest.approx((4.0 / warmth, -4.0 / warmth), abs=0.02)
+
+
+def test_a_supply_that_is_too_low_breaks_no_wire(peer, patient, port):
+    peer.answer(simulated(RoboClawBoard(supply=6.0, resistance=2.0), 0.005))
+    made = Board(port, 0, 128, "board 0", CoilBridgeSettings(coil_resistance=2.0), lambda: False)
+    made.set_up()
+    assert spoken_to(made, 8.0, 0.0) == ("board 0: a supply of 6 V is too low for the currents",)
+
+
+def test_a_slow_coil_that_is_turned_round_again_and_again_has_no_broken_wire(peer, patient, port):
+    there = RoboClawBoard(inductance=0.05)
+    peer.answer(simulated(there, 0.005))  # 10 ms for a write and a question
+    made = board(port)
+    made.set_up()
+    low = 0
+    for at in range(300):
+        give(made, *((4.0, -4.0) if at // 20 % 2 else (-4.0, 4.0)))
+        made.poll()
+        low += max(abs(current) for current in made.currents) < 2.0
+        assert made.warnings == ()
+    assert low > 30  # a few measurements in a row did fall short
 
 
 def test_a_port_is_locked(peer, port):

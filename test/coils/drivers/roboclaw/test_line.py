@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.drivers.roboclaw import board as board_module
+from magnetosuture_thread.coils.drivers.roboclaw import line as line_module
+from magnetosuture_thread.coils.drivers.roboclaw.driver import CLOSING
 from magnetosuture_thread.coils.drivers.roboclaw.line import LineThread
-from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox
-from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError
+from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox, Report
+from magnetosuture_thread.coils.drivers.roboclaw.port import ANSWER_TIMEOUT, DeviceError
+from magnetosuture_thread.coils.drivers.roboclaw.rules import Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 
@@ -53,3 +64,123 @@ def test_a_board_that_never_hears_keeps_nobody():
     boards = Stub(deaf=float("inf")), Stub()
     left(*boards)
     assert boards[1].requests == 1
+
+
+class Clock:
+    """A clock of the test's own, by which nothing takes time but what says so."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        self.slept: list[float] = []
+        stub = SimpleNamespace(monotonic=lambda: self.now, sleep=self._sleep)
+        for module in (board_module, line_module):
+            patch.setattr(module, "time", stub)
+
+    def _sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+class DeadPort:
+    """A port where nobody answers, which each exchange waits for; tells how many there were."""
+
+    name, baudrate, is_open = "/dev/none", 115200, True
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.answer = bytearray()
+        self.exchanges = 0
+
+    def begin(self) -> None:
+        """Begin an exchange."""
+        self.exchanges += 1
+        self._clock.now += ANSWER_TIMEOUT
+
+    def write(self, data: bytes) -> int:
+        """Take bytes."""
+        return len(data)
+
+    def read(self, size: int) -> bytes:
+        """Return nothing."""
+        return b""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    flushInput = reset_output_buffer = close  # noqa: N815
+
+
+def connected(clock: Clock, *boards: int, ends: bool = False) -> tuple[LineThread, DeadPort]:
+    """Return a line that has tried to connect, and its port."""
+    line = LineThread(0, "/dev/none", {n: 128 + n for n in boards}, CoilBridgeSettings(), Mailbox(4, [""], 0.1))
+    port = DeadPort(clock)
+    if ends:
+        line.end()
+    with pytest.raises(DeviceError, match=r"board 0 .*: no valid answer to ReadVersion"):
+        vars(LineThread)["_connect"](line, port)
+    return line, port
+
+
+def test_a_line_that_is_ended_tries_nothing_twice(monkeypatch):
+    clock = Clock(monkeypatch)
+    assert connected(clock, 0, 1)[1].exchanges == 2
+    assert clock.slept == [board_module.QUIET]
+    assert connected(clock, 0, 1, ends=True)[1].exchanges == 1
+    assert clock.slept == [board_module.QUIET]
+
+
+@pytest.mark.parametrize("boards", [(0,), (0, 1)])
+def test_boards_that_are_left_are_asked_for_zero_without_a_break(monkeypatch, boards: tuple[int, ...]):
+    clock = Clock(monkeypatch)
+    line, port = connected(clock, *boards)
+    clock.slept.clear()
+    began, before = clock.now, port.exchanges
+    vars(LineThread)["_leave"](line, port)
+    assert clock.slept == []  # nor is one tried twice before the other one's turn
+    assert port.exchanges - before == round(line_module.LEAVING / ANSWER_TIMEOUT)
+    assert clock.now - began < CLOSING - 2.0 * ANSWER_TIMEOUT  # which the exchange may take that goes on when it ends
+
+
+class Hearing:
+    """A board that tells what it is asked for, at each of two attempts."""
+
+    voltage, currents, warnings = 24.0, (0.0, 0.0), ()
+
+    def __init__(self, between: Callable[[], Any]) -> None:
+        self.asked: list[list[float] | None] = []
+        self._between = between
+
+    def write(self, newest: Callable[[], Vector | None]) -> None:
+        """Take currents twice."""
+        for _ in range(2):
+            currents = newest()
+            self.asked.append(None if currents is None else currents.tolist())
+            self._between()
+
+    def poll(self) -> None:
+        """Do nothing."""
+
+
+@pytest.mark.parametrize(("stop", "then"), [("zeros", [0.0, 0.0]), ("loss", None)])
+def test_every_attempt_at_every_board_takes_what_is_newest(stop: str, then: list[float] | None):
+    mailbox = Mailbox(4, ["", ""], 60.0)
+    line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), mailbox)
+    now = line_module.time.monotonic()
+    for number in (0, 1):
+        mailbox.ready(number, Report({}, {}, ()))
+    mailbox.put(np.array([1.0, 2.0, 3.0, 4.0]), now)
+    stops = {"zeros": lambda: mailbox.put(np.zeros(4), now), "loss": lambda: mailbox.lost(1, "gone")}
+    first, second = Hearing(stops[stop]), Hearing(line.end)
+    vars(line)["_boards"] = {0: first, 1: second}
+    vars(LineThread)["_serve"](line)
+    assert first.asked == [[1.0, 2.0], then]
+    assert second.asked == [then, then]
+
+
+def test_each_board_has_its_own_two_coils(monkeypatch):
+    line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), Mailbox(4, [""], 60.0))
+    vars(line)["_mailbox"].put(np.array([1.0, 2.0, 3.0, 4.0]), line_module.time.monotonic())
+    boards = Hearing(lambda: None), Hearing(line.end)
+    vars(line)["_boards"] = dict(enumerate(boards))
+    vars(LineThread)["_serve"](line)
+    assert [board.asked[0] for board in boards] == [[1.0, 2.0], [3.0, 4.0]]

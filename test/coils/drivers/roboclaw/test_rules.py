@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -25,13 +27,38 @@ def test_pauses_double_up_to_two_seconds():
     ],
 )
 def test_a_duty_is_the_share_of_the_supply(current: float, resistance: float, voltage: float, duty: int, short: bool):
-    assert rules.duties(np.array([current]), resistance, voltage) == ((duty,), short)
+    assert rules.duties(np.array([current]), np.array([resistance]), voltage) == ((duty,), short)
+
+
+def test_each_coil_has_a_resistance_of_its_own():
+    found = rules.duties(np.array([3.0, 3.0]), np.array([1.0, 2.0]), 24.0)
+    assert found == ((4095, 8191), False)
+    assert rules.settled(found[0], np.array([1.0, 2.0]), 24.0) == pytest.approx((3.0, 3.0), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("due", "measured", "expected"),
+    [
+        (4.0, 0.0, True),
+        (-4.0, 1.99, True),
+        (4.0, -1.99, True),
+        (4.0, 2.01, False),
+        (0.51, 0.0, True),
+        (0.49, 0.0, False),
+    ],
+)
+def test_a_current_falls_short_below_half_of_what_is_due(due: float, measured: float, expected: bool):
+    assert rules.falls_short(due, measured) is expected
 
 
 def test_every_question_is_asked_and_duties_most_of_all():
     assert set(rules.ROUND) == set(Question)
     assert rules.ROUND[0] is Question.DUTIES
-    assert rules.ROUND.count(Question.DUTIES) == 2
+    counts = Counter(rules.ROUND)
+    assert counts[Question.DUTIES] == counts[Question.CURRENTS] == max(counts.values())
+    assert all(counts[setting] == 1 for setting in rules.SET)
+    # With two boards on a line and a question each 20 ms, each comes within about a second.
+    assert 2 * 0.02 * len(rules.ROUND) < 1.0
 
 
 @pytest.mark.parametrize(
