@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -165,7 +166,7 @@ class Hearing:
 def test_every_attempt_at_every_board_takes_what_is_newest(stop: str, then: list[float] | None):
     mailbox = Mailbox(4, ["", ""], 60.0)
     line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), mailbox)
-    now = line_module.time.monotonic()
+    now = time.monotonic()
     for number in (0, 1):
         mailbox.ready(number, Report({}, {}, ()))
     mailbox.put(np.array([1.0, 2.0, 3.0, 4.0]), now)
@@ -179,7 +180,7 @@ def test_every_attempt_at_every_board_takes_what_is_newest(stop: str, then: list
 
 def test_each_board_has_its_own_two_coils(monkeypatch):
     line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), Mailbox(4, [""], 60.0))
-    vars(line)["_mailbox"].put(np.array([1.0, 2.0, 3.0, 4.0]), line_module.time.monotonic())
+    vars(line)["_mailbox"].put(np.array([1.0, 2.0, 3.0, 4.0]), time.monotonic())
     boards = Hearing(lambda: None), Hearing(line.end)
     vars(line)["_boards"] = dict(enumerate(boards))
     vars(LineThread)["_serve"](line)
