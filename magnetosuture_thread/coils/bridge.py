@@ -18,6 +18,7 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 Vector = NDArray[np.float64]
 
+AHEAD = 2.0  # periods that a command and a pose must still be good for: one to the next step, one to the boards
 LONGEST = 2.0  # periods that velocity and currents may change over in one step, however late it comes
 CORRECTIONS = 4  # of what the coils add to a velocity that leads towards the wall
 BLOCKED = "the coils would pull the needle to the wall or an obstacle"
@@ -142,11 +143,11 @@ class Bridge:
     def _why_not(self, now: float, arrival: float) -> tuple[tuple[str, ...], Pose | None]:
         """Return all that speaks against a current until the next step, and the pose if there is a good one."""
         pose = self.needle.pose(now, arrival)
-        # What would end before the next step ends now: no current outlives what it is for.
-        period = 1.0 / self._settings.rate
-        ahead = (now + period, arrival + period)
+        # What would end before the next step has reached the boards ends now: no current outlives what it is for.
+        ahead = AHEAD / self._settings.rate
+        then = (now + ahead, arrival + ahead)
         blocked = BLOCKED if arrival - self._blocked < BLOCKED_FOR else ""
-        reasons = (self.latch.holds, self.gate.closed(*ahead), self.needle.lost(*ahead), blocked)
+        reasons = (self.latch.holds, self.gate.closed(*then), self.needle.lost(*then), blocked)
         return tuple(reason for reason in reasons if reason), pose
 
     def _rest(self, now: float, arrival: float, reasons: tuple[str, ...]) -> Outcome:

@@ -20,6 +20,7 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
 
 INSIDE = 0.9  # of the distance to the coils
+FEWEST = 4.0  # periods of the loop in a timeout; two of them are given away so that no current outlives it
 
 
 @dataclass(frozen=True)
@@ -236,6 +237,10 @@ class CoilBridgeSettings(Configuration):
         if self.autostart == "armed" and self.driver == "roboclaw":
             name = f"{self.GROUP}.autostart"
             raise ConfigurationError(name, self.autostart, "active at most: hardware is armed by a person")
+        for name in ("command_timeout", "pose_timeout"):
+            if getattr(self, name) * self.rate < FEWEST:
+                expected = f"at least {FEWEST / self.rate:g} s, {FEWEST:g} periods of the loop"
+                raise ConfigurationError(f"{self.GROUP}.{name}", getattr(self, name), expected)
         # One step may not take more than all that is left of the clearance.
         if self.approach_rate > self.rate:
             name = f"{self.GROUP}.approach_rate"

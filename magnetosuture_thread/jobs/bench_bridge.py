@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SETUP = "petri_35mm_polyamide"
 BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
 MOVING = 0.3  # s for which the coils must be driven before something is killed
+ATTEMPTS = 7  # to arm
 HEARD = 10.0  # s for a process to start and to be heard
 PATIENCE = 30.0  # s for anything to happen
 LOOP = 12.0  # s over which the loop's period is looked at; the bridge keeps the last 2000 intervals
@@ -43,7 +44,7 @@ class BridgeBench:
     Args:
         stage: the boards.
         nodes: the processes.
-        client: for the bridge's switches.
+        client: makes one for the bridge's switches.
         logs: folder of what the processes print.
         bound: the command's timeout and one period of the loop [s].
 
@@ -51,7 +52,9 @@ class BridgeBench:
         unheard: how often nobody who was started after a kill was heard, until the bridge was started anew.
     """
 
-    def __init__(self, stage: PowerStage, nodes: NodeProcesses, client: CoilClient, logs: Path, bound: float) -> None:
+    def __init__(
+        self, stage: PowerStage, nodes: NodeProcesses, client: Callable[[], CoilClient], logs: Path, bound: float
+    ) -> None:
         self._watch = DriveWatch(stage)
         self._nodes = nodes
         self._client = client
@@ -137,15 +140,21 @@ class BridgeBench:
             self._wait(self._driven_for_a_while, "the coils to be driven")
 
     def _arm(self) -> None:
-        deadline = time.monotonic() + PATIENCE
-        while True:
+        """Arm the bridge; start it anew where it is not heard."""
+        for attempt in range(ATTEMPTS):
             try:
-                self._client.do("arm")
+                # Another each time: the one that is not heard may be the client.
+                with self._client() as client:
+                    client.do("arm")
                 return
             except GraphError as error:
                 self._nodes.check()
-                if time.monotonic() > deadline:
+                if attempt == ATTEMPTS - 1:
                     raise GraphError(f"the bridge cannot be armed: {error}") from None
+                if attempt % 2:
+                    self.unheard += 1
+                    self._nodes.kill("coil_bridge")
+                    self._nodes.start("coil_bridge")
 
     def _driven(self) -> bool:
         self._watch.look()
@@ -162,7 +171,8 @@ class BridgeBench:
 
     def _check(self, deadline: float, what: str = "the trials") -> None:
         if time.monotonic() > deadline:
-            raise GraphError(f"waited in vain for {what}; the bridge says: {self._client.state()}")
+            with self._client() as client:
+                raise GraphError(f"waited in vain for {what}; the bridge says: {client.state()}")
 
 
 def bench_bridge(
@@ -207,20 +217,22 @@ def bench_bridge(
             with (
                 environment_of(environment),
                 NodeProcesses((), arguments, environment, folder / "logs") as nodes,
-                CoilClient() as client,
                 _load(busy),
             ):
                 bound = settings.command_timeout + 1.0 / settings.rate
-                bench = BridgeBench(stage, nodes, client, folder / "logs", bound)
+                bench = BridgeBench(stage, nodes, CoilClient, folder / "logs", bound)
                 bench.start("coil_bridge")
                 bench.start("tracker")
                 say(f"{trials} times a commander that falls silent")
                 delays = [bench.stop_trials(trials, progress)]
-                loop, scheduling = client.loop()
+                say(delays[-1].words)
+                with CoilClient() as client:
+                    loop, scheduling = client.loop()
                 bench.start("commander")
                 for victim in ("commander", "tracker", "coil_bridge"):
                     say(f"{kills} times kill -9 of the {victim}")
                     delays.append(bench.kills(victim, kills, progress))
+                    say(delays[-1].words)
                 say(f"{hostile} hostile messages")
                 nodes.kill("commander")
                 nodes.kill("tracker")

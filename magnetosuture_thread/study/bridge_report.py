@@ -39,6 +39,12 @@ class Delays:
         middle, high, most = np.percentile(found, [50.0, 99.0, 100.0])
         return cls(event, len(found), float(middle), float(high), float(most), bound, int(np.sum(found > bound)))
 
+    @property
+    def words(self) -> str:
+        """The figures in a line for a person."""
+        median, p99, greatest = (f"{1e3 * value:.1f}" for value in (self.median, self.p99, self.greatest))
+        return f"  {self.event}: median {median}, 99th percentile {p99}, greatest {greatest} ms ({self.count} times)"
+
 
 @dataclass(frozen=True)
 class BridgeReport:

@@ -117,7 +117,7 @@ def test_source_timeout_and_time_to_stop(timeout: float):
     plant.velocity, last = None, plant.bridge.gate.stamp
     outcomes = plant.run(1.0)
     assert outcomes[-1].reasons == (f"no command for {timeout:g} s",)
-    assert timeout - 2 * PERIOD < stopped_after(plant, last) <= timeout + 1e-9
+    assert timeout - 3 * PERIOD < stopped_after(plant, last) <= timeout - PERIOD + 1e-9
 
 
 def test_a_lost_pose_stops_while_commands_go_on():
@@ -125,7 +125,7 @@ def test_a_lost_pose_stops_while_commands_go_on():
     plant.run(0.5)
     plant.tail, last = None, plant.time
     assert plant.run(1.0)[-1].reasons == ("no needle pose for 0.2 s",)
-    assert stopped_after(plant, last) <= 0.2 + 1e-9
+    assert stopped_after(plant, last) <= 0.2 - PERIOD + 1e-9
 
 
 @pytest.mark.parametrize("lost", ["velocity", "tail"])
@@ -360,6 +360,8 @@ def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: p
     "change",
     [
         {"command_timeout": 0.0},
+        {"command_timeout": 0.015},
+        {"rate": 10.0},
         {"pose_timeout": 0.0},
         {"max_speed": 0.0},
         {"max_current": float("nan")},
