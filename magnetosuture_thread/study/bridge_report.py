@@ -77,19 +77,19 @@ class BridgeReport:
 
 def bridge_table(report: BridgeReport) -> Table:
     """Return the figures as a table that fits 80 columns."""
-    table = Table(title="coil bridge, simulated boards, all cores busy", title_justify="left", title_style="bold")
-    table.caption = f"zero: the duties of all boards; loop at {report.rate:g} Hz, {report.scheduling}"
-    table.caption_justify = "left"
+    title = "coil bridge with simulated boards, all cores busy; times in ms"
+    table = Table(title=title, title_justify="left", title_style="bold", caption_justify="left")
+    table.caption = f"zero: of the duties of all boards; loop at {report.rate:g} Hz, {report.scheduling}"
     table.add_column("", no_wrap=True)
     for name in ("median", "p99", "greatest", "bound", "beyond"):
         table.add_column(name, justify="right", no_wrap=True)
     for each in report.delays:
         values = (each.median, each.p99, each.greatest, each.bound)
-        table.add_row(each.event, *(f"{1e3 * value:.1f} ms" for value in values), f"{each.beyond} of {each.count}")
-    table.add_row("loop off its period", *(f"{value:.2f} ms" for value in report.loop), "2.00 ms", "")
+        table.add_row(each.event, *(f"{1e3 * value:.1f}" for value in values), f"{each.beyond} of {each.count}")
+    table.add_row("loop off its period", *(f"{value:.2f}" for value in report.loop), "", "")
     table.add_section()
-    found = f"{report.greatest_current:.2f} A"
-    table.add_row(f"{report.hostile} hostile messages", "", "", found, f"{report.max_current:.2f} A", "works after")
+    found, limit = f"{report.greatest_current:.2f} A", f"{report.max_current:.2f} A"
+    table.add_row(f"{report.hostile} hostile messages", "", "", found, limit, "it lives")
     kills = sum(each.count for each in report.delays[1:])
-    table.add_row("started after a kill and not heard", "", "", "", "", f"{report.unheard} of {kills}")
+    table.add_row("started after a kill, unheard", "", "", "", "", f"{report.unheard} of {kills}")
     return table
