@@ -90,7 +90,7 @@ class BridgeBench:
             progress(len(delays) / trials)
             self._check(deadline)
         self._nodes.kill("commander")
-        return Delays.of("last command to zero", delays[:trials], self._bound)
+        return Delays.of("last command", delays[:trials], self._bound)
 
     def kills(self, name: str, times: int, progress: Callable[[float], None]) -> Delays:
         """Kill a process again and again while the coils are driven; return the times to zero."""
@@ -103,7 +103,7 @@ class BridgeBench:
             delays += self._watch.to_zero([began])
             progress((done + 1) / times)
             self.start(name)
-        return Delays.of(f"kill -9 of {name} to zero", delays, 0.25)
+        return Delays.of(f"kill -9 of {name}", delays, 0.25)
 
     def vandalism(self, count: int) -> float:
         """Publish hostile messages and see that the bridge works afterwards.

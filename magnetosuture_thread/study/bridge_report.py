@@ -85,11 +85,11 @@ def bridge_table(report: BridgeReport) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     for each in report.delays:
         values = (each.median, each.p99, each.greatest, each.bound)
-        table.add_row(each.event, *(f"{1e3 * value:.1f}" for value in values), f"{each.beyond} of {each.count}")
+        table.add_row(each.event, *(f"{1e3 * value:.1f}" for value in values), f"{each.beyond}/{each.count}")
     table.add_row("loop off its period", *(f"{value:.2f}" for value in report.loop), "", "")
     table.add_section()
     found, limit = f"{report.greatest_current:.2f} A", f"{report.max_current:.2f} A"
-    table.add_row(f"{report.hostile} hostile messages", "", "", found, limit, "it lives")
+    table.add_row(f"{report.hostile} hostile messages", "", "", found, limit, "alive")
     kills = sum(each.count for each in report.delays[1:])
-    table.add_row("started after a kill, unheard", "", "", "", "", f"{report.unheard} of {kills}")
+    table.add_row("unheard after a kill", "", "", "", "", f"{report.unheard}/{kills}")
     return table

@@ -22,5 +22,5 @@ def test_the_table_says_what_is_beyond_its_bound():
     assert delays.greatest == pytest.approx(0.3)
     report = BridgeReport((delays,), (0.01, 0.5, 7.0), "ordinary", 200.0, 10, 9.9, 10.0, 0)
     table = bridge_table(report)
-    assert next(iter(table.columns[5].cells)) == "1 of 3"
-    assert "0 of 0" in list(table.columns[5].cells)
+    assert next(iter(table.columns[5].cells)) == "1/3"
+    assert "0/0" in list(table.columns[5].cells)
