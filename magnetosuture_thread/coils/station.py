@@ -29,6 +29,7 @@ class CoilStation:
 
     def __init__(self) -> None:
         self.latch = ArmingLatch()
+        Bridge(CoilBridgeSettings(), self.latch)  # loads its kernels: no step and no transition waits for a compiler
         self.bridge: Bridge | None = None
         self.driver: CoilDriver | None = None
         self.outcome: Outcome | None = None

@@ -16,7 +16,7 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NODES, TRUE_THREAD, Channel
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
+from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE, SLOWER_BRIDGE
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.currents import CurrentSeries
 from magnetosuture_thread.study.picture import draw_summary
@@ -33,7 +33,7 @@ from magnetosuture_thread.vision.tracker import VisionTracker
 
 DEFAULT_SETUP = "petri_35mm_polyamide"
 # A replayed bag never moves a needle, so its bridge may arm itself.
-NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed")
+NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE)
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
 Times = dict[str, dict[int, float]]

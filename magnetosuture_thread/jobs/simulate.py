@@ -32,6 +32,8 @@ PATIENCE = 3.0  # times the path's own duration, and ...
 SPARE = 20.0  # s of simulated time besides: then a run that never ends is ended
 LOOK = 0.02  # s between two looks at the nodes
 
+# Where two cores carry the whole graph and a recording besides, the bridge leaves them more of it.
+SLOWER_BRIDGE = ("-p", "coil_bridge:rate:=100.0")
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
 
 Say = Callable[[str], None]
@@ -122,7 +124,7 @@ def _run(
     )
     from magnetosuture_thread.nodes.recorder import Recorder
 
-    arguments = ["--params-file", str(setup.path.resolve())]
+    arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE]
     if pace is not None:
         arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:pace:={float(pace)}"]
     notes = {

@@ -30,7 +30,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__("coil_bridge", CoilBridgeSettings, **options)
         self.station = CoilStation()
-        self._stamp: Any = None  # of a good command that has not gone to the coils yet
+        self._stamp: Any = None  # of the last good command
         self._resumes = False  # whether a reset makes it active again
         # A clock of its own for the watchdog: simulated time may stand still, the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -97,7 +97,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             self._report.refuse(error)
 
     def on_command(self, message: TwistStamped, number: int) -> None:
-        """Take a velocity command, for the next currents."""
+        """Take a velocity command, and follow it at once."""
         if self.station.bridge is None:
             return
         try:
@@ -107,6 +107,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             self._report.refuse(error)
         else:
             self._stamp = message.header.stamp
+            self._step()
 
     def on_watchdog(self) -> None:
         """Ask the coils for what the last good command and pose amount to now."""
@@ -132,7 +133,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         outcome = self.station.step(*self._times())
         if outcome is not None and outcome.publish:
             self._report.applied(None if outcome.reasons else self._stamp, outcome)
-            self._stamp = None
         self._report.state(anyway=False)
 
     def _times(self) -> tuple[float, float]:

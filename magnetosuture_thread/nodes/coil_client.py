@@ -21,7 +21,7 @@ from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_report import LOOP, SCHEDULING
 
-TIMEOUT = 5.0  # s for the bridge to be found and to answer
+TIMEOUT = 10.0  # s for the bridge to be found and to answer
 SETTLE = 0.15  # s after an answer, in which the bridge says its new state
 
 TRANSITIONS = {

@@ -6,6 +6,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped, Vector3
 from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents
+from rclpy.serialization import deserialize_message
 
 from magnetosuture_thread.coils.bridge import Outcome
 from magnetosuture_thread.coils.drivers import DriverState
@@ -36,14 +37,15 @@ def command_velocity(message: TwistStamped) -> np.ndarray:
     return np.array([linear.x, linear.y])
 
 
-def currents_message(stamp: Time, outcome: Outcome) -> CoilCurrents:
-    """Return applied coil currents, and why they are zero, if they are a stop."""
+def currents_message(stamp: Time, command: Time | None, outcome: Outcome) -> CoilCurrents:
+    """Return coil currents with the stamp of the command that they follow, or why they are zero."""
     return CoilCurrents(
         header=header(stamp),
         coil=list(outcome.coils),
         current=outcome.allocation.currents.tolist(),
         stop="; ".join(outcome.reasons),
         saturated=outcome.allocation.saturated,
+        command=command or Time(),
     )
 
 
@@ -85,3 +87,9 @@ def state_message(stamp: Time, station: CoilStation, driver: DriverState, refuse
 
 def _vector(velocity: np.ndarray) -> Vector3:
     return Vector3(x=float(velocity[0]), y=float(velocity[1]))
+
+
+def command_stamp(data: bytes) -> int | None:
+    """Return the stamp of the command that serialised currents follow [ns]; None if they follow none."""
+    command = deserialize_message(data, CoilCurrents).command
+    return (command.sec * 1_000_000_000 + command.nanosec) or None

@@ -58,10 +58,10 @@ class CoilReport:
         self._refused += 1
         self._health.refuse(problem)
 
-    def applied(self, stamp: Time | None, outcome: Outcome) -> None:
-        """Say what the coils were told; `stamp` is that of the command if this is its first use, else None."""
-        stamp = stamp or self._node.get_clock().now().to_msg()
-        self._currents.publish(coil_messages.currents_message(stamp, outcome))
+    def applied(self, command: Time | None, outcome: Outcome) -> None:
+        """Say what the coils were told; `command` is the stamp of the command that they follow, if they do."""
+        stamp = self._node.get_clock().now().to_msg()
+        self._currents.publish(coil_messages.currents_message(stamp, command, outcome))
         self._setpoints.publish(messages.twist_message(stamp, outcome.allocation.velocity))
 
     def state(self, *, anyway: bool) -> None:

@@ -17,8 +17,9 @@ from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, DIAGNOSTICS, NODES
+from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, CURRENTS, DIAGNOSTICS, NODES
 from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes.coil_messages import command_stamp
 
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
 START_TIMEOUT = 180.0  # s for all nodes to be there
@@ -57,7 +58,7 @@ class LiveReplay:
 
     Attributes:
         published: of each input topic, when the message of a stamp was published [s].
-        arrived: of each output topic, when the first message of a stamp arrived [s].
+        arrived: of each output topic, when the first message of a stamp arrived [s]; of currents, of a command's stamp.
     """
 
     def __init__(
@@ -202,7 +203,7 @@ class LiveReplay:
         def take(data: bytes, info: dict[str, int]) -> None:
             now = time.perf_counter()
             self._taken += 1
-            stamp = messages.header_stamp(data)
+            stamp = command_stamp(data) if topic.channel is CURRENTS else messages.header_stamp(data)
             if stamp is not None:
                 # When it reached this process: how long it waited here for its turn is not the graph's delay.
                 self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)

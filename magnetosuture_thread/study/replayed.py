@@ -189,7 +189,7 @@ class Collector:
         stamp = message.header.stamp if hasattr(message, "header") else None
         time = stamp.sec * 1_000_000_000 + stamp.nanosec if stamp is not None else 0
         if topic == CURRENTS.recorded and not message.stop:
-            self.driven.add(time)
+            self.driven.add(message.command.sec * 1_000_000_000 + message.command.nanosec)
         if taker is not None:
             taker(self._instants.setdefault(time, Instant(time)), message)
 

@@ -100,7 +100,7 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
     currents, setpoints = graph.listen(topics.CURRENTS), graph.listen(topics.NEEDLE_SETPOINT)
     states = graph.listen(topics.BRIDGE_STATE)
     asked = drive(graph)
-    graph.wait(lambda: any(m.header.stamp == asked.header.stamp for m in currents), "currents for the command")
+    graph.wait(lambda: any(m.command == asked.header.stamp for m in currents), "currents for the command")
     expected = CoilBridgeSettings().allocation().allocate(np.array([0.005, 0.0]), TAIL, EAST).currents
     assert expected[0] > 2.0
     graph.wait(lambda: np.allclose(applied(node)[-1], expected, atol=0.05), "the full currents")

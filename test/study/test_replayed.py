@@ -80,8 +80,8 @@ def test_messages_of_one_stamp_are_put_together():
 
 def test_a_command_counts_as_driven_only_if_it_was_followed():
     collector = Collector(length=1.0)
-    collector.take("/coils/currents", Message(header=header(5), stop=""))
-    collector.take("/coils/currents", Message(header=header(6), stop="no command for 0.2 s"))
+    collector.take("/coils/currents", Message(header=header(7), command=header(5).stamp, stop=""))
+    collector.take("/coils/currents", Message(header=header(8), command=header(6).stamp, stop="no command for 0.2 s"))
     assert collector.driven == {5}
 
 
