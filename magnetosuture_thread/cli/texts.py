@@ -39,7 +39,7 @@ time. Single thread, wall clock; the machine's other work shows in the 99th perc
 
 With --bridge, time the coil bridge instead: how long until the duties of two simulated RoboClaw boards, on
 pseudo-terminals, are zero, after a commander fell silent and after kill -9 of commander, tracker and bridge;
-how even its loop is; and what 10,000 hostile messages can do. Meanwhile all cores are kept busy. Takes ten
+how even its loop is; and what 10,000 hostile messages can do. Meanwhile all cores are kept busy. Takes nine
 minutes.
 """
 
@@ -79,8 +79,9 @@ Press a switch of the coil bridge that runs on this ROS domain, and show its sta
 
   state        show it
   arm, disarm  let velocity commands pass from now on, or none
-  stop         emergency stop: zero at once, latched
-  reset        forget an emergency stop or a fault; the bridge stays disarmed
+  stop         emergency stop, latched; finding the bridge takes this command seconds: a button calls
+               the service coils/emergency_stop
+  reset        forget an emergency stop or a fault, once the driver is ready; the bridge stays disarmed
   configure, activate, deactivate, cleanup
                the lifecycle's transitions
 

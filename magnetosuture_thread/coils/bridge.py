@@ -122,7 +122,7 @@ class Bridge:
         if late > self._settings.command_timeout:
             self._forget()  # the driver has gone to zero by itself meanwhile
         elapsed = min(max(late, 0.0), LONGEST * period)
-        reasons, pose = self._why_not(now, arrival)
+        reasons, pose = self._why_not(now, arrival, driver)
         if reasons or pose is None:
             return self._rest(now, arrival, reasons)
         wanted = self.gate.velocity
@@ -140,14 +140,15 @@ class Bridge:
         self.needle.move(allocation.velocity, now)
         return Outcome(self.coils, allocation, wanted, velocity, (), True)
 
-    def _why_not(self, now: float, arrival: float) -> tuple[tuple[str, ...], Pose | None]:
+    def _why_not(self, now: float, arrival: float, driver: DriverState) -> tuple[tuple[str, ...], Pose | None]:
         """Return all that speaks against a current until the next step, and the pose if there is a good one."""
         pose = self.needle.pose(now, arrival)
         # What would end before the next step has reached the boards ends now: no current outlives what it is for.
         ahead = AHEAD / self._settings.rate
         then = (now + ahead, arrival + ahead)
         blocked = BLOCKED if arrival - self._blocked < BLOCKED_FOR else ""
-        reasons = (self.latch.holds, self.gate.closed(*then), self.needle.lost(*then), blocked)
+        unready = "" if driver.ready or self.latch.latched else f"driver: {driver.problem}"
+        reasons = (self.latch.holds, unready, self.gate.closed(*then), self.needle.lost(*then), blocked)
         return tuple(reason for reason in reasons if reason), pose
 
     def _rest(self, now: float, arrival: float, reasons: tuple[str, ...]) -> Outcome:

@@ -101,7 +101,8 @@ class CoilBridgeSettings(Configuration):
     )
 
     calibration: str = quantity(
-        "", "file of the coils' calibration; without one, coil_angles and the three parameters before it tell all"
+        "",
+        "file of the coils' calibration, from the working directory; it replaces what the parameters say of the coils",
     )
     coil_model: str = quantity(
         "loops", "field of a coil: that of a loop, or of a dipole in its middle", choices=("loops", "dipoles")

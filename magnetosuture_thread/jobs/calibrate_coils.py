@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 import os
 import tempfile
 from dataclasses import replace
@@ -10,7 +11,9 @@ from pathlib import Path
 
 from magnetosuture_thread.coils.calibration_fit import CalibrationFit, fit_calibration
 from magnetosuture_thread.coils.measurements import read_measurements
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.errors import BagError, InvalidInputError
+
+STRONGEST = 1e-3  # T of a background; that of the earth is a twentieth of it
 
 
 def calibrate_coils(measurements: Path, output: Path, model: str = "loops", name: str = "") -> CalibrationFit:
@@ -26,8 +29,13 @@ def calibrate_coils(measurements: Path, output: Path, model: str = "loops", name
         InvalidInputError: the measurements cannot be used; the message says which and why.
         BagError: the file cannot be written.
     """
+    if output.exists() and output.samefile(measurements):
+        raise BagError(output, "holds the measurements; write the calibration to another file")
     fit = fit_calibration(read_measurements(measurements), model)
     x, y = fit.background
+    if math.hypot(x, y) > STRONGEST:
+        text = f"a background of {1e3 * math.hypot(x, y):.3g} mT"
+        raise InvalidInputError(str(measurements), text, f"at most {1e3 * STRONGEST:g} mT; are all fields in T?")
     notes = (
         f"from {fit.readings} readings in {measurements.name}, residual {fit.residual:.2e} T, "
         f"background {x:.2e}, {y:.2e} T"

@@ -21,6 +21,7 @@ from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.loop import LoopCollector, LoopSummary
 
 if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.coil_client import CoilClient
     from magnetosuture_thread.nodes.recorder import Recorder
 
 SCENARIO_NOTE = "scenario"  # of the bag, which holds the set-up's text
@@ -30,6 +31,8 @@ SETTLE = 1.0  # s for all nodes to have found each other
 AFTERWARDS = 0.5  # s that go on once the path is done
 PATIENCE = 3.0  # times the path's own duration, and ...
 SPARE = 20.0  # s of simulated time besides: then a run that never ends is ended
+PATIENT = 15.0  # s for simulated boards to be ready
+FAULT = "fault: "  # what a bridge says of itself that needs a reset
 LOOK = 0.02  # s between two looks at the nodes
 
 # Where two cores carry the whole graph and a recording besides, the bridge leaves them more of it.
@@ -169,8 +172,7 @@ def _run(
                     {topics.NEEDLE_COMMAND.name, topics.TIP_SETPOINT.name, topics.FAULT_REQUEST.name},
                 )
                 if boards:
-                    with CoilClient() as client:
-                        client.do("arm")
+                    _arm(CoilClient)
                 say("running" if pace is None else f"running at {pace:g} times the speed")
                 running = True
                 nodes.start("path_follower")
@@ -181,6 +183,18 @@ def _run(
                 return INTERRUPTED  # passed on once the bag is whole
             finally:
                 recorder.close()
+
+
+def _arm(make: type[CoilClient]) -> None:
+    """Arm the bridge as soon as its boards are ready."""
+    deadline = time.monotonic() + PATIENT
+    while True:
+        try:
+            with make() as client:
+                return client.do("arm")
+        except GraphError as error:
+            if time.monotonic() > deadline:
+                raise GraphError(f"the bridge cannot be armed: {error}") from None
 
 
 def _wired(folder: str, coils: int) -> list[str]:
@@ -232,6 +246,9 @@ def _follow(
         if duration is None and said == "done":
             recorder.spin(AFTERWARDS / pace)
             return ""
+        held = recorder.said.get("coil_bridge", ("", {}))[0]
+        if held.startswith(FAULT):
+            return f"coil_bridge: {held}"
         if elapsed > longest:
             states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.said.items()))
             return f"after {elapsed:.0f} s only {done:.0%} of the path is done; {states}"

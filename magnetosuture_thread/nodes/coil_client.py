@@ -22,6 +22,8 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_report import LOOP, SCHEDULING
 
 TIMEOUT = 10.0  # s for the bridge to be found and to answer
+FOUND = 0.5  # s after we have heard the bridge, for it to have found us
+AGAIN = 0.5  # s without an answer, after which a switch is pressed again
 SETTLE = 0.15  # s after an answer, in which the bridge says its new state
 
 TRANSITIONS = {
@@ -73,7 +75,7 @@ class CoilClient:
         if action in TRANSITIONS:
             transition = Transition(id=TRANSITIONS[action])
             answer = self._call(ChangeState, "coil_bridge/change_state", ChangeState.Request(transition=transition))
-            refusal = f"the bridge refuses to {action}; its log says why"
+            refusal = f"the bridge refuses to {action}: not possible in its state, or its log says why"
         elif action in ("arm", "disarm"):
             answer = self._call(SetBool, ARM, SetBool.Request(data=action == "arm"))
             refusal = answer.message
@@ -129,11 +131,19 @@ class CoilClient:
         self._spin(client.service_is_ready, TIMEOUT)
         if not client.service_is_ready():
             raise GraphError(f"no coil_bridge found within {TIMEOUT:g} s on this ROS domain (service {name})")
-        future = client.call_async(request)
-        self._spin(future.done, TIMEOUT)
-        if not future.done():
-            raise GraphError(f"coil_bridge did not answer within {TIMEOUT:g} s (service {name})")
-        return future.result()
+        deadline = time.monotonic() + TIMEOUT
+        once = kind is ChangeState
+        if once:
+            # We have found the bridge; it must have found us, or its answer goes nowhere.
+            self._spin(lambda: self._state is not None, TIMEOUT)
+            self._spin(lambda: False, FOUND)
+        while time.monotonic() < deadline:
+            # A switch does no harm if it is pressed again: nothing waits for an answer that got lost.
+            future = client.call_async(request)
+            self._spin(future.done, TIMEOUT if once else AGAIN)
+            if future.done():
+                return future.result()
+        raise GraphError(f"coil_bridge did not answer within {TIMEOUT:g} s (service {name})")
 
     def _spin(self, until: Callable[[], bool], longest: float) -> None:
         deadline = time.monotonic() + longest

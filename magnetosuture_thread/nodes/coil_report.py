@@ -9,10 +9,12 @@ from rclpy.clock import Clock
 from rclpy.node import Node
 
 from magnetosuture_thread.coils.bridge import Outcome
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.station import CoilStation
 from magnetosuture_thread.nodes import coil_messages, messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
 
+FAULT = "fault: "
 SCHEDULING = "scheduling"
 LOOP = tuple(f"loop off its period, {name} [ms]" for name in ("median", "99th percentile", "greatest"))
 TELLING = 0.1  # s between two messages of the state, where nothing changes
@@ -33,6 +35,7 @@ class CoilReport:
         self._health = Health(node)
         self._refused = 0
         self._told: object = None
+        self._logged = ""
         self._setpoints = topics.NEEDLE_SETPOINT.publisher(node)
         self._currents = topics.CURRENTS.publisher(node)
         self._states = topics.BRIDGE_STATE.publisher(node)
@@ -80,10 +83,13 @@ class CoilReport:
         )
         self._health.note(driver=station.driver_name, **{"driver problem": driver.problem or "none"})
         self._told = now
+        self._log(latch.condition.value if outcome else "unconfigured", driver)
         if latch.latched:
-            self._health.error(f"fault: {latch.latched}")
+            self._health.error(f"{FAULT}{latch.latched}")
         elif outcome is None:
             self._health.ok("unconfigured")
+        elif not driver.ready:
+            self._health.warn(f"{latch.holds or 'armed'}; driver: {driver.problem}")
         elif latch.holds:
             self._health.ok(latch.holds)
         elif reasons:
@@ -92,3 +98,12 @@ class CoilReport:
             self._health.warn(f"following commands; driver: {'; '.join(driver.warnings)}")
         else:
             self._health.ok("following commands")
+
+    def _log(self, condition: str, driver: DriverState) -> None:
+        """Log what a person would ask for after an incident, as it changes."""
+        latch = self._station.latch
+        text = f"{condition}{', armed' if latch.armed else ''}{f': {latch.latched}' if latch.latched else ''}"
+        text += f"; driver {self._station.driver_name}: {'ready' if driver.ready else driver.problem}"
+        if text != self._logged:
+            self._logged = text
+            self._node.get_logger().info(text)

@@ -11,6 +11,8 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.coils.calibration import read_calibration
 from magnetosuture_thread.coils.field import coils_around, make_coils
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.jobs.calibrate_coils import calibrate_coils
 
 ANGLES = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)
 
@@ -97,3 +99,17 @@ def test_a_folder_that_cannot_be_written_is_named(
     monkeypatch.setattr("tempfile.mkstemp", full)
     assert cli.main(["calibrate-coils", str(measurements), "--output", str(tmp_path / "rig.yaml")]) == 1
     assert "rig.yaml: cannot be written: No space left on device" in capsys.readouterr().err
+
+
+def test_the_measurements_are_not_written_over(tmp_path: Path):
+    path = probe(tmp_path)
+    before = path.read_text()
+    with pytest.raises(BagError, match="holds the measurements"):
+        calibrate_coils(path, path)
+    assert path.read_text() == before
+
+
+def test_a_background_far_above_the_earths_is_taken_for_a_wrong_unit(tmp_path: Path):
+    with pytest.raises(InvalidInputError, match="are all fields in T"):
+        calibrate_coils(probe(tmp_path, background=2e-3), tmp_path / "rig.yaml")
+    assert not (tmp_path / "rig.yaml").exists()
