@@ -47,6 +47,11 @@ class ArmingLatch:
         return "emergency stop" if self.emergency else self.fault
 
     @property
+    def waits(self) -> bool:
+        """Whether nothing but arming is missing."""
+        return self.active and not self.armed and not self.latched
+
+    @property
     def holds(self) -> str:
         """Say why no command may pass; empty if one may."""
         if self.latched:

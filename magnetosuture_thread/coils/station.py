@@ -106,7 +106,7 @@ class CoilStation:
         if self.bridge is None or self.driver is None:
             return None
         state = self.driver.state()
-        self._arms = self._arms and self.latch.holds == "disarmed"
+        self._arms = self._arms and self.latch.waits
         if self._arms and state.ready:
             self.arm(True)
         self.outcome = self.bridge.step(now, arrival, state)

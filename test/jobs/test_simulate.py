@@ -12,6 +12,7 @@ import cv2
 import pytest
 
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.cli import main
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.jobs.behaviour import behaviour
 from magnetosuture_thread.jobs.replay import replay
@@ -64,6 +65,20 @@ def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     assert summary.seen_share > 0.9
     assert any("this machine only" in line for line in said)
     assert shares[-1] == 1.0
+
+
+def test_a_run_whose_bridge_is_stopped_ends_and_says_so(scenario: Path, tmp_path: Path):
+    """The emergency stop is pressed from another process than the bridge's, as the run begins."""
+
+    def say(text: str) -> None:
+        if text == "running":
+            assert main(["coils", "stop"]) == 0
+
+    with pytest.raises(GraphError, match="coil_bridge: fault: emergency stop; what was recorded is in"):
+        simulate(str(scenario), tmp_path / "bag", say=say)
+    states = [record.decode() for record in Bag(tmp_path / "bag").records({"/coils/state"})]
+    assert states[-1].emergency_stopped
+    assert not any(states[-1].current)
 
 
 def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: Path, tmp_path: Path):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import serial
 
 from magnetosuture_thread.coils.drivers.roboclaw import board as board_module
 from magnetosuture_thread.coils.drivers.roboclaw import line as line_module
@@ -82,12 +83,12 @@ class Clock:
         self.now += seconds
 
 
-class DeadPort:
+class DeadPort(serial.Serial):
     """A port where nobody answers, which each exchange waits for; tells how many there were."""
 
-    name, baudrate, is_open = "/dev/none", 115200, True
-
     def __init__(self, clock: Clock) -> None:
+        super().__init__()  # of no device
+        self.is_open = True
         self._clock = clock
         self.answer = bytearray()
         self.exchanges = 0
@@ -97,18 +98,22 @@ class DeadPort:
         self.exchanges += 1
         self._clock.now += ANSWER_TIMEOUT
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: Any, /) -> int:
         """Take bytes."""
         return len(data)
 
-    def read(self, size: int) -> bytes:
+    def read(self, size: int = 1, /) -> bytes:
         """Return nothing."""
         return b""
 
-    def close(self) -> None:
-        """Do nothing."""
+    def reset_input_buffer(self) -> None:
+        """Have nothing to forget."""
 
-    flushInput = reset_output_buffer = close  # noqa: N815
+    def reset_output_buffer(self) -> None:
+        """Have nothing to forget."""
+
+    def close(self) -> None:
+        """Have nothing to close."""
 
 
 def connected(clock: Clock, *boards: int, ends: bool = False) -> tuple[LineThread, DeadPort]:
