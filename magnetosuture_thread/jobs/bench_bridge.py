@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import yaml
 
+from magnetosuture_thread.coils.sources import SILENCE
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
 from magnetosuture_thread.rig.power.watch import DriveWatch
@@ -114,6 +115,9 @@ class BridgeBench:
         Raises:
             GraphError: it does not.
         """
+        # While the bridge still counts those that were killed as speaking, it would refuse all without looking.
+        self._wait(lambda: not self._driven(), "zero")
+        time.sleep(2.0 * SILENCE)
         self._watch.forget()
         self.start("vandal", count=count)
         self._wait(lambda: self._nodes.ended("vandal"), "the vandal to end", PATIENCE + count / 200.0)

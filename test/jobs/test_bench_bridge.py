@@ -9,7 +9,7 @@ from magnetosuture_thread.study.bridge_report import BridgeReport, Delays, bridg
 
 
 def test_whatever_falls_silent_or_is_killed_the_boards_go_to_zero_and_work_again():
-    report = bench_bridge(trials=2, kills=1, hostile=500, busy=False)
+    report = bench_bridge(trials=2, kills=1, hostile=3000, busy=False)
     assert [each.count > 0 for each in report.delays] == [True] * 4
     assert max(each.greatest for each in report.delays) < 5.0
     assert 0.0 < report.greatest_current <= report.max_current
