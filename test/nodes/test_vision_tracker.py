@@ -120,7 +120,7 @@ def test_a_camera_that_falls_silent_is_noticed(graph, camera, thread_arc):
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
-    graph.wait(lambda: tracking[-1].reason.startswith("no camera frame for"), "the silence")
+    graph.wait(lambda: bool(tracking) and tracking[-1].reason.startswith("no camera frame for"), "the silence")
     assert tracking[-1].state == TrackerState.STATE_LOST
     graph.wait(lambda: any(text.startswith("no camera frame for") for text in states(diagnostics)), "a warning")
     assert len(poses) == 1
