@@ -24,7 +24,7 @@ from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power.process import StageProcess
 
 LARGEST_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
 
@@ -208,11 +208,11 @@ class RigSettings(Configuration):
         ]
         return CoilField(coils)
 
-    def power(self) -> PowerStage | None:
+    def power(self) -> StageProcess | None:
         """Return the simulated boards, None where currents come as messages."""
         if self.power_stage == "topic":
             return None
-        return PowerStage(self.power_stage_ports, self.supply_voltage, self.coil_resistance, self.coil_inductance)
+        return StageProcess(self.power_stage_ports, self.supply_voltage, self.coil_resistance, self.coil_inductance)
 
     def dynamics(self) -> RigDynamics:
         """Return needle and thread at their start, in the field of the coils."""

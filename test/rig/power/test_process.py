@@ -1,0 +1,88 @@
+"""Simulated boards in a process of their own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.rig.power.packets import ACKNOWLEDGED, SET_DUTIES, checksum
+from magnetosuture_thread.rig.power.process import StageProcess
+
+HALF_AND_BACK = bytes((128, SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))  # of the supply: a half, and a quarter reversed
+RIG = """
+import sys, time
+from magnetosuture_thread.rig.power.process import StageProcess
+StageProcess([sys.argv[1]], 24.0, 1.0, 0.01).open()
+print("open", flush=True)
+time.sleep(60.0)
+"""
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[StageProcess]:
+    """Two boards, open."""
+    made = StageProcess([str(tmp_path / "a"), str(tmp_path / "b")], 24.0, 1.0, 0.01)
+    made.open()
+    yield made
+    made.close()
+
+
+def wait(condition: Callable[[], bool], what: str) -> None:
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline, f"waited 10 s for {what}"
+        time.sleep(0.005)
+
+
+def test_boards_elsewhere_are_written_to_here_and_their_currents_read(stage, tmp_path):
+    assert stage.currents() == pytest.approx(4 * [0.0])
+    device = os.open(tmp_path / "b", os.O_RDWR | os.O_NOCTTY)
+    try:
+        os.write(device, HALF_AND_BACK + checksum(HALF_AND_BACK).to_bytes(2, "big"))
+        assert os.read(device, 1) == ACKNOWLEDGED
+        wait(lambda: stage.currents() == pytest.approx([0.0, 0.0, 12.0, -6.0], abs=0.05), "the currents")
+    finally:
+        os.close(device)
+    stage.close()
+    stage.close()
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_is_for_the_rig(stage):
+    assert os.getsid(stage.pid) == stage.pid != os.getsid(0)
+
+
+def test_a_path_that_cannot_be_used_is_said_here(tmp_path):
+    stage = StageProcess([str(tmp_path / "nowhere" / "a")], 24.0, 1.0, 0.01)
+    with pytest.raises(ConfigurationError, match=r"power_stage_ports: .*nowhere.*No such file"):
+        stage.open()
+    with pytest.raises(GraphError, match="are not open"):
+        stage.currents()
+
+
+def test_boards_that_died_have_no_current(stage):
+    os.kill(stage.pid, signal.SIGKILL)
+    os.waitid(os.P_PID, stage.pid, os.WEXITED | os.WNOWAIT)
+    with pytest.raises(GraphError, match=r"simulated boards ended \(exit code -9\)"):
+        stage.currents()
+
+
+def test_boards_go_with_a_rig_that_is_killed(tmp_path):
+    rig = subprocess.Popen([sys.executable, "-c", RIG, tmp_path / "a"], stdout=subprocess.PIPE)
+    try:
+        assert rig.stdout is not None
+        assert rig.stdout.readline() == b"open\n"
+        assert (tmp_path / "a").is_symlink()
+    finally:
+        rig.kill()
+        rig.communicate()
+    wait(lambda: not list(tmp_path.iterdir()), "the boards to be taken away")
