@@ -50,14 +50,20 @@ class ExchangePort(serial.Serial):
     def read(self, size: int = 1, /) -> bytes:
         """Send the packet if it has not been sent, and return up to `size` bytes of the answer.
 
-        An exchange, however many reads it has, takes at most twice the time that a board has for an answer.
+        The board's time begins when the packet is out, and an exchange, however many reads it has, waits for at
+        most twice that. What has come is taken even if this thread was held up and comes late for it: rclpy may
+        keep the interpreter to itself for longer than a board has, and that is no fault of the board's. For the
+        same reason a packet that is late by so much is not sent at all, as what it says may no longer be wanted.
         """
         if self._packet:
             packet = bytes(self._packet)
             self._packet.clear()
+            if time.monotonic() >= self._until:
+                return b""
             super().write(packet)
+            self._until = time.monotonic() + ANSWER_TIMEOUT
         if time.monotonic() >= self._until:
-            return b""
+            size = min(size, self.in_waiting)
         data = super().read(size)
         self.answer += data
         return data

@@ -161,6 +161,48 @@ def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     assert len(port.answer) < 48  # which the library would wait for
 
 
+HELD_UP = 3.0 * port_module.ANSWER_TIMEOUT
+
+
+def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port, monkeypatch):
+    write = serial.Serial.write
+
+    def held_up(self: serial.Serial, data: bytes) -> int | None:
+        written = write(self, data)
+        assert os.read(peer.host, 100) == data
+        os.write(peer.host, b"\xff")
+        time.sleep(HELD_UP)
+        return written
+
+    monkeypatch.setattr(serial.Serial, "write", held_up)
+    board(port, hurries=True).write_zero()
+
+
+def test_of_an_answer_in_pieces_no_piece_is_lost_to_a_thread_that_was_held_up(peer, port):
+    port.begin()
+    port.write(b"?")
+    os.write(peer.host, b"1234")
+    answer = port.read(1)
+    time.sleep(HELD_UP)
+    assert answer + port.read(2) + port.read(3) + port.read(1) == b"1234"
+    assert os.read(peer.host, 100) == b"?"
+
+
+def test_a_packet_that_was_held_up_is_made_anew(peer, port):
+    os.set_blocking(peer.host, False)
+    held_up = iter([HELD_UP, 0.0])
+
+    def send(_: int, value: int) -> bool:
+        time.sleep(next(held_up))
+        port.write(bytes((value,)))
+        return bool(port.read(1))
+
+    values = iter([(1,), (2,)])
+    with pytest.raises(DeviceError):
+        board(port)._exchange(send, lambda: next(values), bool)
+    assert os.read(peer.host, 100) == b"\x02"
+
+
 @pytest.mark.parametrize("tenths", range(1, 11))
 def test_every_tenth_of_a_second_gets_to_the_board(peer, patient, port, tenths: int):
     there = RoboClawBoard()
