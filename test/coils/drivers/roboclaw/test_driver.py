@@ -370,7 +370,7 @@ def test_closing_leaves_zero_and_the_port_free(bench):
     for board in bench.boards:
         zero_at, duties = board.timeline[-1]
         assert duties == (0, 0)
-        assert zero_at == board.heard  # it was the last that it was told
+        assert zero_at <= board.heard  # it was told, maybe twice; its own timeout would come after the last word
     assert not driver.state().ready
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("roboclaw")]
     driver.close()
