@@ -42,6 +42,9 @@ class PathFollowerSettings(Configuration):
         minimum=0.0,
         maximum=60.0,
     )
+    audience: int = quantity(
+        1, "subscribers to its commands that it waits for: the bridge, and whoever records", minimum=1, maximum=100
+    )
     longest_lag: float = quantity(
         0.002, "the wish waits while the tip is farther from it", unit="m", minimum=1e-5, maximum=0.1
     )

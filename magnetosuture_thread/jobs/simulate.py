@@ -37,6 +37,8 @@ LOOK = 0.02  # s between two looks at the nodes
 
 # Where two cores carry the whole graph and a recording besides, the bridge leaves them more of it.
 SLOWER_BRIDGE = ("-p", "coil_bridge:rate:=100.0")
+# On a busy machine the recorder finds who steers up to 3 s after the bridge does: the bag would lack the start.
+BRIDGE_AND_RECORDER = ("-p", "path_follower:audience:=2")
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
 
 Say = Callable[[str], None]
@@ -175,7 +177,7 @@ def _run(
                     _arm(CoilClient)
                 say("running" if pace is None else f"running at {pace:g} times the speed")
                 running = True
-                nodes.start("path_follower")
+                nodes.start("path_follower", arguments=BRIDGE_AND_RECORDER)
                 return _follow(recorder, nodes.check, setup, duration, pace or 1.0, progress)
             except KeyboardInterrupt:
                 if not running:

@@ -21,7 +21,9 @@ class PathFollowerNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("path_follower", automatically_declare_parameters_from_overrides=True, **options)
-        self._follower = declare(self, PathFollowerSettings).follower()
+        settings = declare(self, PathFollowerSettings)
+        self._follower = settings.follower()
+        self._audience = settings.audience
         self._health = Health(self)
         self._commands = topics.NEEDLE_COMMAND.publisher(self)
         self._setpoints = topics.TIP_SETPOINT.publisher(self)
@@ -30,8 +32,10 @@ class PathFollowerNode(Node):
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Ask for the velocity that takes the tip along its path."""
-        if not self._commands.get_subscription_count():
-            self._health.warn("nobody takes velocity commands")
+        audience = self._commands.get_subscription_count()
+        if audience < self._audience:
+            some = f"{audience} of {self._audience} take velocity commands"
+            self._health.warn(some if audience else "nobody takes velocity commands")
             return
         try:
             pose = messages.needle_pose(message)

@@ -69,3 +69,17 @@ def test_it_does_not_begin_before_anybody_takes_its_commands(graph):
     graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
     graph.wait(lambda: any(d.status[0].message == "nobody takes velocity commands" for d in diagnostics), "the reason")
     assert wishes == []
+
+
+def test_it_waits_for_as_many_as_it_is_told(graph):
+    node = graph.add(PathFollowerNode, settle=0.0, waypoints=[0.02, 0.0], audience=2)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    first = graph.listen(topics.NEEDLE_COMMAND)
+    graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
+    few = "1 of 2 take velocity commands"
+    graph.wait(lambda: any(d.status[0].message == few for d in diagnostics), "the reason")
+    assert first == []
+    second = graph.listen_later(topics.NEEDLE_COMMAND)
+    graph.wait(lambda: node._commands.get_subscription_count() == 2, "the second")
+    graph.publish(topics.NEEDLE_POSE, pose(5.1, 0.0))
+    graph.wait(lambda: bool(first and second), "commands")
