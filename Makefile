@@ -22,7 +22,8 @@ demo: $(READY)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
 test: $(READY)
-	$(RUN)/python -m pytest --numprocesses=2
+	$(RUN)/python -m pytest --numprocesses=2 -m "not whole_graph"
+	$(RUN)/python -m pytest -m whole_graph
 
 lint: $(READY)
 	$(RUN)/ruff check .

@@ -8,6 +8,7 @@ from magnetosuture_thread.jobs.bench_bridge import bench_bridge
 from magnetosuture_thread.study.bridge_report import BridgeReport, Delays, bridge_table
 
 
+@pytest.mark.whole_graph
 def test_whatever_falls_silent_or_is_killed_the_boards_go_to_zero_and_work_again():
     report = bench_bridge(trials=2, kills=1, hostile=3000, busy=False)
     assert [each.count > 0 for each in report.delays] == [True] * 4

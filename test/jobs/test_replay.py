@@ -19,6 +19,8 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.jobs.replay import replay
 
+pytestmark = pytest.mark.whole_graph
+
 
 def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
     said: list[str] = []
