@@ -23,7 +23,9 @@ from magnetosuture_thread.nodes.coil_messages import command_stamp
 
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
 START_TIMEOUT = 180.0  # s for all nodes to be there
-SETTLE = 0.5  # s after we have found the nodes, for the nodes to have found us
+# s after we have found all nodes, for the nodes to have found us and each other: DDS announces a node a few times as it
+# starts and then each 3 s, and on a busy machine the first of these get lost.
+SETTLE = 3.2
 QUIET = 0.5  # s without any answer, once the tracker has taken all frames: the graph is done
 DRAIN_TIMEOUT = 30.0  # s after the last input at the most
 DEPTH = 300  # messages that may wait for a slow node before any is lost
