@@ -1,37 +1,26 @@
-"""Reads mcap bags, with every checksum checked."""
+"""Reads bags: looks through all of one as it is opened, then goes through its messages by time."""
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from mcap.exceptions import McapError
-from mcap.reader import McapReader, NonSeekingReader, make_reader
-from zstandard import ZstdError
-
-from magnetosuture_thread.bags.types import typestore
-from magnetosuture_thread.bags.writer import NOTES
+from magnetosuture_thread.bags.damage import Damage, Place, together
+from magnetosuture_thread.bags.definitions import Decoder
+from magnetosuture_thread.bags.folder import bag_files
+from magnetosuture_thread.bags.mcap.file import McapFile
+from magnetosuture_thread.bags.message_packing import unpacked
+from magnetosuture_thread.bags.remap import renamed
+from magnetosuture_thread.bags.sqlite import SqliteFile
+from magnetosuture_thread.bags.storage import CDR, Connection, Definition, Item, Storage, in_order
 from magnetosuture_thread.errors import BagError
 
-MAGIC = b"\x89MCAP0\r\n"  # an mcap file's first and last bytes
-# What the mcap package raises on damaged files; some of it is not its own.
-DAMAGE = (
-    McapError,
-    ZstdError,
-    struct.error,
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    EOFError,
-)
+Progress = Callable[[float], None]
+_decoder = cache(Decoder)
 
 
 @dataclass(frozen=True)
@@ -43,155 +32,221 @@ class Record:
         type_name: for example `sensor_msgs/msg/Image`.
         time: when it was recorded [ns].
         data: CDR bytes.
+        definition: of its type, as the bag has it; ours if None.
     """
 
     topic: str
     type_name: str
     time: int
     data: bytes
+    definition: Definition | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def decoder(self) -> Decoder:
+        """Return what decodes messages of this type."""
+        return _decoder(self.definition or Definition(self.type_name))
 
     def decode(self) -> Any:
-        """Return the message as an object of the type store.
+        """Return the message as an object of a type store.
 
         Raises:
             BagError: the bytes are not of the type, or the type is not known.
         """
-        try:
-            return typestore().deserialize_cdr(self.data, self.type_name)
-        except Exception as error:  # The decoder raises whatever the bytes make it stumble over.
-            raise BagError(self.topic, f"a message cannot be decoded as {self.type_name}: {error}") from None
+        return self.decoder.decode(self.topic, self.data)
 
 
 class Bag:
-    """A recorded bag.
+    """A recorded bag: mcap or sqlite3, one file or several, whole or damaged.
+
+    It is looked through as it is opened, with every checksum, so that damage is known before anything is made of
+    the bag. What is intact is read; nothing that may be wrong is (see `bags/mcap/verdict.py` for the rule).
 
     Args:
-        path: an mcap file, or a folder that holds one.
+        path: a file, or the folder of a bag.
+        remap: new name of a topic by its recorded name.
+        progress: called with the share looked through, 0 to 1.
 
     Attributes:
-        topics: type of each topic.
+        path: as it was given.
+        topics: type of each topic, but for those in `conflicts`.
+        conflicts: types of each topic that has more than one.
         counts: number of messages of each topic.
         start: time of the first message [ns].
+        end: time of the last message [ns].
         duration: from the first to the last message [s].
         notes: what was written about the bag by our writer.
+        damage: what is broken and lost; None if the bag is whole. Its text is one line for a person.
+        unchecked: why damage may not have been noticed, in one line; empty if it would have been.
+        facts: of each file, for a person: name and value.
 
     Raises:
-        BagError: there is no such bag, it is no mcap, it is cut off, damaged or empty.
+        BagError: there is no such bag, it cannot be read, nothing intact is in it, or there is no such topic to
+            remap.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self, path: Path, *, remap: Mapping[str, str] | None = None, progress: Progress = lambda share: None
+    ) -> None:
         self.path = path
-        self.file = _mcap_file(path)
-        _check_ends(self.file)
-        try:
-            with self.file.open("rb") as stream:
-                reader = make_reader(stream, validate_crcs=True)
-                summary = reader.get_summary()
-                notes = [record.metadata for record in reader.iter_metadata() if record.name == NOTES]
-        except DAMAGE as error:
-            raise BagError(self.file, _damaged(error)) from None
-        if summary is None or summary.statistics is None:
-            raise BagError(self.file, "has no summary with statistics, so that nothing says whether it is whole")
-        statistics = summary.statistics
-        if not statistics.message_count:
-            raise BagError(self.file, "holds no messages")
-        names = {schema.id: schema.name for schema in summary.schemas.values()}
-        self.topics: dict[str, str] = {}
+        found = bag_files(path)
+        self._storages, problems = _open(found.files, progress)
+        places = [Place(name, 0, 0, "it is missing") for name in found.missing]
+        lost = [Damage((place,), 0, place.end, None) for place in (*places, *problems)]
+        self.damage = together([*(storage.damage for storage in self._storages), *lost])
+        self.unchecked = next((storage.unchecked for storage in self._storages if storage.unchecked), "")
+        self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
+        self.notes: dict[str, str] = next((storage.notes for storage in self._storages if storage.notes), {})
+        if not any(storage.counts for storage in self._storages):
+            raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
+        filled = [storage for storage in self._storages if storage.counts]
+        self.start = min(storage.start for storage in filled)
+        self.end = max(storage.end for storage in filled)
+        self.duration = (self.end - self.start) * 1e-9
+        recorded = {c.topic for storage in self._storages for c in storage.connections.values()}
+        self._names = renamed(path, recorded, remap or {})
         self.counts: Counter[str] = Counter()
-        for channel in summary.channels.values():
-            type_name = names.get(channel.schema_id, "")
-            if self.topics.setdefault(channel.topic, type_name) != type_name:
-                types = f"{self.topics[channel.topic]} and {type_name}"
-                raise BagError(self.file, f"topic {channel.topic} has two types, {types}; expected one")
-            self.counts[channel.topic] += statistics.channel_message_counts.get(channel.id, 0)
-        self.start = statistics.message_start_time
-        self._end = statistics.message_end_time
-        self.duration = (self._end - self.start) * 1e-9
-        self.notes: dict[str, str] = notes[0] if notes else {}
+        types: dict[str, dict[str, None]] = {}
+        for storage in self._storages:
+            for number, connection in storage.connections.items():
+                name, count = self._names[connection.topic], storage.counts.get(number, 0)
+                self.counts[name] += count
+                types.setdefault(name, {})[connection.type_name] = None
+        self.topics = {name: next(iter(own)) for name, own in types.items() if len(own) == 1}
+        self.conflicts = {name: tuple(own) for name, own in types.items() if len(own) > 1}
 
-    def records(self, topics: Collection[str] | None = None) -> Iterator[Record]:
-        """Go through the messages by time.
+    def records(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        start: float = 0.0,
+        duration: float | None = None,
+        refused: Counter[str] | None = None,
+    ) -> Iterator[Record]:
+        """Go through the messages by time, without ever holding more than some chunks in memory.
 
         Args:
-            topics: only these; all if None.
+            topics: only these; all that have one type if None. Those that the bag lacks give nothing.
+            start: only messages from this time on [s since the bag's start].
+            duration: only messages until this time after `start` [s]; all that follow if None.
+            refused: to count messages in, by the reason, that cannot be unpacked or are no CDR; None to raise.
 
         Raises:
-            BagError: a chunk is damaged.
+            BagError: one of the topics has two types, or the bag has changed since it was opened.
         """
-        try:
-            with self.file.open("rb") as stream:
-                reader: McapReader = make_reader(stream, validate_crcs=True)
-                for schema, channel, message in reader.iter_messages(topics=topics):
-                    name = schema.name if schema is not None else ""
-                    yield Record(channel.topic, name, message.log_time, message.data)
-        except DAMAGE as error:
-            raise BagError(self.file, _damaged(error)) from None
+        for topic in topics or ():
+            self._refuse_two_types(topic)
+        return self._records(set(self.topics if topics is None else topics), start, duration, refused)
 
-    def check(self) -> None:
-        """Read all of it once, so that damage is known before anything is made of it.
+    def every_record(self, refused: Counter[str]) -> Iterator[tuple[Connection, Record]]:
+        """Go through all messages by time, each with where it comes from.
 
-        The chunks have checksums. The summary, from which topics, types, counts and times come, is held
-        against what stands before it.
+        Those of topics with two types, and those that are no CDR, are among them.
 
-        Raises:
-            BagError: a chunk is damaged, or the summary does not fit the messages.
+        Args:
+            refused: to count messages in, by the reason, that cannot be unpacked.
         """
-        found: Counter[tuple[str, str]] = Counter()
-        times: list[int] = []
-        try:
-            with self.file.open("rb") as stream:
-                reader = NonSeekingReader(stream, validate_crcs=True)
-                for schema, channel, message in reader.iter_messages(log_time_order=False):
-                    found[channel.topic, schema.name if schema is not None else ""] += 1
-                    time = message.log_time
-                    times = [min(times[0], time), max(times[1], time)] if times else [time, time]
-        except DAMAGE as error:
-            raise BagError(self.file, _damaged(error)) from None
-        promised = Counter({(topic, self.topics[topic]): count for topic, count in self.counts.items() if count})
-        if found != promised or times != [self.start, self._end]:
-            held = f"{sum(found.values())} messages on {len(found)} topics"
-            told = f"{sum(promised.values())} on {len(promised)}"
-            raise BagError(self.file, f"is damaged: it holds {held}, its summary says {told}, or other types or times")
+        for connection, item in self._items(set(self.counts), 0.0, None):
+            record = self._unless_refused(connection, item, refused)
+            if record is not None:
+                yield connection, record
+
+    def connections(self) -> Iterable[Connection]:
+        """Return what each publisher said on each topic, under its recorded name."""
+        return [connection for storage in self._storages for connection in storage.connections.values()]
+
+    def name_of(self, connection: Connection) -> str:
+        """Return the name of a connection's topic once it is remapped."""
+        return self._names[connection.topic]
 
     def require(self, topic: str, type_name: str) -> None:
         """Raise `BagError` unless the bag has messages of this type on a topic."""
         if not self.counts.get(topic):
-            present = ", ".join(sorted(self.topics)) or "none"
+            present = ", ".join(sorted({*self.topics, *self.conflicts})) or "none"
             raise BagError(self.path, f"has no messages on {topic} ({type_name}); its topics: {present}")
+        self._refuse_two_types(topic)
         if self.topics[topic] != type_name:
             raise BagError(self.path, f"topic {topic} is of type {self.topics[topic]}, expected {type_name}")
 
+    def _refuse_two_types(self, topic: str) -> None:
+        if topic in self.conflicts:
+            types = " and ".join(self.conflicts[topic])
+            raise BagError(self.path, f"topic {topic} has two types, {types}; expected one")
 
-def _mcap_file(path: Path) -> Path:
+    def _records(
+        self, topics: Collection[str], start: float, duration: float | None, refused: Counter[str] | None
+    ) -> Iterator[Record]:
+        for connection, item in self._items(topics, start, duration):
+            record = self._unless_refused(connection, item, refused, only=CDR)
+            if record is not None:
+                yield record
+
+    def _unless_refused(
+        self, connection: Connection, item: Item, refused: Counter[str] | None, only: str = ""
+    ) -> Record | None:
+        """Return a message; None, once it is counted, if it cannot be unpacked or is written in another way."""
+        topic = self._names[connection.topic]
+        try:
+            if only and connection.serialization != only:
+                raise BagError(topic, f"its messages are written as {connection.serialization!r}, expected {only!r}")
+            data = unpacked(topic, item.data)
+        except BagError as error:
+            if refused is None:
+                raise
+            refused[str(error)] += 1
+            return None
+        return Record(topic, connection.type_name, item.time, data, connection.definition)
+
+    def _items(
+        self, topics: Collection[str], start: float, duration: float | None
+    ) -> Iterator[tuple[Connection, Item]]:
+        first = self.start + round(start * 1e9)
+        last = self.end if duration is None else first + round(duration * 1e9)
+        # One numbering over all files, so that they can be merged.
+        numbered: list[Connection] = []
+        parts = []
+        for storage in sorted(self._storages, key=lambda storage: storage.start):
+            wanted = {
+                number: len(numbered) + index
+                for index, number in enumerate(storage.connections)
+                if self._names[storage.connections[number].topic] in topics
+            }
+            numbered += storage.connections.values()
+            if wanted:
+                parts.append((storage.start, partial(_renumbered, storage, wanted, first, last)))
+        for item in in_order(parts):
+            yield numbered[item.connection], item
+
+
+def _renumbered(storage: Storage, numbers: dict[int, int], start: int, end: int) -> Iterator[Item]:
+    for item in storage.items(numbers, start, end):
+        yield item._replace(connection=numbers[item.connection])
+
+
+def _open(files: list[Path], progress: Progress) -> tuple[list[Storage], list[Place]]:
+    """Open the files of a bag; of several, those that cannot be read at all are told as broken places."""
+    storages: list[Storage] = []
+    problems: list[Place] = []
+    total, done = sum(_size(file) for file in files), 0
+
+    def come_on(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(min(1.0, done / max(total, 1)))
+
+    for file in files:
+        try:
+            storages.append(SqliteFile(file, come_on) if file.suffix == ".db3" else McapFile(file, come_on))
+        except BagError as error:
+            if len(files) == 1:
+                raise
+            problems.append(Place(file.name, 0, _size(file), error.problem))
+    if not storages:
+        raise BagError(files[0].parent, f"holds no file that can be read; {problems[0]}")
+    return storages, problems
+
+
+def _size(file: Path) -> int:
     try:
-        path.stat()
-        files = [path] if path.is_file() else sorted(path.glob("*.mcap"))
-    except FileNotFoundError:
-        raise BagError(path, "does not exist; expected an mcap file or the folder of a bag") from None
-    except (OSError, ValueError) as error:
-        raise BagError(path, f"cannot be read: {error}") from None
-    if not files:
-        raise BagError(path, "holds no .mcap file")
-    if len(files) > 1:
-        raise BagError(path, f"holds {len(files)} .mcap files; name one of them")
-    return files[0]
-
-
-def _check_ends(path: Path) -> None:
-    """Refuse a file that does not begin or end as an mcap file does."""
-    try:
-        with path.open("rb") as stream:
-            begins = stream.read(len(MAGIC))
-            size = stream.seek(0, 2)
-            stream.seek(max(0, size - len(MAGIC)))
-            ends = stream.read()
-    except OSError as error:
-        raise BagError(path, f"cannot be read: {error.strerror}") from None
-    if begins != MAGIC:
-        raise BagError(path, "is no mcap file" if begins else "is empty, expected an mcap file")
-    if ends != MAGIC:
-        raise BagError(path, f"is cut off after {size} bytes: its end is missing")
-
-
-def _damaged(error: BaseException) -> str:
-    return f"is damaged: {type(error).__name__} {error}".rstrip()
+        return file.stat().st_size
+    except OSError:
+        return 0

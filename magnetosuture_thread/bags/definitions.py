@@ -1,0 +1,121 @@
+"""Decodes messages by the definition that the bag has of their type, where that is not ours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from magnetosuture_thread.bags.storage import Definition
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.errors import BagError
+
+HEADER = "std_msgs/msg/Header"
+
+
+class Decoder:
+    """Decodes messages of one type.
+
+    Args:
+        definition: of the type, as a bag has it. Ours is taken where it has none, where its own says the same, and
+            where its own cannot be read.
+
+    Attributes:
+        type_name: for example `nav_msgs/msg/Path`.
+        is_ours: whether our definition of the type is taken.
+        is_known: whether there is any definition.
+    """
+
+    def __init__(self, definition: Definition) -> None:
+        self.type_name = definition.type_name
+        own = _parsed(definition)
+        ours = typestore()
+        self.is_ours = self.type_name in ours.fielddefs and (
+            self.type_name not in own or not _differ(self.type_name, own, ours.fielddefs)
+        )
+        self._store: Typestore = ours if self.is_ours else _store(own)
+        self.is_known = self.type_name in self._store.fielddefs
+
+    def decode(self, topic: str, data: bytes) -> Any:
+        """Return a message as an object of a type store.
+
+        Raises:
+            BagError: the bytes are not of the type, or nothing defines it.
+        """
+        if not self.is_known:
+            raise BagError(topic, f"nothing defines the type {self.type_name or '(no name)'} of its messages")
+        try:
+            return self._store.deserialize_cdr(data, self.type_name)
+        except Exception as error:  # The decoder raises whatever the bytes make it stumble over.
+            raise BagError(topic, f"a message cannot be decoded as {self.type_name}: {error}") from None
+
+    def has_header(self) -> bool:
+        """Return whether a message is a header or begins with one, which has its stamp."""
+        if self.type_name == HEADER:
+            return True
+        fields = self._store.fielddefs[self.type_name][1] if self.is_known else []
+        return bool(fields) and fields[0][1][1] == HEADER
+
+
+def _parsed(definition: Definition) -> dict[str, Any]:
+    """Return the types that a definition tells, by name; none where it cannot be read, or uses what nobody defines.
+
+    An empty one says nothing of a type that we know: some recorders leave it out.
+    """
+    own: dict[str, Any] = {}
+    if not definition.text.strip() and definition.type_name in typestore().fielddefs:
+        return own
+    try:
+        if definition.encoding == "ros2msg":
+            own = dict(get_types_from_msg(definition.text, definition.type_name))
+        elif definition.encoding == "ros2idl":
+            own = dict(get_types_from_idl(definition.text))
+    except Exception:  # The parser raises whatever the text makes it stumble over.
+        return {}
+    used = {inner for _, fields in own.values() for _, kind in fields for inner in _named(kind)}
+    return own if used <= {*own, *typestore().fielddefs} else {}
+
+
+def _differ(type_name: str, own: dict[str, Any], ours: dict[str, Any]) -> bool:
+    """Return whether two definitions of a type say other fields, there or in a type within it."""
+    waiting, seen = [type_name], set[str]()
+    while waiting:
+        name = waiting.pop()
+        if name in seen or name not in own:  # which is then ours
+            continue
+        seen.add(name)
+        if name not in ours:
+            return True
+        fields = [(field.lower(), kind) for field, kind in own[name][1]]
+        if fields != [(field.lower(), kind) for field, kind in ours[name][1]]:
+            return True
+        waiting += [inner for _, kind in fields for inner in _named(kind)]
+    return False
+
+
+def _store(own: dict[str, Any]) -> Typestore:
+    """Return a store of a bag's own types; what they use and do not define is ours."""
+    store = get_typestore(Stores.EMPTY)
+    ours = typestore().fielddefs
+    missing = {inner for _, fields in own.values() for _, kind in fields for inner in _named(kind)} - set(own)
+    types = dict(own)
+    while missing:
+        name = missing.pop()
+        if name in types or name not in ours:
+            continue
+        types[name] = ours[name]
+        missing |= {inner for _, kind in ours[name][1] for inner in _named(kind)}
+    try:
+        store.register(types)
+    except Exception:  # A name that is no name in Python, for example.
+        return get_typestore(Stores.EMPTY)
+    return store
+
+
+def _named(kind: Any) -> list[str]:
+    """Return the name of the type that a field is of, or is a sequence of, where it has one."""
+    code, value = int(kind[0]), kind[1]
+    if code == 2:
+        return [value]
+    return _named(value[0]) if code in (3, 4) else []

@@ -1,0 +1,246 @@
+"""Bags of other recorders: mcap and sqlite3, packed or not, split, with definitions of their own."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.writer import CompressionType
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.storage import Definition
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError
+from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
+
+PLUGINS = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
+TYPES = {"/text": STRING, "/header": HEADER}
+
+
+def messages(count: int = 200):
+    header = stamped(3)
+    both = texts(count) + [("/header", time + 5, cdr(HEADER, header.stamp, "dish")) for _, time, _ in texts(count)]
+    return sorted(both, key=lambda message: message[1])
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_bags_of_rosbag2_are_read(tmp_path: Path, plugin: StoragePlugin):
+    folder = write_rosbag(tmp_path / "bag", plugin, messages(), TYPES)
+    bag = Bag(folder)
+    assert read(bag) == messages()
+    assert (bag.topics, bag.counts) == (TYPES, {"/text": 200, "/header": 200})
+    assert bag.damage is None
+    assert "no checksums" in bag.unchecked
+    assert [r.decode().data for r in bag.records({"/text"}, start=1.0, duration=0.02)] == [
+        "text 100",
+        "text 101",
+        "text 102",
+    ]
+    (folder / "metadata.yaml").unlink()
+    assert read(Bag(folder)) == messages()
+    file = next(path for path in folder.iterdir() if path.suffix in (".db3", ".mcap"))
+    assert read(Bag(file)) == messages()
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_nothing_is_written_where_a_bag_is_read(tmp_path: Path, plugin: StoragePlugin):
+    folder = write_rosbag(tmp_path / "bag", plugin, messages(), TYPES)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    read(Bag(folder))
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_messages_that_were_packed_one_by_one(tmp_path: Path, plugin: StoragePlugin):
+    writer = RosbagWriter(tmp_path / "bag", version=9, storage_plugin=plugin)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer as bag:
+        connection = bag.add_connection("/text", STRING, typestore=typestore())
+        for _, time, data in texts(20):
+            bag.write(connection, time, data)
+    assert read(Bag(tmp_path / "bag")) == texts(20)
+
+
+def test_a_file_that_is_packed_as_a_whole_says_how_to_unpack_it(tmp_path: Path):
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    file = write_mcap(tmp_path / "a.mcap", texts(5), {"/text": STRING})
+    (folder / "a.mcap.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+    for path in (folder, folder / "a.mcap.zstd"):
+        with pytest.raises(BagError, match=r"packed as a whole; unpack it first: zstd -d a\.mcap\.zstd"):
+            Bag(path)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_chunks_of_every_compression(tmp_path: Path, compression: CompressionType):
+    path = write_mcap(tmp_path / "a.mcap", messages(), TYPES, compression=compression)
+    bag = Bag(path)
+    assert read(bag) == messages()
+    assert (bag.unchecked, bag.damage) == ("", None)
+
+
+def test_messages_out_of_order_come_by_time(tmp_path: Path):
+    shuffled = random.Random(1).sample(messages(), 400)
+    assert read(Bag(write_mcap(tmp_path / "a.mcap", shuffled, TYPES))) == messages()
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_split_bag_is_one_bag(tmp_path: Path, named: bool):
+    """Eleven parts, so that by name alone the last would come second."""
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for part in range(11):
+        write_mcap(folder / f"split_{part}.mcap", texts(20, start=(1 + part) * 10**9), {"/text": STRING})
+    if named:
+        names = "".join(f"  - split_{part}.mcap\n" for part in range(11))
+        (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{names}")
+    bag = Bag(folder)
+    assert bag.counts == {"/text": 220}
+    assert [time for _, time, _ in read(bag)] == sorted(time for _, time, _ in read(bag))
+    assert [r.decode().data for r in bag.records(start=5.0, duration=0.01)] == ["text 0", "text 1"]
+    middle = folder / "split_4.mcap"
+    middle.write_bytes(middle.read_bytes()[:-300])
+    (folder / "split_5.mcap").write_bytes(b"")
+    (folder / "split_6.mcap").unlink()
+    damage = Bag(folder).damage
+    assert damage is not None
+    said = "\n".join(map(str, damage.places))
+    assert "split_4.mcap" in said
+    assert "split_5.mcap, byte 0: is empty" in said
+    assert ("split_6.mcap, byte 0: it is missing" in said) == named
+    assert Bag(folder).counts["/text"] >= 160
+
+
+def test_a_folder_with_several_bags_is_refused(tmp_path: Path):
+    for name in ("one", "two"):
+        write_mcap(tmp_path / f"{name}.mcap", texts(3), {"/text": STRING})
+    with pytest.raises(BagError, match=r"holds 2 \.mcap files; name one of them"):
+        Bag(tmp_path)
+
+
+def test_the_bags_own_definitions_are_taken(tmp_path: Path):
+    """Of a type that we do not know, and of one that was different once."""
+    theirs = Definition("their_msgs/msg/Thing", "ros2msg", "std_msgs/Header header\nint32 number\n")
+    older = Definition(STRING, "ros2msg", "int32 size\nstring data\n")
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/thing", theirs.type_name, theirs)
+        bag.add_topic("/older", STRING, older)
+        bag.add_topic("/text", STRING)
+        bag.write("/thing", 1, cdr(HEADER, stamped(3).stamp, "dis") + b"\7\0\0\0")
+        bag.write("/older", 2, b"\0\1\0\0\5\0\0\0\2\0\0\0a\0")
+        bag.write("/text", 3, cdr(STRING, "b"))
+    thing, old, text = (record.decode() for record in Bag(tmp_path / "bag").records())
+    assert (thing.header.frame_id, thing.number) == ("dis", 7)
+    assert (old.size, old.data, text.data) == (5, "a", "b")
+
+
+def test_definitions_as_idl(tmp_path: Path):
+    text = "module their_msgs { module msg { struct Thing { long number; }; }; };"
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/thing", "their_msgs/msg/Thing", Definition("their_msgs/msg/Thing", "ros2idl", text))
+        bag.write("/thing", 1, b"\0\1\0\0\7\0\0\0")
+    assert next(Bag(tmp_path / "bag").records()).decode().number == 7
+
+
+@pytest.mark.parametrize("text", ["", "no definition at all", "their_msgs/Other other", "int32 a\nint32 a"])
+def test_a_definition_that_says_nothing(tmp_path: Path, text: str):
+    """Of a type that we know ours is taken; of another one the messages cannot be decoded, but they are there."""
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/text", STRING, Definition(STRING, "ros2msg" if text else "", text if "at all" in text else ""))
+        bag.add_topic("/thing", "their_msgs/msg/Thing", Definition("their_msgs/msg/Thing", "ros2msg", text))
+        bag.write("/text", 1, cdr(STRING, "b"))
+        bag.write("/thing", 2, cdr(STRING, "b"))
+    known, unknown = Bag(tmp_path / "bag").records()
+    assert known.decode().data == "b"
+    with pytest.raises(BagError, match="/thing: "):
+        unknown.decode()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\0\1\0\0",
+        b"\0\1\0\0\xff\xff\xff\xff",
+        b"\0\1\0\0\xff\xff\xff\x7fabc\0",
+        b"\0\1\0\0\2\0\0\0\xff\0",
+        b"\0\7\0\0\2\0\0\0a\0",
+        b"\x28\xb5\x2f\xfd\0\0",
+    ],
+)
+def test_bytes_that_are_no_message_name_the_topic(tmp_path: Path, data: bytes):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/text", STRING)
+        bag.write("/text", 1, data)
+
+    def decode() -> None:
+        for record in Bag(tmp_path / "bag").records():
+            record.decode()
+
+    with pytest.raises(BagError, match=r"/text: a (packed )?message cannot be"):
+        decode()
+
+
+def test_lengths_that_lie_take_no_memory(tmp_path: Path):
+    """A path of four thousand million poses in a hundred bytes."""
+    header = cdr(HEADER, stamped(1).stamp, "dish123")
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/path", "nav_msgs/msg/Path")
+        bag.write("/path", 1, header + b"\xff\xff\xff\xff" + bytes(60))
+    record = next(Bag(tmp_path / "bag").records())
+    with pytest.raises(BagError, match="/path: a message cannot be decoded"):
+        record.decode()
+
+
+def test_a_topic_with_two_types_spoils_no_other(tmp_path: Path):
+    path = tmp_path / "two"
+    shutil.copytree(write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, messages(), TYPES), path)
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        database.execute("UPDATE topics SET name = '/text' WHERE name = '/header'")
+        database.execute("INSERT INTO topics VALUES (9, '/other', 'std_msgs/msg/String', 'cdr', '', '')")
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (9, 1, ?)", (cdr(STRING, "a"),))
+        database.commit()
+    bag = Bag(path)
+    assert bag.conflicts == {"/text": (STRING, HEADER)}
+    assert [topic for topic, _, _ in read(bag)] == ["/other"]
+    for ask in (lambda: bag.records({"/text"}), lambda: bag.require("/text", STRING)):
+        with pytest.raises(BagError, match=f"topic /text has two types, {STRING} and {HEADER}; expected one"):
+            ask()
+
+
+def test_a_damaged_database_gives_what_can_be_read(tmp_path: Path):
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(4000), {"/text": STRING})
+    file = folder / "bag.db3"
+    whole = file.read_bytes()
+    original = set(texts(4000))
+    recovered = 0
+    for place in range(8, len(whole) // 4096 - 1, 7):
+        file.write_bytes(whole[: place * 4096] + bytes(4096) + whole[(place + 1) * 4096 :])
+        try:
+            bag = Bag(folder)
+            found = read(bag)
+        except BagError:
+            continue
+        assert set(found) <= original
+        assert bag.damage is not None or len(found) == 4000
+        recovered += len(found) > 2000
+    assert recovered > 3
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(BagError, match=r"malformed|cannot be read") as caught:
+        read(Bag(folder))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_database(tmp_path: Path):
+    for content, words in ((b"", "is empty"), (b"text" * 99, "is no sqlite3"), (b"SQLite format 3\0" * 9, "as a bag")):
+        (tmp_path / "bag.db3").write_bytes(content)
+        with pytest.raises(BagError, match=words):
+            Bag(tmp_path / "bag.db3")

@@ -1,0 +1,365 @@
+"""A bag in the words of our graph: remapped topics, other types, other frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.remap import remapping
+from magnetosuture_thread.bags.storage import Definition
+from magnetosuture_thread.bags.transforms import Transforms
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.interface import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    NEEDLE_COMMAND,
+    NEEDLE_POSE,
+    SEEN_THREAD,
+    TRUE_NEEDLE,
+    TRUE_THREAD,
+)
+from test.bags.bags import STRING, make, stamped
+
+SECOND = 10**9
+POINT, QUATERNION, POSE = "geometry_msgs/msg/Point", "geometry_msgs/msg/Quaternion", "geometry_msgs/msg/Pose"
+TURN = Rotation.from_euler("z", 90, degrees=True)
+
+
+def pose(x: float = 1.0, y: float = 2.0, z: float = 3.0, turn: Rotation | None = None) -> Any:
+    quaternion = (turn or Rotation.identity()).as_quat()
+    return make(POSE, make(POINT, x, y, z), make(QUATERNION, *map(float, quaternion)))
+
+
+def pose_stamped(index: int = 1, frame: str = "dish", x: float = 1.0) -> Any:
+    return make("geometry_msgs/msg/PoseStamped", stamped(index, frame), pose(x))
+
+
+def transform(parent: str, child: str, x: float, turn: Rotation | None = None, index: int = 0) -> Any:
+    quaternion = (turn or Rotation.identity()).as_quat()
+    move = make("geometry_msgs/msg/Vector3", x, 0.0, 0.0)
+    turned = make(QUATERNION, *map(float, quaternion))
+    both = make("geometry_msgs/msg/Transform", move, turned)
+    return make("geometry_msgs/msg/TransformStamped", stamped(index, parent), child, both)
+
+
+def tf(*transforms: Any) -> Any:
+    return make("tf2_msgs/msg/TFMessage", list(transforms))
+
+
+def covariance(*diagonal: float) -> np.ndarray:
+    return np.diag(diagonal).astype(float).ravel()
+
+
+def bag_of(tmp_path: Path, *messages: tuple[str, Any], remap: dict[str, str] | None = None) -> Bag:
+    """Return a bag of messages, one a second."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic, name in {topic: message.__msgtype__ for topic, message in messages}.items():
+            writer.add_topic(topic, name)
+        for index, (topic, message) in enumerate(messages):
+            writer.write_message(topic, (1 + index) * SECOND, message)
+    return Bag(tmp_path / "bag", remap=remap)
+
+
+def only(recording: Recording, channel: Any) -> Any:
+    """Return the only message of a channel, decoded."""
+    (record,) = recording.records([channel])
+    assert (record.topic, record.type_name) == (channel.recorded, channel.type_name)
+    return typestore().deserialize_cdr(record.data, channel.type_name)
+
+
+def place(message: Any) -> tuple[float, float, float]:
+    return message.position.x, message.position.y, message.position.z
+
+
+HELD = make("geometry_msgs/msg/PoseWithCovariance", pose(), covariance(1, 2, 3, 4, 5, 6))
+NO_TWIST = make(
+    "geometry_msgs/msg/TwistWithCovariance",
+    make("geometry_msgs/msg/Twist", *[make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)] * 2),
+    np.zeros(36),
+)
+
+
+@pytest.mark.parametrize(
+    ("message", "variance"),
+    [
+        (pose_stamped(), 0.0),
+        (make("geometry_msgs/msg/PoseWithCovarianceStamped", stamped(1), HELD), 2.0),
+        (
+            make(
+                "geometry_msgs/msg/TransformStamped",
+                stamped(1),
+                "needle",
+                make(
+                    "geometry_msgs/msg/Transform",
+                    make("geometry_msgs/msg/Vector3", 1.0, 2.0, 3.0),
+                    make(QUATERNION, 0.0, 0.0, 0.0, 1.0),
+                ),
+            ),
+            0.0,
+        ),
+        (make("nav_msgs/msg/Odometry", stamped(1), "needle", HELD, NO_TWIST), 2.0),
+    ],
+)
+def test_every_kind_of_pose(tmp_path: Path, message: Any, variance: float):
+    for number, channel in enumerate((NEEDLE_POSE, TRUE_NEEDLE)):
+        bag = bag_of(tmp_path / str(number), ("/theirs", message), remap={"/theirs": channel.recorded})
+        found = only(Recording(bag), channel)
+        assert (found.header.stamp.sec, found.header.frame_id) == (1, "dish")
+        held = found.pose if channel is TRUE_NEEDLE else found.pose.pose
+        assert place(held) == (1.0, 2.0, 3.0)
+        if channel is NEEDLE_POSE:
+            assert found.pose.covariance[7] == variance
+
+
+POINTS = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (2.0, 0.0, 0.25)]
+
+
+def marker(kind: int = 4, action: int = 0) -> Any:
+    fields = {
+        "header": stamped(1),
+        "ns": "",
+        "id": 0,
+        "type": kind,
+        "action": action,
+        "pose": pose(0.0, 0.0, 0.0),
+        "scale": make("geometry_msgs/msg/Vector3", 1.0, 1.0, 1.0),
+        "color": make("std_msgs/msg/ColorRGBA", 1.0, 1.0, 1.0, 1.0),
+        "lifetime": make("builtin_interfaces/msg/Duration", 0, 0),
+        "frame_locked": False,
+        "points": [make(POINT, *xyz) for xyz in POINTS],
+        "colors": [],
+        "texture_resource": "",
+        "texture": make(COMPRESSED_IMAGE.type_name, stamped(1), "", np.zeros(0, dtype=np.uint8)),
+        "uv_coordinates": [],
+        "text": "",
+        "mesh_resource": "",
+        "mesh_file": make("visualization_msgs/msg/MeshFile", "", np.zeros(0, dtype=np.uint8)),
+        "mesh_use_embedded_materials": False,
+    }
+    return typestore().types["visualization_msgs/msg/Marker"](**fields)
+
+
+@pytest.mark.parametrize("channel", [SEEN_THREAD, TRUE_THREAD])
+@pytest.mark.parametrize(
+    "message",
+    [
+        make(
+            "nav_msgs/msg/Path",
+            stamped(1),
+            [make("geometry_msgs/msg/PoseStamped", stamped(1), pose(*p)) for p in POINTS],
+        ),
+        make("geometry_msgs/msg/PoseArray", stamped(1), [pose(*p) for p in POINTS]),
+        make(
+            "geometry_msgs/msg/PolygonStamped",
+            stamped(1),
+            make("geometry_msgs/msg/Polygon", [make("geometry_msgs/msg/Point32", *p) for p in POINTS]),
+        ),
+        marker(),
+    ],
+    ids=lambda message: message.__msgtype__.split("/")[-1],
+)
+def test_every_kind_of_thread(tmp_path: Path, message: Any, channel: Any):
+    bag = bag_of(tmp_path, ("/theirs", message), remap={"/theirs": channel.recorded})
+    found = only(Recording(bag), channel)
+    assert [place(each.pose) for each in found.poses] == POINTS
+    assert found.header.frame_id == "dish"
+
+
+def test_a_marker_that_is_no_line_is_refused_and_counted(tmp_path: Path):
+    topic = SEEN_THREAD.recorded
+    bag = bag_of(tmp_path, (topic, marker()), (topic, marker(kind=5)), (topic, marker(action=2)))
+    recording = Recording(bag)
+    assert len(list(recording.records([SEEN_THREAD]))) == 1
+    assert recording.refused == {"/thread/measured: a marker that is no line strip being added": 2}
+
+
+def test_a_command_without_a_stamp_is_stamped_when_it_was_recorded(tmp_path: Path):
+    linear = make("geometry_msgs/msg/Vector3", 1.0, 2.0, 0.0)
+    twist = make("geometry_msgs/msg/Twist", linear, make("geometry_msgs/msg/Vector3", 0.0, 0.0, 3.0))
+    bag = bag_of(tmp_path, ("/cmd_vel", twist), remap={"/cmd_vel": NEEDLE_COMMAND.recorded})
+    found = only(Recording(bag), NEEDLE_COMMAND)
+    assert (found.header.stamp.sec, found.header.frame_id) == (1, "dish")
+    assert (found.twist.linear.y, found.twist.angular.z) == (2.0, 3.0)
+
+
+def test_what_is_ours_is_passed_on_byte_for_byte(tmp_path: Path):
+    bag = bag_of(tmp_path, (TRUE_NEEDLE.recorded, pose_stamped()), (TRUE_NEEDLE.recorded, pose_stamped(2)))
+    recording = Recording(bag)
+    assert [r.data for r in recording.records([TRUE_NEEDLE, IMAGE])] == [r.data for r in bag.records()]
+    assert [r.time for r in recording.records([TRUE_NEEDLE], start=0.5)] == [2 * SECOND]
+
+
+def image(compressed: bool) -> Any:
+    data = np.zeros(3, dtype=np.uint8)
+    if compressed:
+        return make(COMPRESSED_IMAGE.type_name, stamped(1, "camera"), "jpeg", data)
+    return make(IMAGE.type_name, stamped(1, "camera"), 1, 1, "bgr8", 0, 3, data)
+
+
+def test_images_are_told_by_their_type(tmp_path: Path):
+    for compressed, channel in ((True, COMPRESSED_IMAGE), (False, IMAGE)):
+        for name in (IMAGE.recorded, COMPRESSED_IMAGE.recorded):
+            folder = tmp_path / f"{compressed}{name.replace('/', '_')}"
+            recording = Recording(bag_of(folder, ("/cam", image(compressed)), remap={"/cam": name}))
+            assert recording.camera is channel
+            assert recording.counts == {channel.recorded: 1}
+            assert only(recording, channel).header.frame_id == "camera"
+    both = bag_of(tmp_path / "both", (IMAGE.recorded, image(False)), *[(COMPRESSED_IMAGE.recorded, image(True))] * 2)
+    assert Recording(both).camera is COMPRESSED_IMAGE
+    assert Recording(bag_of(tmp_path / "none", ("/pose", pose_stamped()))).camera is None
+
+
+def test_poses_of_another_frame_are_transformed(tmp_path: Path):
+    """Frames: world <- dish turned by 90 degrees at x = 10; world <- arm moves; arm <- tool is fixed."""
+    bag = bag_of(
+        tmp_path,
+        ("/tf_static", tf(transform("world", "dish", 10.0, TURN), transform("arm", "tool", 0.5))),
+        ("/tf", tf(transform("world", "arm", 10.0, index=2))),
+        ("/tf", tf(transform("world", "arm", 20.0, index=4))),
+        (TRUE_NEEDLE.recorded, pose_stamped(1, "tool")),
+        (TRUE_NEEDLE.recorded, pose_stamped(3, "/tool")),
+        (TRUE_NEEDLE.recorded, pose_stamped(4, "tool")),
+        (TRUE_NEEDLE.recorded, pose_stamped(9, "dish")),
+    )
+    recording = Recording(bag)
+    found: list[Any] = [typestore().deserialize_cdr(r.data, r.type_name) for r in recording.records([TRUE_NEEDLE])]
+    # At 3 s the tool is at x = 10.5 in the world: a point at x = 1 of it is at 1.5 ahead of the dish's origin.
+    assert np.allclose([place(m.pose) for m in found], [[2.0, -1.5, 3.0], [2.0, -11.5, 3.0], [1.0, 2.0, 3.0]])
+    assert {m.header.frame_id for m in found} == {"dish"}
+    turned = found[0].pose.orientation
+    assert np.allclose([turned.x, turned.y, turned.z, turned.w], TURN.inv().as_quat())
+    assert recording.refused == {"/truth/needle: nothing tells where its frame tool was at its time": 1}
+
+
+def test_covariances_and_velocities_turn_too(tmp_path: Path):
+    held = make("geometry_msgs/msg/PoseWithCovariance", pose(), covariance(1, 2, 3, 4, 5, 6))
+    vector = make("geometry_msgs/msg/Vector3", 1.0, 0.0, 0.0)
+    bag = bag_of(
+        tmp_path,
+        ("/tf_static", tf(transform("world", "dish", 10.0, TURN))),
+        (NEEDLE_POSE.recorded, make(NEEDLE_POSE.type_name, stamped(1, "world"), held)),
+        (
+            NEEDLE_COMMAND.recorded,
+            make(NEEDLE_COMMAND.type_name, stamped(1, "world"), make("geometry_msgs/msg/Twist", vector, vector)),
+        ),
+    )
+    found = only(Recording(bag), NEEDLE_POSE)
+    assert np.allclose(np.diag(found.pose.covariance.reshape(6, 6)), [2, 1, 3, 5, 4, 6])
+    twist = only(Recording(bag), NEEDLE_COMMAND).twist
+    assert np.allclose([twist.linear.x, twist.linear.y, twist.angular.y], [0, -1, -1])
+
+
+@pytest.mark.parametrize("frame", ["camera_link", ""])
+def test_a_frame_that_leads_nowhere_says_how_to_help(tmp_path: Path, frame: str):
+    bag = bag_of(
+        tmp_path,
+        ("/tf_static", tf(transform("world", "dish", 10.0))),
+        (TRUE_NEEDLE.recorded, pose_stamped(1, frame)),
+        (TRUE_THREAD.recorded, make("nav_msgs/msg/Path", stamped(1), [])),
+    )
+    with pytest.raises(BagError, match="/truth/needle") as caught:
+        Recording(bag).records([TRUE_NEEDLE, TRUE_THREAD])
+    assert "frames told on /tf and /tf_static: dish, world" in str(caught.value)
+    assert f"--frame {frame or repr('')}" in str(caught.value)
+    assert len(list(Recording(bag).records([TRUE_THREAD]))) == 1
+    found = only(Recording(bag, dish_frame=frame), TRUE_NEEDLE)
+    assert (place(found.pose), found.header.frame_id) == ((1.0, 2.0, 3.0), "dish")
+
+
+def test_a_topic_of_an_unfit_type_is_named_when_it_is_asked_for(tmp_path: Path):
+    text = make(STRING, "here")
+    bag = bag_of(
+        tmp_path, (TRUE_NEEDLE.recorded, text), (TRUE_THREAD.recorded, make("nav_msgs/msg/Path", stamped(1), []))
+    )
+    recording = Recording(bag)
+    assert list(recording.unfit) == [TRUE_NEEDLE.recorded]
+    assert len(list(recording.records([TRUE_THREAD]))) == 1
+    for ask in (lambda: recording.records([TRUE_NEEDLE]), lambda: recording.require(TRUE_NEEDLE)):
+        with pytest.raises(
+            BagError, match=r"topic /truth/needle is of type std_msgs/msg/String, expected .*PoseStamped"
+        ):
+            ask()
+    with pytest.raises(BagError, match=r"has no messages on /needle/measured_cp .*remap one by TOPIC:="):
+        recording.require(NEEDLE_POSE)
+
+
+def test_a_type_that_is_defined_in_another_way_is_converted_or_refused(tmp_path: Path):
+    """Fields in another order: the bytes must not be passed on as ours."""
+    parts = "================\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    own = "geometry_msgs/Vector3 angular\ngeometry_msgs/Vector3 linear\n" + "=" * 64 + parts
+    with BagWriter(tmp_path / "bag") as bag:
+        definition = Definition("geometry_msgs/msg/Twist", "ros2msg", own)
+        bag.add_topic(NEEDLE_COMMAND.recorded, definition.type_name, definition)
+        bag.write(NEEDLE_COMMAND.recorded, 1, b"\0\1\0\0" + np.arange(6.0).tobytes())
+        bag.add_topic(IMAGE.recorded, IMAGE.type_name, Definition(IMAGE.type_name, "ros2msg", "int32 number\n"))
+        bag.write(IMAGE.recorded, 2, b"\0\1\0\0\1\0\0\0")
+    recording = Recording(Bag(tmp_path / "bag"))
+    found = only(recording, NEEDLE_COMMAND)
+    assert (found.twist.angular.x, found.twist.linear.x) == (0.0, 3.0)
+    assert list(recording.records([IMAGE])) == []
+    assert sum(recording.refused.values()) == 1
+
+
+def test_remapping_is_written_as_in_ros():
+    assert remapping("cam/image:=/camera/image_raw") == ("/cam/image", "/camera/image_raw")
+    for text in ("", ":=", "/a:=", ":=/b", "/a=/b", "/a:=/b:=/c", "/a b:=/c"):
+        with pytest.raises(ConfigurationError, match="FROM:=TO"):
+            remapping(text)
+
+
+def test_a_remap_that_cannot_be_is_refused(tmp_path: Path):
+    messages = [("/camera/rgb", pose_stamped()), ("/other", pose_stamped()), ("/needle", pose_stamped())]
+    bag_of(tmp_path, *messages)
+    for remap, words in (
+        (
+            {"/camera/rbg": "/x"},
+            r"has no topic /camera/rbg to remap; did you mean /camera/rgb\?; its topics: /camera/rgb",
+        ),
+        ({"/other": "/needle"}, "has /needle itself; /other cannot be remapped to it"),
+        ({"/other": "/x", "/needle": "/x"}, "cannot both be remapped to /x"),
+    ):
+        with pytest.raises(BagError, match=words):
+            Bag(tmp_path / "bag", remap=remap)
+    swapped = Bag(tmp_path / "bag", remap={"/other": "/needle", "/needle": "/other"})
+    assert [record.topic for record in swapped.records()] == ["/camera/rgb", "/needle", "/other"]
+
+
+@settings(deadline=None)
+@given(data=st.data())
+def test_transforms_agree_with_matrices(data: st.DataObject):
+    """A random tree against products of 4 x 4 matrices, there and back."""
+    random = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    names = [f"frame{index}" for index in range(6)]
+    matrices, told = {names[0]: np.eye(4)}, []
+    for index, name in enumerate(names[1:], start=1):
+        parent = names[random.integers(index)]
+        turn, x = Rotation.random(rng=random), float(random.normal())
+        told.append(transform(parent, name, x, turn))
+        own = np.eye(4)
+        own[:3, :3], own[0, 3] = turn.as_matrix(), x
+        matrices[name] = matrices[parent] @ own
+    tree = Transforms([("/tf_static", tf(*told))])
+    before, after = random.choice(names, 2)
+    point = random.normal(size=3)
+    rigid = tree.between(str(before), str(after), 0)
+    assert rigid is not None
+    expected = np.linalg.inv(matrices[str(after)]) @ matrices[str(before)] @ [*point, 1.0]
+    assert np.allclose(rigid.points(point), expected[:3])
+    assert np.allclose(rigid.inverse().points(rigid.points(point)), point)
+
+
+def test_frames_in_a_circle_and_broken_transforms_lead_nowhere():
+    broken = transform("a", "b", float("nan"))
+    tree = Transforms([("/tf_static", tf(transform("c", "d", 1.0), transform("d", "c", 1.0), broken))])
+    assert not tree.lead("c", "a")
+    assert not tree.lead("b", "a")

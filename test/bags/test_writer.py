@@ -1,0 +1,196 @@
+"""Recording ends badly: the disk is full, or the recorder is killed. What was recorded stays readable."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from rosbags.rosbag2 import Reader
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.storage import Definition
+from magnetosuture_thread.bags.writer import BagWriter, RecordingEndedError
+from magnetosuture_thread.errors import BagError
+from test.bags.bags import STRING, cdr, read
+
+# Writes messages that cannot be packed until something stops it, and says how many.
+RECORDER = """
+import os, resource, signal, sys
+from pathlib import Path
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError
+folder, limit = Path(sys.argv[1]), int(sys.argv[2])
+bag = BagWriter(folder, {"setup": "example"})
+bag.add_topic("/noise", "std_msgs/msg/UInt8MultiArray")
+if limit:
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+count = 0
+try:
+    while True:
+        data = bytes([0, 1, 0, 0]) + bytes(8) + (40_000).to_bytes(4, "little") + os.urandom(40_000)
+        bag.write("/noise", 10**9 + count * 10**7, data)
+        count += 1
+        if count % 20 == 0 and not limit:
+            print(count, flush=True)
+except BagError as error:
+    print(error)
+    bag.close()
+    try:
+        bag.write("/noise", 0, b"")
+    except BagError as again:
+        print(again)
+"""
+
+
+@pytest.mark.parametrize("limit", [1_000_000, 1_234_567, 3_000_000])
+def test_a_disk_that_takes_no_more(tmp_path: Path, limit: int):
+    folder = tmp_path / "full"
+    done = subprocess.run(
+        [sys.executable, "-c", RECORDER, str(folder), str(limit)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    first, second = done.stdout.splitlines()
+    bag = Bag(folder)
+    assert f"full: the disk takes no larger file after {bag.counts['/noise']} messages; what was recorded" in first
+    assert first.endswith(str(folder / "full_0.mcap"))
+    assert "is closed" in second
+    assert bag.counts["/noise"] >= limit // 40_100 - 7
+    assert bag.counts["/noise"] == len(read(bag))
+    assert not (folder / ".reserve").exists()
+    assert bag.damage is None or bag.damage.chunks == 0
+
+
+def test_with_room_for_its_summary_a_bag_that_was_ended_early_is_whole(tmp_path: Path, monkeypatch):
+    """A full disk: the reserve that is then given free takes summary and metadata.yaml."""
+    bag = BagWriter(tmp_path / "full", {"setup": "example"})
+    bag.add_topic("/text", STRING)
+    stream = bag._stream
+
+    class Full:
+        """A disk with no room until the reserve is gone."""
+
+        def write(self, data: bytes) -> int:
+            if (bag.folder / ".reserve").exists() and stream.tell() > 300_000:
+                stream.write(data[:1000])
+                raise OSError(28, "No space left on device")
+            return stream.write(data)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(stream, name)
+
+    monkeypatch.setattr(bag._writer, "_stream", Full())
+    written = 0
+
+    def fill() -> None:
+        nonlocal written
+        while True:
+            bag.write("/text", written * 10**8, cdr(STRING, f"{written} " + hex(hash(str(written))) * 100))
+            written += 1
+
+    with pytest.raises(RecordingEndedError, match=r"the disk is full after \d+ messages"):
+        fill()
+    bag.close()
+    found = Bag(tmp_path / "full")
+    assert found.damage is None
+    assert 0 < found.counts["/text"] < written
+    assert found.notes == {"setup": "example"}
+    with Reader(tmp_path / "full") as reader:
+        assert reader.message_count == found.counts["/text"]
+
+
+def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
+    folder = tmp_path / "killed"
+    with subprocess.Popen(
+        [sys.executable, "-c", RECORDER, str(folder), "0"], stdout=subprocess.PIPE, text=True
+    ) as recorder:
+        assert recorder.stdout is not None
+        said = 0
+        while said < 200:
+            said = int(recorder.stdout.readline())
+        recorder.send_signal(signal.SIGKILL)
+        recorder.wait()
+    bag = Bag(folder)
+    assert bag.damage is not None
+    assert "cut off" in str(bag.damage)
+    assert bag.counts["/noise"] >= said - 7  # a chunk holds seven
+    assert [time for _, time, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
+
+
+def test_messages_do_not_wait_longer_than_two_seconds(tmp_path: Path):
+    bag = BagWriter(tmp_path / "slow")
+    bag.add_topic("/text", STRING)
+    for index in range(100):
+        bag.write("/text", index * 10**9, cdr(STRING, str(index)))
+    assert Bag(tmp_path / "slow").counts["/text"] >= 97
+    bag.close()
+    assert Bag(tmp_path / "slow").damage is None
+
+
+def test_every_chunk_can_be_read_on_its_own(tmp_path: Path):
+    """Also without the summary and all other chunks: each tells its topics and types anew."""
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/text", STRING)
+        for index in range(60):
+            bag.write("/text", index * 10**10, cdr(STRING, str(index)))
+    file = tmp_path / "bag" / "bag_0.mcap"
+    whole = file.read_bytes()
+    middle = len(whole) // 2
+    (tmp_path / "half.mcap").write_bytes(bytes(2000) + whole[2000:middle])
+    records = list(Bag(tmp_path / "half.mcap").records())
+    assert records
+    assert all(record.decode().data == str(record.time // 10**10) for record in records)
+
+
+def test_a_type_that_nobody_knows_needs_a_definition(tmp_path: Path):
+    with BagWriter(tmp_path / "bag") as bag:
+        with pytest.raises(BagError, match="nothing defines the type their_msgs/msg/Thing"):
+            bag.add_topic("/thing", "their_msgs/msg/Thing")
+        definition = Definition("their_msgs/msg/Thing", "ros2msg", "int32 number\n")
+        bag.add_topic("/thing", "their_msgs/msg/Thing", definition)
+        bag.write("/thing", 1, b"\0\1\0\0\7\0\0\0")
+    (record,) = Bag(tmp_path / "bag").records()
+    assert record.decode().number == 7
+
+
+def test_metadata_has_no_anchors(tmp_path: Path):
+    """rosbag2 would read them; people would not."""
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/text", STRING)
+        bag.write("/text", 1, cdr(STRING, ""))
+    text = (tmp_path / "bag" / "metadata.yaml").read_text()
+    assert "&" not in text
+    assert yaml.safe_load(text)["rosbag2_bagfile_information"]["files"][0]["message_count"] == 1
+
+
+def test_whatever_interrupts_a_recorder_what_it_wrote_is_whole(tmp_path: Path):
+    """An alarm, as Ctrl-C would, at any place in the writer; the bag is closed as the `with` block ends."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for trial in range(40):
+            written = 0
+            with contextlib.suppress(KeyboardInterrupt), BagWriter(tmp_path / str(trial)) as bag:
+                bag.add_topic("/text", STRING)
+                bag.write("/text", 0, cdr(STRING, "0"))
+                signal.setitimer(signal.ITIMER_REAL, 0.002 + 0.0005 * trial)
+                while True:
+                    written += 1
+                    bag.write("/text", written * 10**8, cdr(STRING, str(written) * 1000))
+            found = Bag(tmp_path / str(trial))
+            assert found.damage is None, trial
+            assert found.counts["/text"] in (written, written + 1)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
