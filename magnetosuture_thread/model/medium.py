@@ -31,22 +31,30 @@ class Medium:
     bending_damping: float = 0.0
 
     @classmethod
-    def liquid(cls, viscosity: float, length: float, diameter: float, wetted_fraction: float = 0.5) -> Medium:
+    def liquid(
+        cls,
+        viscosity: float,
+        length: float,
+        diameter: float,
+        wetted_fraction: float = 0.5,
+        drag_anisotropy: float = 0.5,
+    ) -> Medium:
         """Return the drag of a slender thread that floats in a viscous liquid, without inertia.
 
-            zeta_perp = f 4 pi mu / ln(2 L / d),    zeta_par = zeta_perp / 2
+            zeta_perp = f 4 pi mu / ln(2 L / d),    zeta_par = a zeta_perp
 
         Args:
             viscosity: mu [Pa s].
             length: L of the thread [m].
             diameter: d of the thread [m].
             wetted_fraction: f, the part of the thread's surface that the liquid touches.
+            drag_anisotropy: a; half to leading order.
 
         Source: slender-body theory, leading order in 1 / ln(2 L / d). Deviation: none; the paper has no
         physical drag, only the damping kappa.
         """
         drag = wetted_fraction * 4.0 * math.pi * viscosity / math.log(2.0 * length / diameter)
-        return cls(drag_across=drag, drag_along=0.5 * drag)
+        return cls(drag_across=drag, drag_along=drag_anisotropy * drag)
 
     @classmethod
     def air(

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
+
+import numpy as np
 
 from magnetosuture_thread.configuration import Configuration, described, quantity
 from magnetosuture_thread.errors import ConfigurationError
@@ -13,18 +16,20 @@ from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_f
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
-from magnetosuture_thread.model.predictor import ThreadPredictor
+from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
 
 MEDIA = ("liquid", "air")
 OF_MEDIUM = {
     "viscosity": "liquid",
     "wetted_fraction": "liquid",
+    "drag_anisotropy": "liquid",
     "mass_per_length": "air",
     "air_drag": "air",
     "bending_damping": "air",
     "gravity": "air",
 }
+FIXED = {name: "what is compiled when it starts" for name in ("formulation", "solver")}  # why a node cannot change it
 SHARPEST_TURN = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
@@ -58,7 +63,7 @@ class ThreadModelSettings(Configuration):
         maximum=2000.0,
     )
     held_nodes: tuple[int, ...] = quantity(
-        (), "nodes that stay where they are at the start, as where tissue holds the thread", minimum=1, maximum=2000
+        (), "nodes that stay where they are, as where tissue holds the thread", minimum=1, maximum=2000
     )
     medium: str = quantity(
         "liquid",
@@ -74,6 +79,26 @@ class ThreadModelSettings(Configuration):
     )
     wetted_fraction: float = quantity(
         0.5, "part of the thread's surface in the liquid; half for a floating thread", minimum=0.05, maximum=1.0
+    )
+    drag_anisotropy: float = quantity(
+        0.5,
+        "drag of the liquid along the thread over that across it; half for a slender body",
+        minimum=0.05,
+        maximum=1.0,
+    )
+    attachment_offset: tuple[float, ...] = quantity(
+        (),
+        "where the thread is fixed, seen from the tracked tail: along the needle's heading, and to its left",
+        unit="m",
+        minimum=-0.01,
+        maximum=0.01,
+        multiple=2,
+    )
+    paper_damping: float = quantity(
+        0.95, "kappa, part of its velocity that a node keeps from step to step; for paper", minimum=0.0, maximum=0.999
+    )
+    paper_stiffness_weight: float = quantity(
+        0.0, "W_stiff; 0 takes the material's; for paper", minimum=0.0, maximum=1e12
     )
     mass_per_length: float = quantity(
         4e-6, "mass of the thread in air per length", unit="kg/m", minimum=1e-9, maximum=10.0
@@ -160,11 +185,11 @@ class ThreadModelSettings(Configuration):
         A segment could lie across such an obstacle with both of its nodes outside.
         """
         least = 0.5 * self.length / self.segments
-        for disc in self._discs():
+        for disc in self._discs:
             if disc.radius < least:
                 name, words = f"{self.GROUP}.disc_obstacles", "as every third number a radius of at least"
                 raise ConfigurationError(name, disc.radius, f"{words} {least:g} m, half of a segment")
-        for index, polygon in enumerate(self._polygons()):
+        for index, polygon in enumerate(self._polygons):
             if not polygon.has_room_for(least):
                 name, words = f"{self.GROUP}.polygon_obstacles", "polygons with room for a disc of a radius of at least"
                 raise ConfigurationError(name, f"polygon {index}", f"{words} {least:g} m, half of a segment")
@@ -174,8 +199,12 @@ class ThreadModelSettings(Configuration):
             raise ConfigurationError(
                 f"{self.GROUP}.segments", self.segments, f"at most {most}, so that a segment is longer than thick"
             )
-        if len(self.gravity) not in (0, 2):
-            raise ConfigurationError(f"{self.GROUP}.gravity", list(self.gravity), "two numbers, x and y, or none")
+        for name, pair, words in (
+            ("attachment_offset", self.attachment_offset, "along and to the left"),
+            ("gravity", self.gravity, "x and y"),
+        ):
+            if len(pair) not in (0, 2):
+                raise ConfigurationError(f"{self.GROUP}.{name}", list(pair), f"two numbers, {words}, or none")
         if self.formulation == "paper" and self.medium != "liquid":
             raise ConfigurationError(
                 f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
@@ -198,11 +227,13 @@ class ThreadModelSettings(Configuration):
 
     def obstacles(self) -> tuple[Disc | Polygon, ...]:
         """Return all obstacles: the discs, then the polygons, in the order in which margins number them."""
-        return (*self._discs(), *self._polygons())
+        return (*self._discs, *self._polygons)
 
+    @cached_property
     def _discs(self) -> tuple[Disc, ...]:
         return discs_from(self.disc_obstacles)
 
+    @cached_property
     def _polygons(self) -> tuple[Polygon, ...]:
         return polygons_from(
             self.GROUP, self.polygon_obstacles, self.polygon_sizes, self.corner_radius, self.corner_angle
@@ -225,12 +256,21 @@ class ThreadModelSettings(Configuration):
             attachment=Attachment(self.attachment),
             viscosity=self.viscosity,
             wetted_fraction=self.wetted_fraction,
+            drag_anisotropy=self.drag_anisotropy,
             rest_curvature=self.rest_curvature,
         )
         if self.medium == "air":
             air = Medium.air(self.mass_per_length, self.gravity, self.air_drag, self.bending_damping)
             return replace(thread, medium=air)
         return thread
+
+    def attachment_pose(self, pose: NeedlePose) -> NeedlePose:
+        """Return the pose of the point where the thread is fixed, from that of the needle's tail, in the plane."""
+        if not self.attachment_offset:
+            return pose
+        along, left = self.attachment_offset
+        x, y = pose.heading
+        return replace(pose, tail=pose.tail + np.array([along * x - left * y, along * y + left * x]))
 
     def predictor(self) -> ThreadPredictor:
         """Return a predictor of this thread among these obstacles, its kernels compiled.
@@ -240,7 +280,8 @@ class ThreadModelSettings(Configuration):
         """
         thread, surroundings = self.thread(), Surroundings(self.obstacles(), self.margin_range)
         tolerance = self.residual_tolerance
-        paper = PaperOptions.tuned(MATERIALS[self.material].stiffness_weight)
+        weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
+        paper = replace(PaperOptions.tuned(weight), damping=self.paper_damping)
         formulation = make_formulation(
             self.formulation, thread, surroundings, make_solver(self.solver, tolerance), tolerance, paper
         )

@@ -97,6 +97,7 @@ class Thread:
         attachment: Attachment,
         viscosity: float = 1.0,
         wetted_fraction: float = 0.5,
+        drag_anisotropy: float = 0.5,
         rest_curvature: float | tuple[float, ...] = 0.0,
     ) -> Thread:
         """Make a thread of a material that floats in a viscous liquid.
@@ -113,6 +114,7 @@ class Thread:
             viscosity: mu of the liquid [Pa s]; glycerin at room temperature is about 1.
             wetted_fraction: f, the part of the thread's surface that the liquid touches; half for a
                 thread that floats.
+            drag_anisotropy: zeta_par / zeta_perp.
             rest_curvature: see the attributes.
 
         Source: Euler-Bernoulli beam; drag as `Medium.liquid`. Deviation: the paper has no physical
@@ -124,7 +126,7 @@ class Thread:
             segments=segments,
             diameter=material.diameter,
             bending_stiffness=material.elastic_modulus * math.pi * material.diameter**4 / 64.0,
-            medium=Medium.liquid(viscosity, length, material.diameter, wetted_fraction),
+            medium=Medium.liquid(viscosity, length, material.diameter, wetted_fraction, drag_anisotropy),
             attachment=attachment,
             rest_curvature=rest_curvature,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ from numba.core.registry import CPUDispatcher
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.model import settings
+from magnetosuture_thread.model.choices import make_formulation
+from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.model.settings import ThreadModelSettings
 
@@ -76,6 +80,15 @@ def test_sharp_corners_are_rounded():
         ({"gravity": [0.0, -9.81]}, "gravity.*medium: air only"),
         ({"medium": "air", "viscosity": 0.5}, "viscosity.*medium: liquid only"),
         ({"rest_curvature": 900.0}, "half a radian"),
+        ({"drag_anisotropy": 0.0}, "from 0.05 to 1"),
+        ({"drag_anisotropy": float("nan")}, "from 0.05 to 1"),
+        ({"medium": "air", "drag_anisotropy": 0.7}, "drag_anisotropy.*medium: liquid only"),
+        ({"attachment_offset": [1e-3]}, "multiple of 2"),
+        ({"attachment_offset": [1e-3, 0.0, 1e-3, 0.0]}, "attachment_offset.*two numbers, along and to the left"),
+        ({"attachment_offset": [1e-3, float("nan")]}, "from -0.01 to 0.01 m"),
+        ({"attachment_offset": [1.0, 0.0]}, "from -0.01 to 0.01 m"),
+        ({"paper_damping": 1.0}, "from 0 to 0.999"),
+        ({"paper_stiffness_weight": -1.0}, "from 0 to"),
         ({"formulation": "paper", "medium": "air"}, "paper has no inertia"),
         ({"segments": 400}, "longer than thick"),
     ],
@@ -94,6 +107,8 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
         {"solver": "osqp", "attachment": "glued"},
         {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
         {"held_nodes": [20], "rest_curvature": 30.0},
+        {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},
+        {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
         {"polygon_obstacles": SQUARE, "polygon_sizes": [4], "margin_range": 0.02},
     ],
 )
@@ -116,6 +131,55 @@ def test_a_material_can_be_another_than_those_that_are_known():
     assert other.diameter == 1.2e-4
     assert other.bending_stiffness == pytest.approx(8.0 * known.bending_stiffness)
     assert other.medium.drag_across > known.medium.drag_across
+
+
+@pytest.mark.parametrize("anisotropy", [0.3, 0.5, 1.0])
+def test_the_drag_along_the_thread_is_a_part_of_that_across(anisotropy: float):
+    across = made().thread().medium.drag_across
+    medium = made(drag_anisotropy=anisotropy).thread().medium
+    assert (medium.drag_across, medium.drag_along) == (across, anisotropy * across)
+
+
+@pytest.mark.parametrize(
+    ("values", "damping", "weight"),
+    [
+        ({}, 0.95, 0.01),
+        ({"material": "silk_6_0"}, 0.95, 100.0),
+        ({"paper_damping": 0.5}, 0.5, 0.01),
+        ({"material": "silk_6_0", "paper_stiffness_weight": 7.0}, 0.95, 7.0),
+    ],
+)
+def test_the_papers_options_come_from_the_settings(monkeypatch, values: dict[str, Any], damping: float, weight: float):
+    given = []
+
+    def spied(*arguments: Any) -> Any:
+        given.append(arguments[-1])
+        return make_formulation(*arguments)
+
+    monkeypatch.setattr(settings, "make_formulation", spied)
+    made(formulation="paper", **values).predictor()
+    assert (given[0].damping, given[0].stiffness_weight) == (damping, weight)
+    assert given[0] == replace(PaperOptions.tuned(weight), damping=damping)
+
+
+def test_the_attachment_turns_with_the_needle():
+    pose = NeedlePose(3.0, np.array([1.0, 2.0]), np.array([0.6, 0.8]))
+    assert made().attachment_pose(pose) is pose
+    found = made(attachment_offset=[0.01, -0.005]).attachment_pose(pose)
+    np.testing.assert_allclose(found.tail, [1.0 + 0.006 + 0.004, 2.0 + 0.008 - 0.003], atol=1e-15)
+    assert found.heading is pose.heading
+    assert found.stamp == 3.0
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize("disc", [[0.0, 0.0, 0.005], [-0.01, 0.0, 0.03], [-0.01, 0.0, 0.0005]])
+def test_a_predictor_can_be_made_wherever_obstacles_are(formulation: str, disc: list[float]):
+    """Where it is warmed up there may be one, which says nothing of where the thread will be."""
+    assert not made(formulation=formulation, disc_obstacles=disc).predictor().started
+
+
+def test_what_cannot_be_solved_is_said_at_each_step_and_not_at_the_start():
+    assert not made(residual_tolerance=1e-12, rest_curvature=329.2).predictor().started
 
 
 def test_inertia_and_weight_come_from_the_settings():

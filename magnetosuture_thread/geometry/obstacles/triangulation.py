@@ -54,7 +54,10 @@ def triangulate(polygon: Polygon) -> Triangulation:
         ]
     )
     shape = shapely.Polygon(polygon.outline, polygon.holes)
-    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(shape))
+    try:
+        pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(shape))
+    except shapely.errors.GEOSException as error:  # corners apart by less than rounding
+        raise _refusal(polygon, str(error)) from error
     index = {tuple(vertex): i for i, vertex in enumerate(vertices.tolist())}
     try:
         triangles = np.array(

@@ -110,22 +110,39 @@ def distance_barrier(
         value[i] = 0.5 * (longest[i] ** 2 - square)
 
 
+@compiled
+def _write(
+    positions: Points,
+    apart: int,
+    longest: NDArray[np.float64],
+    sign: float,
+    nodes: NDArray[np.intp],
+    value: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    clearance: NDArray[np.float64],
+) -> None:
+    """Write the rows of `_rows`, with their gradient at the two nodes that they touch."""
+    count, dimension = len(positions) - apart, positions.shape[1]
+    spread = np.empty((count, 3, dimension))
+    distance_barrier(positions, apart, longest, value, spread)
+    for i in range(count):
+        nodes[i, 0], nodes[i, 1] = i, i + apart
+        shift, square = i - min(i, len(positions) - 3), 0.0
+        for a in range(dimension):
+            gradient[i, 0, a] = sign * spread[i, shift, a]
+            gradient[i, 1, a] = sign * spread[i, shift + apart, a]
+            square += spread[i, shift, a] * spread[i, shift, a]
+        value[i] *= sign
+        clearance[i] = sign * (longest[i] - np.sqrt(square))
+
+
 def _rows(
     positions: Points, apart: int, longest: float | NDArray[np.float64], kind: BarrierKind, sign: float
 ) -> BarrierRows:
     positions = np.ascontiguousarray(positions)
-    count = len(positions) - apart
-    bound = np.full(count, 1.0) * longest
-    value, gradient = np.empty(count), np.empty((count, 3, positions.shape[1]))
-    distance_barrier(positions, apart, bound, value, gradient)
-    first = np.arange(count)
-    shift = first - np.minimum(first, len(positions) - 3)
-    ends = np.stack([gradient[first, shift], gradient[first, shift + apart]], axis=1)
-    return BarrierRows(
-        kind=kind,
-        nodes=np.column_stack([first, first + apart]),
-        obstacle=np.full(count, NO_OBSTACLE),
-        value=sign * value,
-        gradient=sign * ends,
-        clearance=sign * (bound - np.linalg.norm(positions[apart:] - positions[:-apart], axis=1)),
-    )
+    count, dimension = len(positions) - apart, positions.shape[1]
+    bound, nodes = np.empty(count), np.empty((count, 2), dtype=np.intp)
+    value, gradient, clearance = np.empty(count), np.empty((count, 2, dimension)), np.empty(count)
+    bound[:] = longest
+    _write(positions, apart, bound, sign, nodes, value, gradient, clearance)
+    return BarrierRows(kind, nodes, np.full(count, NO_OBSTACLE), value, gradient, clearance)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Polygon, triangulate
 
 
@@ -39,3 +41,9 @@ def test_it_keeps_every_edge_once_and_the_area(seed: int, vertices: int, hole: b
 def test_vertices_in_line_are_kept():
     wall = [(0.001 * i, 0.0) for i in range(50)] + [(0.049 - 0.001 * i, 0.002) for i in range(50)]
     assert len(triangulate(Polygon(tuple(wall))).triangles) == 98
+
+
+def test_corners_apart_by_less_than_rounding_are_refused():
+    needle = Polygon(((0.0, 0.0), (0.005, 0.0), (0.0, 0.005))).smoothed(1e-320)
+    with pytest.raises(ConfigurationError, match="can be cut into triangles"):
+        triangulate(needle)

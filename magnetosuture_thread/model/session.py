@@ -1,0 +1,163 @@
+"""A session: needle poses and seen threads come, predictions go; what `thread_model` does without ROS."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.predictor import FARTHEST, NeedlePose, Prediction
+from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.model.thread import Thread
+
+EARLY = 30  # poses that may wait for the centreline of their frame
+REPLAYED = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
+WAITING = "waiting for the thread to be seen"
+_OBSTACLES = (Disc((0.0, 0.0), 1e-3), Polygon(((0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3))))  # one of each kind
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one needle pose.
+
+    Attributes:
+        stamp: of the pose [ns].
+        prediction: of the thread; None where there is none.
+        problem: why there is none; None while the thread is waited for.
+    """
+
+    stamp: int
+    prediction: Prediction | None = None
+    problem: InvalidInputError | SolverError | None = None
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the pose waits for the thread to be seen."""
+        return self.prediction is None and self.problem is None
+
+
+class ThreadSession:
+    """Predicts the thread over one run: from where it is first seen, by the poses that follow.
+
+    The node `thread_model` and the replay without a graph are both a shell around this, so that the same poses
+    give the same predictions to the last bit.
+
+    Args:
+        settings: thread, liquid and obstacles.
+
+    Attributes:
+        settings: in force.
+
+    Raises:
+        ConfigurationError: an obstacle cannot be used.
+    """
+
+    def __init__(self, settings: ThreadModelSettings) -> None:
+        self.settings = settings
+        self._predictor = settings.predictor()
+        # Obstacles may come later, and no callback shall wait for the compiler of what they need.
+        Surroundings(_OBSTACLES, settings.margin_range)
+        self._seen: tuple[int, Points] | None = None
+        self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=EARLY)
+        self._last: int | None = None
+
+    @property
+    def thread(self) -> Thread:
+        """The thread that is predicted."""
+        return self._predictor.thread
+
+    def prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
+        """Build what other settings need, and return what puts them in force, which cannot fail.
+
+        The prediction then goes on from where the thread is and as it moves. That takes some milliseconds, and with
+        an outline of a thousand corners a tenth of a second.
+
+        Raises:
+            ConfigurationError: they cannot be used.
+        """
+        if settings == self.settings:
+            return lambda: None
+        predictor = settings.predictor()
+
+        def put_in_force() -> None:
+            predictor.follow_on(self._predictor)
+            self.settings, self._predictor = settings, predictor
+
+        return put_in_force
+
+    def change(self, settings: ThreadModelSettings) -> None:
+        """Go on with other settings, from where the thread is and as it moves.
+
+        Raises:
+            ConfigurationError: they cannot be used; those before stay in force.
+        """
+        self.prepare(settings)()
+
+    def wants_seen(self, stamp: int) -> bool:
+        """Return whether a seen thread of this stamp [ns] would be of use; most are not."""
+        if self.settings.initial_shape != "seen":
+            return False
+        return not self._predictor.started or self._last is None or stamp < self._last - REPLAYED
+
+    def on_seen(self, stamp: int, centreline: Points) -> Iterator[Outcome]:
+        """Take the thread as the camera sees it, to start from.
+
+        Args:
+            stamp: of the frame [ns].
+            centreline: from the needle's tail on, shape (m, d) [m].
+
+        Returns:
+            What comes of the poses that waited for it, each worked out when it is asked for.
+        """
+        if not self.wants_seen(stamp):
+            return iter(())
+        self._seen = (stamp, centreline)
+        # The pose of the same frame may have come first, and others after it.
+        early = [(at, pose) for at, pose in self._early if at >= stamp]
+        self._early.clear()
+        return (self.on_pose(at, pose) for at, pose in early)
+
+    def on_pose(self, stamp: int, pose: NeedlePose) -> Outcome:
+        """Follow the needle to a pose.
+
+        Args:
+            stamp: of the frame [ns]; `pose.stamp` is the same in seconds.
+            pose: as tracked; where the thread is fixed to it, `attachment_offset` says.
+        """
+        if self._last is not None and stamp < self._last - REPLAYED:
+            self._predictor.reset()
+            self._last = None
+            self._early.clear()
+            if self._seen is not None and self._seen[0] > stamp:
+                self._seen = None  # of the time before it was set back
+        try:
+            attached = self.settings.attachment_pose(pose)
+            if self._predictor.started:
+                prediction = self._predictor.step(attached)
+            elif (centreline := self._initial_shape(stamp, pose, attached)) is not None:
+                prediction = self._predictor.start(attached, centreline)
+            else:
+                self._early.append((stamp, pose))
+                return Outcome(stamp)
+        except (InvalidInputError, SolverError) as error:
+            return Outcome(stamp, problem=error)
+        self._last = stamp
+        return Outcome(stamp, prediction)
+
+    def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
+        if self.settings.initial_shape == "straight":
+            return np.array([attached.tail, attached.tail - self.thread.length * attached.heading])
+        if self._seen is None or self._seen[0] != stamp:
+            return None
+        centreline = self._seen[1]
+        if attached is pose or len(centreline) < 2 or not np.all(np.abs(centreline) <= FARTHEST):
+            return centreline
+        # What is between the tail and where the thread is fixed belongs to the needle. How far the seen thread begins
+        # from the tail goes on to the predictor, which refuses one that is not this needle's.
+        nearest = int(np.linalg.norm(centreline - attached.tail, axis=1).argmin())
+        return np.vstack([centreline[:1] + (attached.tail - pose.tail), centreline[nearest + 1 :]])

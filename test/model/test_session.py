@@ -1,0 +1,462 @@
+"""A session: what waits, what is refused, what time set back does, and how it goes on with other settings."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model import settings as model_settings
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
+from magnetosuture_thread.model.settings import ThreadModelSettings
+
+EAST = np.array([1.0, 0.0])
+SECOND = 1_000_000_000
+SQUARE = [-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007]
+
+
+def made(**values: Any) -> ThreadModelSettings:
+    """Return settings from what a set-up file would hold."""
+    return from_mapping(ThreadModelSettings, values)
+
+
+def straight(**values: Any) -> ThreadSession:
+    """Return a session that needs no camera."""
+    return ThreadSession(made(initial_shape="straight", **values))
+
+
+def pose(stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> NeedlePose:
+    """Return a needle pose at a stamp [ns]."""
+    return NeedlePose(stamp * 1e-9, np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]))
+
+
+def go(session: ThreadSession, stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Outcome:
+    """Show a session a pose at a stamp [s]."""
+    at = round(stamp * SECOND)
+    return session.on_pose(at, pose(at, x, y, angle))
+
+
+def predicted(outcome: Outcome) -> Prediction:
+    """Return the prediction that there must be."""
+    assert outcome.problem is None
+    assert outcome.prediction is not None
+    return outcome.prediction
+
+
+def seen(x: float = 0.0, y: float = 0.0) -> Points:
+    """Return a thread that lies straight behind a needle that points east."""
+    return np.column_stack([x - np.linspace(0.0, 0.019, 60), np.full(60, y)])
+
+
+def on_a_curve(session: ThreadSession, first: int, last: int) -> list[Prediction]:
+    """Return what a session predicts of a needle that is driven in a curve, at 30 Hz."""
+    return [
+        predicted(go(session, 1.0 + k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0))
+        for k in range(first, last)
+    ]
+
+
+def test_a_pose_waits_for_the_thread_of_its_frame():
+    session = ThreadSession(made())
+    assert [go(session, 1.0 + 0.1 * k, 1e-4 * k).waiting for k in range(4)] == [True] * 4
+    # The first frame's thread was never seen.
+    found = list(session.on_seen(1_100_000_000, seen(1e-4)))
+    assert [outcome.stamp for outcome in found] == [1_100_000_000, 1_200_000_000, 1_300_000_000]
+    assert [predicted(outcome).status for outcome in found] == ["started", "solved", "solved"]
+    assert predicted(go(session, 1.4, 4e-4)).interval == pytest.approx(0.1)
+
+
+def test_the_thread_may_be_seen_first():
+    session = ThreadSession(made())
+    session.on_seen(SECOND, seen())  # kept, whether or not anybody asks for what comes of it
+    assert go(session, 0.9).waiting
+    assert predicted(go(session, 1.0)).status == "started"
+
+
+def test_only_so_many_poses_wait():
+    session = ThreadSession(made())
+    for k in range(3 * EARLY):
+        assert go(session, 1.0 + 0.01 * k).waiting
+    kept = list(session.on_seen(SECOND, seen()))
+    assert [outcome.waiting for outcome in kept] == [True] * EARLY  # that of the frame is among them no more
+    assert kept[0].stamp == SECOND + (2 * EARLY) * 10_000_000
+
+
+def test_an_early_pose_that_fails_does_not_keep_the_next_from_being_followed():
+    session = ThreadSession(made())
+    go(session, 1.0)
+    go(session, 1.0)  # its stamp is not later
+    go(session, 1.1)
+    found = list(session.on_seen(SECOND, seen()))
+    assert isinstance(found[1].problem, InvalidInputError)
+    assert [outcome.prediction is not None for outcome in found] == [True, False, True]
+
+
+def test_a_thread_that_cannot_be_the_needles_is_refused_and_waited_for_anew():
+    session = ThreadSession(made())
+    go(session, 1.0)
+    go(session, 1.1)
+    found = list(session.on_seen(SECOND, seen(y=5e-3)))
+    assert "from the needle's tail" in str(found[0].problem)
+    assert found[1].waiting
+    assert predicted(next(iter(session.on_seen(1_100_000_000, seen())))).status == "started"
+
+
+@pytest.mark.parametrize("offset", [[], [1e-3, 0.0]])
+@pytest.mark.parametrize(
+    "centreline",
+    [
+        np.empty((0, 2)),
+        np.zeros((1, 2)),
+        np.full((9, 2), np.nan),
+        np.full((9, 2), np.inf),
+        np.array([[0.0, 0.0], [1e300, -1e300]]),
+        np.array([[1e-3, 0.0], [1e-3, 0.0]]),
+    ],
+)
+def test_a_centreline_that_is_none_is_refused(centreline: Points, offset: list[float]):
+    session = ThreadSession(made(attachment_offset=offset))
+    go(session, 1.0)
+    (outcome,) = session.on_seen(SECOND, centreline)
+    assert isinstance(outcome.problem, InvalidInputError)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        NeedlePose(1.1, np.array([np.nan, 0.0]), EAST),
+        NeedlePose(1.1, np.array([1e300, 0.0]), EAST),
+        NeedlePose(1.1, np.zeros(2), 2.0 * EAST),
+        NeedlePose(0.9, np.zeros(2), EAST),
+    ],
+)
+@pytest.mark.parametrize("offset", [[], [1e-3, 5e-4]])
+def test_a_bad_pose_is_refused_and_changes_nothing(bad: NeedlePose, offset: list[float]):
+    session, other = straight(attachment_offset=offset), straight(attachment_offset=offset)
+    for one in (session, other):
+        go(one, 1.0)
+    refused = session.on_pose(round(bad.stamp * SECOND), bad)
+    assert isinstance(refused.problem, InvalidInputError)
+    assert not refused.waiting
+    np.testing.assert_array_equal(predicted(go(session, 1.2, 1e-3)).vertices, predicted(go(other, 1.2, 1e-3)).vertices)
+
+
+def test_a_step_that_is_not_solved_is_told_and_the_next_goes_on_from_before():
+    session = straight(residual_tolerance=1e-12)
+    go(session, 1.0)
+    failed = go(session, 1.001, 0.017, 0.013)
+    assert isinstance(failed.problem, SolverError)
+    assert go(session, 1.1, 1e-5).stamp == 1_100_000_000
+
+
+def test_only_threads_that_are_of_use_are_wanted():
+    session = ThreadSession(made())
+    assert session.wants_seen(0)
+    session.on_seen(SECOND, seen())
+    go(session, 1.0)
+    assert not session.wants_seen(2 * SECOND)
+    assert not session.wants_seen(SECOND // 2)  # late
+    assert session.wants_seen(-SECOND)  # time was set back
+    assert not straight().wants_seen(SECOND)
+
+
+def test_time_set_back_starts_anew():
+    session = ThreadSession(made())
+    session.on_seen(100 * SECOND, seen())
+    go(session, 100.0)
+    go(session, 100.1)
+    assert go(session, 1.0).waiting  # for a thread of that time
+    assert [predicted(outcome).status for outcome in session.on_seen(SECOND, seen())] == ["started"]
+    assert predicted(go(session, 1.1)).interval == pytest.approx(0.1)
+
+
+def test_a_late_pose_is_not_time_set_back():
+    session = straight()
+    go(session, 100.0)
+    assert isinstance(go(session, 99.0).problem, InvalidInputError)
+    assert predicted(go(session, 98.999999999)).status == "started"
+
+
+@pytest.mark.parametrize("stamp", [-(2**31) * SECOND, (2**31 - 1) * SECOND + SECOND - 1, 0])
+def test_any_stamp_that_a_message_can_hold_is_taken(stamp: int):
+    session = straight()
+    assert session.on_pose(stamp, pose(stamp)).stamp == stamp
+    assert predicted(session.on_pose(stamp + SECOND, pose(stamp + SECOND))).interval == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("values", [{}, {"formulation": "paper"}, {"attachment_offset": [5e-4, -3e-4]}])
+def test_two_sessions_say_the_same_to_the_last_bit(values: dict[str, Any]):
+    obstacles = {"disc_obstacles": [-0.005, 0.003, 0.002], "polygon_obstacles": SQUARE, "polygon_sizes": [4]}
+    one, other = (on_a_curve(straight(**values, **obstacles), 0, 60) for _ in range(2))
+    for first, second in zip(one, other, strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+        for rows, others in zip(first.margins, second.margins, strict=True):
+            np.testing.assert_array_equal(rows.value, others.value)
+
+
+# --- where the thread is fixed -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("attachment", ["pinned", "glued"])
+@pytest.mark.parametrize("offset", [[1e-3, 0.0], [-2e-3, 0.0], [0.0, 7e-4], [-1e-3, -5e-4], [0.01, 0.01]])
+def test_the_thread_hangs_where_it_is_fixed(offset: list[float], attachment: str):
+    session = straight(attachment_offset=offset, attachment=attachment)
+    for k in range(20):
+        angle = 0.02 * k
+        prediction = predicted(go(session, 1.0 + k / 30.0, 1e-4 * k, 0.0, angle))
+        along, left = offset
+        expected = [
+            1e-4 * k + along * np.cos(angle) - left * np.sin(angle),
+            along * np.sin(angle) + left * np.cos(angle),
+        ]
+        np.testing.assert_allclose(prediction.vertices[0], expected, atol=1e-12)
+    assert np.abs(prediction.stretch).max() < 1e-3
+
+
+def test_no_offset_is_an_offset_of_zero_to_the_last_bit():
+    one, other = straight(), straight(attachment_offset=[0.0, 0.0])
+    for first, second in zip(on_a_curve(one, 0, 20), on_a_curve(other, 0, 20), strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+@pytest.mark.parametrize(
+    ("offset", "begin", "end"),
+    [
+        ([2e-3, 0.0], 2e-3, 2e-3 - 0.019),  # fixed in front of the tail: what is between them is covered by the thread
+        ([-2e-3, 0.0], -2e-3, -2e-3 - 0.019),  # behind it: what is seen before belongs to the needle
+        ([0.0, 0.0], 0.0, -0.019),
+    ],
+)
+def test_a_seen_thread_begins_where_it_is_fixed(offset: list[float], begin: float, end: float):
+    session = ThreadSession(made(attachment_offset=offset))
+    go(session, 1.0)
+    prediction = predicted(next(iter(session.on_seen(SECOND, seen()))))
+    np.testing.assert_allclose(prediction.vertices[0], [begin, 0.0], atol=1e-12)
+    np.testing.assert_allclose(prediction.vertices[-1], [end, 0.0], atol=1e-9)
+
+
+def test_a_seen_thread_must_begin_at_the_tail_wherever_it_is_fixed():
+    session = ThreadSession(made(attachment_offset=[2e-3, 0.0]))
+    go(session, 1.0)
+    (outcome,) = session.on_seen(SECOND, seen(x=2e-3))
+    assert "from the needle's tail" in str(outcome.problem)
+
+
+# --- other settings ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"material": "silk_6_0"},
+        {"viscosity": 0.3, "drag_anisotropy": 0.7},
+        {"attachment": "glued"},
+        {"attachment_offset": [1e-3, 1e-3]},
+        {"margin_range": 1e-2},
+        {"disc_obstacles": [0.0, 0.02, 0.003]},
+        {"medium": "air", "gravity": [0.0, -0.01]},
+    ],
+)
+def test_it_goes_on_from_the_present_shape(values: dict[str, Any]):
+    session = straight()
+    before = on_a_curve(session, 0, 30)[-1]
+    session.change(made(initial_shape="straight", **values))
+    assert session.settings == made(initial_shape="straight", **values)
+    after = on_a_curve(session, 30, 31)[0]
+    assert after.interval == pytest.approx(1 / 30.0)  # no pose was lost, and no time
+    assert after.status == "solved"
+    assert np.linalg.norm(after.vertices[1:] - before.vertices[1:], axis=1).max() < 1.5e-3
+    assert np.abs(after.stretch).max() < 1e-3
+
+
+def test_what_does_not_concern_the_thread_does_not_move_it():
+    one, other = straight(), straight()
+    for session in (one, other):
+        on_a_curve(session, 0, 30)
+    one.change(made(initial_shape="straight", margin_range=1e-2, contact_tolerance=1e-4))
+    for first, second in zip(on_a_curve(one, 30, 40), on_a_curve(other, 30, 40), strict=True):
+        np.testing.assert_allclose(first.vertices, second.vertices, atol=1e-7)
+
+
+def test_the_same_settings_change_nothing_to_the_last_bit():
+    one, other = straight(), straight()
+    for session in (one, other):
+        on_a_curve(session, 0, 30)
+    one.change(made(initial_shape="straight"))
+    for first, second in zip(on_a_curve(one, 30, 40), on_a_curve(other, 30, 40), strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"segments": 60},
+        {"segments": 7},
+        {"length": 0.03, "segments": 40},
+        {"length": 0.01},
+        {"length": 0.001, "segments": 8},
+    ],
+)
+def test_other_segments_lie_along_the_thread_before(values: dict[str, Any]):
+    session = straight()
+    before = on_a_curve(session, 0, 30)[-1].vertices
+    session.change(made(initial_shape="straight", **values))
+    after = on_a_curve(session, 30, 31)[0].vertices
+    assert len(after) == session.thread.segments + 1
+    assert session.thread == session.settings.thread()
+    near = np.linalg.norm(after[:, None] - before, axis=2).min(axis=1)
+    along = session.thread.segment_length * np.arange(len(after))
+    assert near[along < 0.018].max() < 1e-3
+    assert np.linalg.norm(np.diff(after, axis=0), axis=1) == pytest.approx(session.thread.segment_length, rel=5e-3)
+
+
+def test_a_thread_in_air_keeps_its_speed():
+    air = {"medium": "air", "air_drag": 0.0, "initial_shape": "straight"}
+    session, other = ThreadSession(made(**air)), ThreadSession(made(**air))
+    for one in (session, other):
+        for k in range(10):
+            predicted(go(one, 1.0 + k / 100.0, 1e-3 * k))
+    session.change(made(**air, margin_range=1e-2))
+    same, kept = (predicted(go(one, 1.1, 1e-2)).vertices for one in (session, other))
+    np.testing.assert_allclose(same, kept, atol=1e-7)
+    session.change(made(**air, segments=50))
+    finer, kept = (predicted(go(one, 1.11, 1.1e-2)).vertices for one in (session, other))
+    np.testing.assert_allclose(finer[::2], kept, atol=1e-5)
+
+
+def test_tissue_that_takes_hold_later_holds_where_the_thread_is_then():
+    session = straight()
+    before = on_a_curve(session, 0, 30)[-1].vertices
+    session.change(made(initial_shape="straight", held_nodes=[20]))
+    for k in range(28, 0, -1):  # back, so that the thread gets slack
+        after = predicted(
+            go(session, 3.0 - k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0)
+        )
+    np.testing.assert_allclose(after.vertices[20], before[20], atol=1e-12)
+    session.change(made(initial_shape="straight"))
+    assert np.linalg.norm(on_a_curve(session, 100, 130)[-1].vertices[20] - before[20]) > 1e-3
+
+
+@pytest.mark.parametrize("values", [{}, {"formulation": "paper"}])
+def test_settings_that_cannot_be_used_leave_those_before_in_force(values: dict[str, Any], monkeypatch):
+    one, other = straight(**values), straight(**values)
+    for session in (one, other):
+        on_a_curve(session, 0, 20)
+    before = one.settings
+
+    def refuse(*_: Any) -> None:
+        raise ConfigurationError("thread_model.disc_obstacles", 1.0, "something else")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(model_settings, "make_formulation", refuse)
+        with pytest.raises(ConfigurationError):
+            one.change(made(initial_shape="straight", disc_obstacles=[0.0, 0.01, 0.002], **values))
+    assert one.settings is before
+    for first, second in zip(on_a_curve(one, 20, 30), on_a_curve(other, 20, 30), strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+def test_what_is_prepared_and_not_put_in_force_changes_nothing():
+    one, other = straight(), straight()
+    for session in (one, other):
+        on_a_curve(session, 0, 20)
+    put_in_force = one.prepare(made(initial_shape="straight", material="silk_6_0"))
+    np.testing.assert_array_equal(on_a_curve(one, 20, 25)[-1].vertices, on_a_curve(other, 20, 25)[-1].vertices)
+    put_in_force()  # later, and yet from where the thread is now
+    assert on_a_curve(one, 25, 26)[0].interval == pytest.approx(1 / 30.0)
+    assert one.settings.material == "silk_6_0"
+
+
+def test_a_change_while_the_thread_is_waited_for_loses_no_pose():
+    session = ThreadSession(made())
+    for k in range(3):
+        go(session, 1.0 + 0.1 * k)
+    session.change(made(material="silk_6_0"))
+    assert [predicted(outcome).stamp for outcome in session.on_seen(SECOND, seen())] == pytest.approx([1.0, 1.1, 1.2])
+
+
+def test_who_waits_for_the_camera_can_be_told_to_start_straight():
+    session = ThreadSession(made())
+    assert go(session, 1.0).waiting
+    session.change(made(initial_shape="straight"))
+    assert predicted(go(session, 1.1)).status == "started"
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        {"disc_obstacles": [-0.01, 1e-4, 0.001]},  # upon the thread, a little to one side
+        {"disc_obstacles": [-0.01, 0.0, 0.001]},  # upon it: no side is nearer
+        {"disc_obstacles": [0.0, 0.0, 0.005]},  # upon the needle
+        {"disc_obstacles": [-0.01, 0.0, 0.03]},  # upon everything
+        {"polygon_obstacles": [-0.012, -0.001, -0.006, -0.001, -0.006, 0.002, -0.012, 0.002], "polygon_sizes": [4]},
+    ],
+)
+def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, obstacle: dict[str, Any]):
+    """It pushes the thread out; where that is not possible, the step says so and its margins are not valid."""
+    session = straight(formulation=formulation)
+    go(session, 1.0)
+    settings = made(initial_shape="straight", formulation=formulation, **obstacle)
+    session.change(settings)
+    outside = settings.obstacles()[0]
+    proven = 0
+    for k in range(1, 15):
+        prediction = go(session, 1.0 + k / 30.0, 1e-4 * k).prediction
+        if prediction is None or not prediction.converged:
+            continue
+        proven += 1
+        margins = Margins.of(prediction.margins, settings.contact_tolerance)
+        free = margins.kind == 2
+        if isinstance(outside, Disc):
+            distance = outside.signed_distance(prediction.vertices)[0] - 30e-6
+            np.testing.assert_allclose(margins.clearance[free], distance[margins.node[free]], atol=1e-12)
+        assert margins.clearance[free].min(initial=0.0) > -1e-7
+    assert (proven > 0) == (obstacle.get("disc_obstacles") in (None, [-0.01, 1e-4, 0.001]))
+
+
+def test_no_kernel_is_compiled_by_a_change():
+    """In a process of its own: in this one others have compiled what they need."""
+    code = """
+import gc
+import numpy as np
+from numba.core.registry import CPUDispatcher
+from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.session import ThreadSession
+from magnetosuture_thread.model.settings import ThreadModelSettings
+
+def kernels():
+    ours = (found for found in gc.get_objects() if isinstance(found, CPUDispatcher))
+    return sum(len(f.signatures) for f in ours if f.py_func.__module__.startswith("magnetosuture_thread"))
+
+def made(**values):
+    return from_mapping(ThreadModelSettings, {"initial_shape": "straight", **values})
+
+square = [-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007]
+session, before, stamp = ThreadSession(made()), kernels(), 0
+for values in (
+    {}, {"segments": 60}, {"length": 0.03}, {"material": "silk_6_0"}, {"medium": "air", "gravity": [0.0, -1.0]},
+    {"disc_obstacles": [-0.01, 1e-4, 0.001]}, {"polygon_obstacles": square, "polygon_sizes": [4]},
+    {"disc_obstacles": [-0.01, 1e-4, 0.001], "polygon_obstacles": square, "polygon_sizes": [4]},
+    {"attachment": "glued", "rest_curvature": 20.0}, {"held_nodes": [20]}, {"attachment_offset": [1e-3, 0.0]},
+):
+    session.change(made(**values))
+    for _ in range(40):
+        stamp += 33_000_000
+        at = np.array([0.0, stamp * 5e-12])
+        outcome = session.on_pose(stamp, NeedlePose(stamp * 1e-9, at, np.array([1.0, 0.0])))
+        assert outcome.prediction is None or outcome.prediction.margins
+print(kernels() - before)
+"""
+    found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
+    assert found.stdout.strip() == "0"
