@@ -1,0 +1,147 @@
+"""Recorded experiments without a graph: what the needle did, and what the model predicts of it.
+
+The same core as in the nodes, fed by the same numbers, so that the predictions are those of the graph to the
+last bit; but as fast as the machine can, and with nothing that depends on time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.errors import BagError, MagnetosutureError
+from magnetosuture_thread.interface import CAMERA, COMPRESSED_IMAGE, NEEDLE_POSE
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
+from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.offline.changes import changed
+from magnetosuture_thread.offline.sights import Sights
+from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.study.sight import Sight
+
+SOURCES = ("auto", "camera", "poses")
+Progress = Callable[[float], None]
+
+
+def sights(
+    recording: Recording,
+    setup: Setup,
+    *,
+    source: str = "auto",
+    start: float = 0.0,
+    duration: float | None = None,
+    progress: Progress = lambda share: None,
+) -> Sights:
+    """Return what each camera frame, or each recorded pose, of a bag says, in their order.
+
+    Args:
+        recording: the bag.
+        setup: what to look for, and how large the dish is.
+        source: `camera`: the frames, tracked as `vision_tracker` does; `poses`: the needle poses and seen threads
+            that were recorded; `auto`: the camera where there are frames.
+        start: seconds into the bag to begin at.
+        duration: [s]; to the bag's end if None.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: the bag does not hold the source; or while going through, a length is not in metres.
+    """
+    return Sights(recording, setup, chosen_source(recording, source), start, duration, progress)
+
+
+def chosen_source(recording: Recording, source: str) -> str:
+    """Return `camera` or `poses`.
+
+    Raises:
+        BagError: the bag does not hold what was asked for.
+    """
+    has_frames = recording.camera is not None and bool(recording.counts.get(recording.camera.recorded))
+    has_poses = bool(recording.counts.get(NEEDLE_POSE.recorded))
+    if source == "auto" and (has_frames or has_poses):
+        return "camera" if has_frames else "poses"
+    if (source == "camera" and has_frames) or (source == "poses" and has_poses):
+        return source
+    for channel in (*CAMERA.values(), NEEDLE_POSE):
+        if channel.recorded in recording.unfit:
+            raise BagError(recording.path, recording.unfit[channel.recorded])
+    recording.require(NEEDLE_POSE if source == "poses" else COMPRESSED_IMAGE)
+    raise BagError(recording.path, "holds camera frames on a topic that is not theirs")  # require says all else
+
+
+@dataclass(frozen=True)
+class Step:
+    """What came of one sight with a needle.
+
+    Attributes:
+        sight: the sight.
+        outcome: the prediction, or why there is none.
+        margins: of the prediction; None where there is none, or where it did not converge, so that they prove nothing.
+        step_time: wall-clock time that the prediction took [s].
+        settings: in force.
+    """
+
+    sight: Sight
+    outcome: Outcome
+    margins: Margins | None
+    step_time: float
+    settings: ThreadModelSettings
+
+
+def predictions(given: Iterable[Sight], settings: ThreadModelSettings) -> Iterator[Step]:
+    """Predict the thread over one run, as `thread_model` does.
+
+    What the bag of `sights` says of obstacles and thread is taken as it comes. A pose before the thread is first seen
+    gives a step that waits, as live, and is not predicted later unless its own thread is seen; sights without a
+    needle give none.
+
+    Args:
+        given: by time.
+        settings: of thread, liquid and obstacles.
+
+    Raises:
+        ConfigurationError: an obstacle cannot be used.
+    """
+    return _steps(given, ThreadSession(settings))
+
+
+def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:
+    waiting: dict[int, Sight] = {}
+
+    def step(sight: Sight, outcome: Outcome, began: float) -> Step:
+        taken = time.perf_counter() - began
+        if outcome.waiting:
+            waiting[outcome.stamp] = sight
+        else:
+            waiting.pop(outcome.stamp, None)
+        margins, prediction = None, outcome.prediction
+        if prediction is not None and prediction.converged:
+            margins = Margins.of(prediction.margins, session.settings.contact_tolerance)
+        return Step(sight, outcome, margins, taken, session.settings)
+
+    for sight in given:
+        if isinstance(given, Sights):
+            _change(session, given)
+        if not sight.found:
+            continue
+        if len(sight.seen):
+            began = time.perf_counter()
+            for outcome in session.on_seen(sight.stamp, sight.seen):
+                yield step(waiting.get(outcome.stamp, sight), outcome, began)
+                began = time.perf_counter()
+        began = time.perf_counter()
+        pose = NeedlePose(sight.stamp * 1e-9, sight.tail, sight.heading)
+        yield step(sight, session.on_pose(sight.stamp, pose), began)
+        while len(waiting) > 2 * EARLY:
+            del waiting[next(iter(waiting))]
+
+
+def _change(session: ThreadSession, given: Sights) -> None:
+    """Take what the bag says of obstacles and thread; what cannot be used is counted, as live."""
+    for record in given.changes():
+        try:
+            session.change(changed(session.settings, record))
+        except MagnetosutureError as error:
+            given.refused[f"{record.topic}: {error}"] += 1

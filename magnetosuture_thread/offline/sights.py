@@ -1,0 +1,227 @@
+"""What each camera frame, or each recorded pose, of a bag says, with the thread that was seen and the true one."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.geometry.orientation import angle_of, heading_of, turned
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SEEN_THREAD, TRUE_THREAD, Channel
+from magnetosuture_thread.model.session import EARLY
+from magnetosuture_thread.offline.changes import CHANGING
+from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
+from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.study.sight import Sight
+from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.session import Seen, TrackerSession
+from magnetosuture_thread.vision.warm_up import warm_up
+
+MEASURED = 8  # the length of each so many seen threads is looked at
+LONGEST, SHORTEST = 3.0, 0.2  # of the set-up's thread; a seen one beyond is not of this set-up
+NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
+    "no needle for sure",
+    "a broken picture",
+    "a stamp not newer than the last",
+    "a pose that is none",
+)
+Progress = Callable[[float], None]
+_CHANGING = {channel.recorded for channel in CHANGING}
+
+
+class Sights(Iterator[Sight]):
+    """Goes through a bag; see `sights`. A few sights are held at a time, however long the bag is.
+
+    Attributes:
+        source: `camera` or `poses`.
+        count: camera frames, or poses, so far.
+        found: of these with a needle.
+        refused: the others, by why.
+        on_frame: called with stamp and what was seen in each frame, before its sight is given.
+        on_record: called with each recorded pose and seen thread, before its sight is given.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        setup: Setup,
+        source: str,
+        start: float,
+        duration: float | None,
+        progress: Progress,
+    ) -> None:
+        self.source = source
+        self.count = self.found = 0
+        self.refused: Counter[str] = Counter()
+        self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
+        self.on_record: Callable[[Record], None] = lambda record: None
+        self._dish = setup.vision.dish_diameter
+        self._length = setup.model.length
+        self._threads = self._measured = self._odd = 0
+        self._tracker: TrackerSession | None = None
+        if source == "camera":
+            warm_up()
+            self._tracker = TrackerSession(setup.vision)
+        self._recording = recording
+        begin = recording.start + round(start * 1e9)
+        whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
+        sources = (recording.camera,) if source == "camera" else (NEEDLE_POSE, SEEN_THREAD)
+        given = (TRUE_THREAD, *CHANGING, *sources)
+        channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
+        records = recording.records(channels, start=start, duration=duration)
+        self._changes = list(recording.records(CHANGING, duration=start)) if start > 0.0 else []
+        awaited = {TRUE_THREAD, SEEN_THREAD} & set(channels)
+        self._going = self._go(_telling(records, begin, whole, progress), awaited)
+
+    def __next__(self) -> Sight:
+        """Return the next sight.
+
+        Raises:
+            BagError: a length is not in metres, or the bag is damaged.
+        """
+        return next(self._going)
+
+    def changes(self) -> list[Record]:
+        """Return, once, what the bag says of obstacles and thread before the sight that was given last."""
+        changes, self._changes = self._changes, []
+        return changes
+
+    def thread_problem(self) -> str:
+        """Return in words that most of the seen threads are not of this set-up; else empty."""
+        if 2 * self._odd <= self._measured:
+            return ""
+        return (
+            f"{self._odd} of {self._measured} seen threads that were measured are longer than {LONGEST:g} times or "
+            f"shorter than {SHORTEST:g} times the set-up's {self._length:g} m: is it another thread?"
+        )
+
+    def _go(self, records: Iterator[Record], awaited: set[Channel]) -> Iterator[Sight]:
+        """Give a sight once what belongs to it has come, or cannot be expected any more."""
+        waiting: deque[Sight | Record] = deque()
+        parts: dict[str, dict[int, Points]] = {channel.recorded: {} for channel in awaited}
+        for record in records:
+            if record.topic in (TRUE_THREAD.recorded, SEEN_THREAD.recorded):
+                self._keep(parts[record.topic], record)
+            elif record.topic in _CHANGING:
+                waiting.append(record)
+            else:
+                waiting.append(self._pose(record) if self.source == "poses" else self._frame(record))
+            while waiting and (
+                len(waiting) > EARLY
+                or isinstance(head := waiting[0], Record)
+                or all(head.stamp in known for known in parts.values())
+            ):
+                yield from self._next(waiting.popleft(), parts)
+        while waiting:
+            yield from self._next(waiting.popleft(), parts)
+
+    def _next(self, head: Sight | Record, parts: dict[str, dict[int, Points]]) -> Iterator[Sight]:
+        if isinstance(head, Record):
+            self._changes.append(head)
+        else:
+            yield self._whole(head, parts)
+
+    def _keep(self, known: dict[int, Points], record: Record) -> None:
+        if record.topic == SEEN_THREAD.recorded:
+            self.on_record(record)
+        try:
+            points = read_path(record)
+        except InvalidInputError as error:
+            self.refused[f"{record.topic}: {error}"] += 1
+            points = np.empty((0, 2))
+        if record.topic == SEEN_THREAD.recorded and len(points):
+            self._check_place(record.topic, points)
+            if self._threads % MEASURED == 0:
+                length = float(arc_lengths(points)[-1]) / self._length
+                self._odd += not SHORTEST <= length <= LONGEST
+                self._measured += 1
+            self._threads += 1
+        known[stamp_of(record)] = points
+        if len(known) > 2 * EARLY:  # of a frame that never came
+            del known[next(iter(known))]
+
+    def _whole(self, sight: Sight, parts: dict[str, dict[int, Points]]) -> Sight:
+        none = np.empty((0, 2))
+        truth = parts.get(TRUE_THREAD.recorded, {}).get(sight.stamp, none)
+        seen = parts.get(SEEN_THREAD.recorded, {}).get(sight.stamp, none)
+        if not len(truth) and not len(seen):
+            return sight
+        return replace(sight, truth=truth, seen=seen if self.source == "poses" else sight.seen)
+
+    def _pose(self, record: Record) -> Sight:
+        """Return what a recorded pose says."""
+        self.count += 1
+        self.on_record(record)
+        stamp = stamp_of(record)
+        try:
+            tail, heading = read_pose(record)
+        except InvalidInputError as error:
+            self.refused[NO_POSE] += 1
+            return Sight(stamp, reason=str(error))
+        self._check_place(record.topic, tail)
+        self.found += 1
+        return Sight(stamp, tail, heading)
+
+    def _frame(self, record: Record) -> Sight:
+        """Return what a camera frame says, as `thread_model` would get it."""
+        assert self._tracker is not None
+        self.count += 1
+        message = record.decode()
+        stamp = int(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        began = time.perf_counter()
+        try:
+            image = pixels(message, record.type_name)
+        except InvalidInputError as error:
+            seen, kind = self._tracker.on_broken(error), BROKEN
+        else:
+            began = time.perf_counter()
+            seen, kind = self._tracker.on_image(stamp * 1e-9, image), NOT_FOUND
+            if seen.problem is not None:
+                kind = NOT_NEWER if seen.problem.field == "image.stamp" else BROKEN
+        taken = time.perf_counter() - began
+        self.on_frame(stamp, seen)
+        if not seen.tracked:
+            self.refused[kind] += 1
+            return Sight(stamp, reason=seen.track.reason, processing=taken)
+        self.found += 1
+        # A message says the heading as a quaternion, which costs the last bits.
+        z, w = turned(angle_of(seen.track.heading))
+        heading = heading_of(0.0, 0.0, z, w, NEEDLE_POSE.name)
+        return Sight(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
+
+    def _check_place(self, topic: str, points: Points) -> None:
+        """Refuse what is farther away than the dish is wide."""
+        if np.abs(points).max() > self._dish:  # what is not finite is refused by the model
+            worst = points.reshape(-1, 2)[np.abs(points).reshape(-1, 2).max(axis=1).argmax()]
+            where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {self._dish:g} m wide"
+            raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another set-up's?")
+
+
+def pixels(message: Any, type_name: str) -> Any:
+    """Return a decoded message's image; see `decode_image` and `unpack_image`.
+
+    Raises:
+        InvalidInputError: it is broken.
+    """
+    if type_name == COMPRESSED_IMAGE.type_name:
+        return decode_image(message.data)
+    return np.asarray(unpack_image(message.data, message.height, message.width, message.step, message.encoding))
+
+
+def _telling(records: Iterator[Record], begin: int, whole: float, progress: Progress) -> Iterator[Record]:
+    """Go through records and tell how far, a thousand times at the most: showing it takes longer than a step."""
+    told = 0.0
+    for record in records:
+        share = min(1.0, (record.time - begin) * 1e-9 / max(whole, 1e-9))
+        if share >= told:
+            progress(share)
+            told = share + 1e-3
+        yield record

@@ -1,0 +1,349 @@
+"""Recorded experiments without a graph."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.interface import (
+    COMPRESSED_IMAGE,
+    MARGINS,
+    MATERIAL,
+    NEEDLE_POSE,
+    OBSTACLE_SET,
+    PREDICTED_THREAD,
+    SEEN_THREAD,
+    TRUE_THREAD,
+)
+from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.jobs.replay_offline import replay_offline
+from magnetosuture_thread.offline.messages import header, make, path_message, pose_message
+from magnetosuture_thread.offline.packing import packed_margins, packed_prediction
+from magnetosuture_thread.offline.predictions import predictions, sights
+from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.reference import ReferenceTrajectory
+
+SETUP = read_setup("petri_35mm_polyamide")
+
+
+@pytest.fixture(scope="module")
+def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceTrajectory) -> Path:
+    """Return a bag of poses of one second."""
+    path = tmp_path_factory.mktemp("poses") / "pull"
+    record(straight_pull, SETUP, path, duration=1.0, poses=True, noise=1e-5)
+    return path
+
+
+def changed(bag: Path, folder: Path, change: Callable[[Record, Any], Any]) -> Path:
+    """Write a bag again, each message as it comes out of a function; those that come out as None are left out."""
+    source = Bag(bag)
+    with BagWriter(folder, source.notes) as writer:
+        for topic, type_name in source.topics.items():
+            writer.add_topic(topic, type_name)
+        for old in source.records(set(source.topics)):
+            message = change(old, old.decode())
+            if message is not None:
+                writer.write_message(old.topic, old.time, message)
+    return folder
+
+
+def at(message: Any, stamp: int) -> Any:
+    """Return a message with another stamp."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+    return message
+
+
+def test_sights_of_poses_hold_what_was_recorded(pose_bag: Path, straight_pull: ReferenceTrajectory):
+    shares: list[float] = []
+    found = sights(Recording(Bag(pose_bag)), SETUP, progress=shares.append)
+    assert found.source == "poses"
+    seen = list(found)
+    assert (found.count, found.found, found.refused) == (30, 30, {})
+    assert [s.stamp for s in seen] == [round((1.0 + k / 30.0) * 1e9) for k in range(30)]
+    for k, sight in enumerate(seen):
+        tail, _, thread = straight_pull.at(k / 30.0)
+        assert np.linalg.norm(sight.tail - tail) < 6e-5
+        assert np.linalg.norm(sight.heading) == pytest.approx(1.0, abs=1e-12)
+        assert sight.seen.shape == (64, 2)
+        assert np.array_equal(sight.seen[0], sight.tail)
+        assert np.abs(sight.seen[-1] - thread[-1]).max() < 6e-5
+        assert sight.truth.shape == (51, 2)
+        assert np.allclose(sight.truth[0], tail, atol=1e-12)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_sights_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_pull: ReferenceTrajectory):
+    found = sights(Recording(Bag(short_bag)), SETUP)
+    seen = list(found)
+    assert (found.source, found.count, found.found) == ("camera", 30, 28)
+    assert found.refused == {"no needle for sure": 2}
+    assert [bool(s.reason) for s in seen] == [True] * 2 + [False] * 28
+    for k, sight in enumerate(seen[2:], 2):
+        assert np.linalg.norm(sight.tail - straight_pull.at(k / 30.0)[0]) < 1e-4
+        assert sight.seen.shape == (64, 2)
+        assert sight.truth.shape == (51, 2)
+        assert sight.processing > 0.0
+
+
+def test_a_window_is_a_part_of_the_whole(pose_bag: Path):
+    recording = Recording(Bag(pose_bag))
+    whole = [s.stamp for s in sights(recording, SETUP)]
+    assert [s.stamp for s in sights(recording, SETUP, start=0.5, duration=0.25)] == [
+        stamp for stamp in whole if 0.5e9 <= stamp - whole[0] <= 0.75e9
+    ]
+
+
+def test_the_source_must_be_there(pose_bag: Path, tmp_path: Path):
+    with pytest.raises(BagError, match="camera/image_raw/compressed"):
+        sights(Recording(Bag(pose_bag)), SETUP, source="camera")
+    blind = changed(pose_bag, tmp_path / "blind", lambda old, m: m if old.topic == TRUE_THREAD.recorded else None)
+    for source in ("auto", "poses"):
+        with pytest.raises(BagError, match="has no messages on"):
+            sights(Recording(Bag(blind)), SETUP, source=source)
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    with pytest.raises(BagError, match=r"empty\.mcap"):
+        replay_offline(tmp_path / "empty.mcap", tmp_path / "out")
+    with pytest.raises(BagError, match="asked to start at 7 s"):
+        replay_offline(pose_bag, tmp_path / "out", start=7.0)
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
+    summary = replay_offline(pose_bag, tmp_path / "a" / "out")
+    assert (summary.frames, summary.tracked, summary.predicted, summary.source) == (30, 30, 30, "poses")
+    assert summary.error_truth is not None
+    assert summary.error_truth["count"] == 30
+    assert summary.error_truth["maximum"] < 1.0
+    assert summary.speed is not None
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", "replay", "--offline", str(pose_bag), "--output", "b"]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert shown.returncode == 0, shown.stderr
+    assert "times as fast as recorded" in shown.stdout
+    one, other = tmp_path / "a" / "out", tmp_path / "b"
+    names = sorted(path.name for path in (one / "bag").iterdir())
+    assert names == sorted(path.name for path in (other / "bag").iterdir()) == ["bag_0.mcap", "metadata.yaml"]
+    for name in names:
+        assert (one / "bag" / name).read_bytes() == (other / "bag" / name).read_bytes()
+    assert json.loads((one / "summary.json").read_text())["predicted"] == 30
+    assert cv2.imread(str(one / "summary.png")) is not None
+    counts = Bag(one / "bag").counts
+    assert {topic: counts[topic] for topic in counts if counts[topic]} == {
+        channel.recorded: 30 for channel in (NEEDLE_POSE, SEEN_THREAD, PREDICTED_THREAD, MARGINS)
+    }
+
+
+def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path):
+    def pose(old: Record, message: Any) -> Any:
+        if old.topic == NEEDLE_POSE.recorded:
+            message.pose.pose.position.x *= 1e3
+        return message
+
+    def thread(old: Record, message: Any) -> Any:
+        if old.topic == SEEN_THREAD.recorded:
+            for each in message.poses:
+                each.pose.position.x *= 1e3
+        return message
+
+    for name, change in ((NEEDLE_POSE.recorded, pose), (SEEN_THREAD.recorded, thread)):
+        bag = changed(pose_bag, tmp_path / name.replace("/", "_"), change)
+        with pytest.raises(BagError) as caught:
+            replay_offline(bag, tmp_path / "out")
+        for words in (name, "the dish is 0.035 m wide", "are these millimetres"):
+            assert words in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_thread_of_another_length_is_said(pose_bag: Path, tmp_path: Path):
+    def short(old: Record, message: Any) -> Any:
+        if old.topic == SEEN_THREAD.recorded:
+            message.poses = message.poses[:8]
+        return message
+
+    bag = changed(pose_bag, tmp_path / "short", short)
+    said: list[str] = []
+    summary = replay_offline(bag, tmp_path / "out", say=said.append)
+    assert "is it another thread?" in summary.remark
+    assert summary.remark in said
+
+
+def test_stamps_that_go_back_are_refused_and_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):
+    def back(old: Record, message: Any) -> Any:
+        stamp = stamp_of(old)
+        late = old.topic in (NEEDLE_POSE.recorded, COMPRESSED_IMAGE.recorded) and stamp > round(1.9e9)
+        return at(message, stamp - 500_000_000) if late else message
+
+    for bag, tracked in ((pose_bag, 30), (short_bag, 26)):
+        summary = replay_offline(changed(bag, tmp_path / f"{bag.parent.name}", back), tmp_path / f"out{tracked}")
+        assert (summary.frames, summary.tracked) == (30, tracked)
+        assert summary.refused["a stamp not newer than the last"] == 2
+        assert summary.predicted == min(tracked, 28)
+
+
+def test_time_that_goes_back_by_more_begins_anew(pose_bag: Path, tmp_path: Path):
+    def back(old: Record, message: Any) -> Any:
+        stamp = stamp_of(old)
+        return at(message, stamp + (3 * 10**9 if stamp < 1.5e9 else 0))
+
+    summary = replay_offline(changed(pose_bag, tmp_path / "back", back), tmp_path / "out")
+    assert summary.predicted == 30
+    assert summary.error_seen is not None
+    assert summary.error_seen["maximum"] < 1.0
+
+
+def test_broken_pictures_and_poses_are_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):
+    def torn(old: Record, message: Any) -> Any:
+        if old.topic == COMPRESSED_IMAGE.recorded and stamp_of(old) > round(1.9e9):
+            message.data = message.data[:7]
+        if old.topic == NEEDLE_POSE.recorded and stamp_of(old) > round(1.9e9):
+            message.pose.pose.orientation.w = 3.0
+        return message
+
+    summary = replay_offline(changed(short_bag, tmp_path / "torn", torn), tmp_path / "out")
+    assert summary.refused == {"no needle for sure": 2, "a broken picture": 2}
+    summary = replay_offline(changed(pose_bag, tmp_path / "bent", torn), tmp_path / "out2")
+    assert (summary.tracked, summary.refused) == (28, {"a pose that is none": 2})
+
+
+def test_nothing_predicted_is_said_with_the_reason(pose_bag: Path, tmp_path: Path):
+    blind = changed(pose_bag, tmp_path / "blind", lambda old, m: None if old.topic == SEEN_THREAD.recorded else m)
+    with pytest.raises(BagError, match="30 of 30 poses had a needle; waiting for the thread to be seen"):
+        replay_offline(blind, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    steps = list(predictions(sights(Recording(Bag(blind)), SETUP), replace(SETUP.model, initial_shape="straight")))
+    assert len(steps) == 30
+    assert all(step.outcome.prediction is not None for step in steps)
+
+
+def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_path: Path):
+    whole = next(short_bag.glob("*.mcap")).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 3 // 4])
+    damage = Bag(tmp_path / "cut.mcap").damage
+    assert damage is not None
+    said: list[str] = []
+    summary = replay_offline(tmp_path / "cut.mcap", tmp_path / "out", say=said.append)
+    assert 0 < summary.predicted < 28
+    assert summary.damage == str(damage)
+    assert any(str(damage) in line for line in said)
+
+
+def test_poses_may_wait_for_their_thread(pose_bag: Path):
+    """The thread is seen late: poses before are answered, and not predicted."""
+    recording = Recording(Bag(pose_bag))
+    seen = list(sights(recording, SETUP))
+    late = [replace(s, seen=np.empty((0, 2))) if k < 5 else s for k, s in enumerate(seen)]
+    steps = list(predictions(late, SETUP.model))
+    assert [step.outcome.waiting for step in steps] == [True] * 5 + [False] * 25
+    assert steps[5].outcome.stamp == steps[5].sight.stamp == seen[5].stamp
+
+
+@pytest.mark.parametrize("frame", ["dish", "another_frame", ""])
+@pytest.mark.parametrize("count", [0, 1, 2, 64])
+def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
+    points = np.random.default_rng(count).normal(size=(count, 2))
+    message = path_message(5 * 10**9 + 7, points)
+    for pose in message.poses:
+        pose.header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id=frame)
+    data = bytes(typestore().serialize_cdr(message, SEEN_THREAD.type_name))
+    given = Record(SEEN_THREAD.recorded, SEEN_THREAD.type_name, 3, data)
+    assert np.array_equal(read_path(given), points)
+    assert stamp_of(given) == 5 * 10**9 + 7
+    if count > 1:
+        message.poses[1].header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id="longer_than_it")
+        data = bytes(typestore().serialize_cdr(message, SEEN_THREAD.type_name))
+        assert np.array_equal(read_path(replace(given, data=data)), points)
+    for cut in range(0, len(data), 5):
+        with pytest.raises(BagError):
+            read_path(replace(given, data=data[:cut]))
+
+
+def test_poses_are_read_as_a_node_gets_them():
+    heading = np.array([np.cos(2.5), np.sin(2.5)])
+    message = pose_message(10**9, np.array([1e-3, -2e-3]), heading, None)
+    data = bytes(typestore().serialize_cdr(message, NEEDLE_POSE.type_name))
+    given = Record(NEEDLE_POSE.recorded, NEEDLE_POSE.type_name, 3, data)
+    tail, along = read_pose(given)
+    assert tail.tolist() == [1e-3, -2e-3]
+    assert along == pytest.approx(heading, abs=1e-15)
+    with pytest.raises(BagError):
+        read_pose(replace(given, data=data[:40]))
+
+
+def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
+    steps = list(predictions(list(sights(Recording(Bag(pose_bag)), SETUP))[:3], SETUP.model))
+    prediction, margins = steps[-1].outcome.prediction, steps[-1].margins
+    assert prediction is not None
+    assert margins is not None
+    store = typestore()
+    for material in ("polyamide_7_0", "", "x", "xyz"):
+        data = packed_prediction(12 * 10**9 + 34, prediction, material)
+        message: Any = store.deserialize_cdr(data, PREDICTED_THREAD.type_name)
+        assert bytes(store.serialize_cdr(message, PREDICTED_THREAD.type_name)) == data
+        assert (message.material, message.header.stamp.nanosec, message.step_time) == (material, 34, 0.0)
+        assert np.array_equal([[p.x, p.y] for p in message.vertices], prediction.vertices)
+        assert np.array_equal(message.stretch, prediction.stretch)
+    for given in (margins, replace(margins, touching=(3, 4)), None):
+        data = packed_margins(7, given, "" if given else "for a reason")
+        message = store.deserialize_cdr(data, MARGINS.type_name)
+        assert bytes(store.serialize_cdr(message, MARGINS.type_name)) == data
+        assert message.valid == (given is not None)
+        assert message.contact_state == (0 if given is None else 2 if given.touching else 1)
+        if given is not None:
+            assert np.array_equal(message.clearance, given.clearance)
+            assert [entry.obstacle for entry in message.least] == [entry.obstacle for entry in given.least]
+
+
+def test_obstacles_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_path: Path):
+    source = Bag(pose_bag)
+    with BagWriter(tmp_path / "told", source.notes) as writer:
+        for topic, type_name in (
+            *source.topics.items(),
+            (OBSTACLE_SET.recorded, OBSTACLE_SET.type_name),
+            (MATERIAL.recorded, MATERIAL.type_name),
+        ):
+            writer.add_topic(topic, type_name)
+        for record in source.records(set(source.topics)):
+            writer.write(record.topic, record.time, record.data)
+        for time, radius in ((1.39, 0.002), (1.61, -1.0)):
+            stamp = round(time * 1e9)
+            disc = make("magnetosuture_msgs/msg/Disc", x=0.0, y=0.006, radius=radius)
+            obstacles = make(
+                OBSTACLE_SET.type_name, header=header(stamp), discs=[disc], polygons=[], corner_radius=np.empty(0)
+            )
+            writer.write_message(OBSTACLE_SET.recorded, stamp, obstacles)
+        silk = make(
+            MATERIAL.type_name,
+            header=header(stamp),
+            name="silk_6_0",
+            diameter=0.0,
+            elastic_modulus=0.0,
+            viscosity=0.0,
+            drag_anisotropy=0.0,
+            rest_curvature=np.empty(0),
+            attachment="",
+            attachment_offset=np.empty(0),
+        )
+        writer.write_message(MATERIAL.recorded, stamp, silk)
+    for start, first in ((0.0, 12), (0.5, 0)):
+        seen = sights(Recording(Bag(tmp_path / "told")), SETUP, start=start)
+        steps = list(predictions(seen, SETUP.model))
+        assert [len(step.settings.obstacles()) for step in steps] == [0] * first + [1] * (len(steps) - first)
+        assert {step.settings.material for step in steps} == {SETUP.model.material, "silk_6_0"}
+        assert steps[-1].settings.material == "silk_6_0"
+        assert all(step.outcome.prediction is not None for step in steps)
+        assert sum(seen.refused.values()) == 1
