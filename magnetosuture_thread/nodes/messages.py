@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import struct
-from collections.abc import Sequence
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -17,24 +15,32 @@ from geometry_msgs.msg import (
     TwistStamped,
     Vector3,
 )
-from magnetosuture_msgs.msg import BarrierMargin, PredictedThread, SafetyMargins, TrackerState
+from magnetosuture_msgs.msg import TrackerState
 from nav_msgs.msg import Path
-from std_msgs.msg import ColorRGBA, Header
-from visualization_msgs.msg import Marker, MarkerArray
+from std_msgs.msg import Header
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, triangulate
+from magnetosuture_thread.geometry.orientation import angle_of, heading_of, turned
 from magnetosuture_thread.interface import DISH_FRAME
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.vision.look import State, Track
 
 _IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
-FULL_COLOUR_CLEARANCE = 1e-3  # m; markers turn from green to red over this
+
+
+def nanoseconds(stamp: Time) -> int:
+    """Return a stamp in nanoseconds."""
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
+
+
+def stamp_of(nanoseconds: int) -> Time:
+    """Return a time in nanoseconds as a stamp."""
+    return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
 
 
 def seconds(stamp: Time) -> float:
     """Return a stamp in seconds."""
-    return (stamp.sec * 1_000_000_000 + stamp.nanosec) * 1e-9
+    return nanoseconds(stamp) * 1e-9
 
 
 def header_stamp(data: bytes) -> int | None:
@@ -69,7 +75,7 @@ def pose_message(
             that it is not known, if None.
     """
     message = PoseWithCovarianceStamped(header=header(stamp))
-    message.pose.pose = _pose(tail, math.atan2(heading[1], heading[0]))
+    message.pose.pose = flat_pose(tail, angle_of(heading))
     if covariance is not None:
         whole = np.zeros((6, 6))
         whole[np.ix_(_IN_PLANE, _IN_PLANE)] = covariance
@@ -94,29 +100,22 @@ def tracker_state(stamp: Time, track: Track, processing_time: float) -> TrackerS
 
 def placed(stamp: Time, point: np.ndarray, angle: float) -> PoseStamped:
     """Return a pose in the dish plane that has no uncertainty: a truth, or a wish."""
-    return PoseStamped(header=header(stamp), pose=_pose(point, angle))
+    return PoseStamped(header=header(stamp), pose=flat_pose(point, angle))
 
 
 def needle_pose(message: PoseWithCovarianceStamped) -> NeedlePose:
     """Return the needle's pose in the plane.
 
     Raises:
-        InvalidInputError: wrong frame, not finite, or no unit quaternion.
+        InvalidInputError: wrong frame, no stamp, or no unit quaternion.
     """
     require_dish_frame(message.header.frame_id, "needle/measured_cp")
+    stamp = message.header.stamp
+    if stamp.nanosec >= 1_000_000_000:  # the prediction could not be stamped by it
+        raise InvalidInputError("needle/measured_cp.header.stamp.nanosec", stamp.nanosec, "less than a second's")
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    tail = np.array([position.x, position.y])
-    # Not by squares: Python raises an error for those of what a hostile message may hold.
-    size = math.hypot(q.x, q.y, q.z, q.w)
-    if not abs(size - 1.0) < 1e-3:
-        raise InvalidInputError("needle/measured_cp.pose.orientation", f"norm {size:g}", "a unit quaternion")
-    along = np.array([1.0 - 2.0 * (q.y * q.y + q.z * q.z), 2.0 * (q.x * q.y + q.w * q.z)])
-    length = float(np.linalg.norm(along))
-    if length < 1e-3:
-        raise InvalidInputError(
-            "needle/measured_cp.pose.orientation", "an upright needle", "an x axis in the dish plane"
-        )
-    return NeedlePose(seconds(message.header.stamp), tail, along / length)
+    heading = heading_of(q.x, q.y, q.z, q.w, "needle/measured_cp.pose.orientation")
+    return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
 
 
 class PathMaker:
@@ -160,105 +159,12 @@ def twist_message(stamp: Time, velocity: np.ndarray) -> TwistStamped:
     return message
 
 
-def prediction_message(stamp: Time, prediction: Prediction, material: str, step_time: float) -> PredictedThread:
-    """Return a predicted thread; `step_time` is the wall-clock time it took [s]."""
-    return PredictedThread(
-        header=header(stamp),
-        formulation=prediction.formulation,
-        material=material,
-        vertices=_points(prediction.vertices),
-        stretch=prediction.stretch.tolist(),
-        solver=prediction.solver,
-        solver_status=prediction.status,
-        residual=prediction.residual,
-        interval=prediction.interval,
-        substeps=prediction.substeps,
-        step_time=step_time,
-    )
+def flat_pose(point: np.ndarray, angle: float) -> Pose:
+    """Return a pose in the dish plane: a point of shape (2,) [m] and an angle from the x axis on [rad]."""
+    z, w = turned(angle)
+    return Pose(position=Point(x=float(point[0]), y=float(point[1])), orientation=Quaternion(z=z, w=w))
 
 
-def margins_message(stamp: Time, prediction: Prediction, contact_tolerance: float) -> SafetyMargins:
-    """Return every barrier of a prediction, the least of each kind, and what touches."""
-    message = SafetyMargins(header=header(stamp), valid=True, contact_state=SafetyMargins.CONTACT_FREE)
-    kinds, nodes, obstacles, values, clearances = [], [], [], [], []
-    touching: set[int] = set()
-    for rows in prediction.margins:
-        count = len(rows.value)
-        if not count:
-            continue
-        node = rows.nodes[:, -1]
-        kinds.append(np.full(count, rows.kind))
-        nodes.append(node)
-        obstacles.append(rows.obstacle)
-        values.append(rows.value)
-        clearances.append(rows.clearance)
-        least = int(rows.clearance.argmin())
-        message.least.append(
-            BarrierMargin(
-                kind=int(rows.kind),
-                node=int(node[least]),
-                obstacle=int(rows.obstacle[least]),
-                value=float(rows.value[least]),
-                clearance=float(rows.clearance[least]),
-            )
-        )
-        if rows.kind == BarrierMargin.KIND_OBSTACLE:
-            touching.update(node[rows.clearance <= contact_tolerance].tolist())
-    message.kind = np.concatenate(kinds).astype(np.uint8)
-    message.node = np.concatenate(nodes).astype(np.uint32)
-    message.obstacle = np.concatenate(obstacles).astype(np.int32)
-    message.value = np.concatenate(values)
-    message.clearance = np.concatenate(clearances)
-    if touching:
-        message.contact_state = SafetyMargins.CONTACT_TOUCHING
-        message.contact_nodes = sorted(touching)
-    return message
-
-
-def invalid_margins(stamp: Time, reason: str) -> SafetyMargins:
-    """Return a margins message that says that there are none, and why."""
-    return SafetyMargins(header=header(stamp), valid=False, reason=reason, contact_state=SafetyMargins.CONTACT_UNKNOWN)
-
-
-def thread_markers(stamp: Time, prediction: Prediction, diameter: float) -> MarkerArray:
-    """Return the predicted thread as a line, each node coloured by its clearance of obstacles."""
-    clearance = np.full(len(prediction.vertices), np.inf)
-    for rows in prediction.margins:
-        if rows.kind == BarrierMargin.KIND_OBSTACLE:
-            np.minimum.at(clearance, rows.nodes[:, -1], rows.clearance)
-    line = Marker(header=header(stamp), ns="thread", id=0, type=Marker.LINE_STRIP, action=Marker.ADD)
-    line.pose = _pose(np.zeros(2), 0.0)
-    line.scale.x = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
-    line.points = _points(prediction.vertices)
-    safe = np.clip(clearance / FULL_COLOUR_CLEARANCE, 0.0, 1.0)
-    line.colors = [ColorRGBA(r=float(1.0 - s), g=float(0.75 * s), b=0.1, a=1.0) for s in safe]
-    return MarkerArray(markers=[line])
-
-
-def obstacle_markers(stamp: Time, obstacles: Sequence[Obstacle]) -> MarkerArray:
-    """Return the obstacles: discs as flat cylinders, polygons as their triangles."""
-    markers = []
-    for index, obstacle in enumerate(obstacles):
-        marker = Marker(header=header(stamp), ns="obstacles", id=index, action=Marker.ADD)
-        marker.color = ColorRGBA(r=0.85, g=0.65, b=0.6, a=0.8)
-        if isinstance(obstacle, Disc):
-            marker.type = Marker.CYLINDER
-            marker.pose = _pose(np.asarray(obstacle.centre), 0.0)
-            marker.scale = Vector3(x=2.0 * obstacle.radius, y=2.0 * obstacle.radius, z=1e-3)
-        elif isinstance(obstacle, Polygon):
-            shape = triangulate(obstacle)
-            marker.type = Marker.TRIANGLE_LIST
-            marker.pose = _pose(np.zeros(2), 0.0)
-            marker.scale = Vector3(x=1.0, y=1.0, z=1.0)
-            marker.points = _points(shape.vertices[shape.triangles].reshape(-1, 2))
-        markers.append(marker)
-    return MarkerArray(markers=markers)
-
-
-def _pose(point: np.ndarray, angle: float) -> Pose:
-    turned = Quaternion(z=math.sin(0.5 * angle), w=math.cos(0.5 * angle))
-    return Pose(position=Point(x=float(point[0]), y=float(point[1])), orientation=turned)
-
-
-def _points(vertices: np.ndarray) -> list[Point]:
+def point_list(vertices: np.ndarray) -> list[Point]:
+    """Return points of shape (m, 2) [m] as a message has them."""
     return [Point(x=x, y=y) for x, y in vertices.tolist()]

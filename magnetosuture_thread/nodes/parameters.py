@@ -1,14 +1,16 @@
-"""Declares a configuration class as the parameters of a node."""
+"""A configuration class as the parameters of a node: declared, and changed while it runs."""
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Generic, TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import OF_ROS, Configuration, Described, described, from_mapping, to_mapping
+from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 
 C = TypeVar("C", bound=Configuration)
 
@@ -23,13 +25,15 @@ _ARRAYS = {
     int: Parameter.Type.INTEGER_ARRAY,
     str: Parameter.Type.STRING_ARRAY,
 }
+LONGEST_LIST = 1000  # entries that a parameter may be set to while the node runs: what it builds of them takes time
+_LONGEST_REASON = 400  # characters
 
 
 def _type(about: Described) -> Parameter.Type:
     return _ARRAYS[about.entry] if about.kind is tuple else _TYPES[about.kind]
 
 
-def declare(node: Node, cls: type[C], *, read_only: bool = True) -> C:
+def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[str, str] | None = None) -> C:
     """Declare every field of a configuration class and return the settings in force.
 
     The node must have been made with `automatically_declare_parameters_from_overrides=True`: only so
@@ -40,6 +44,7 @@ def declare(node: Node, cls: type[C], *, read_only: bool = True) -> C:
         node: that gets the parameters.
         cls: the configuration class.
         read_only: whether they stay as they are for good; else they can be declared again.
+        fixed: those that stay as they are all the same, and why, by name.
 
     Raises:
         ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds.
@@ -54,9 +59,109 @@ def declare(node: Node, cls: type[C], *, read_only: bool = True) -> C:
     for about in described(cls):
         if about.name in given:
             node.undeclare_parameter(about.name)
-        parameter = Parameter(about.name, _type(about), values[about.name])
-        node.declare_parameter(about.name, parameter.value, _descriptor(about, read_only), ignore_override=True)
+        descriptor = _descriptor(about, read_only, (fixed or {}).get(about.name, ""))
+        if values[about.name] == []:
+            _declare_empty(node, about, descriptor)
+        else:
+            node.declare_parameter(about.name, values[about.name], descriptor, ignore_override=True)
     return settings
+
+
+class Changeable(Generic[C]):
+    """Settings that follow a node's parameters while it runs.
+
+    Whatever is asked for, by service or by `set`, is checked together with all that stays, by the configuration
+    class. Nothing is changed before all of the node's callbacks have agreed; then it is at once.
+
+    Args:
+        node: has these settings declared as its parameters.
+        settings: in force.
+        prepare: makes what the node needs of other settings and returns what puts them in force, which must not
+            fail; raises a `MagnetosutureError` where they cannot be used.
+
+    Attributes:
+        settings: in force.
+    """
+
+    def __init__(self, node: Node, settings: C, prepare: Callable[[C], Callable[[], None]]) -> None:
+        self.settings = settings
+        self._node, self._prepare = node, prepare
+        self._about = {about.name: about for about in described(type(settings))}
+        self._agreed: tuple[C, Callable[[], None]] | None = None
+        node.add_pre_set_parameters_callback(self._as_declared)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._put_in_force)
+
+    def set(self, values: Mapping[str, Any]) -> None:
+        """Set parameters together, as the service does.
+
+        Raises:
+            MagnetosutureError: they are refused; nothing has changed.
+        """
+        parameters = [Parameter(name, _type(self._about[name]), value) for name, value in values.items()]
+        if not parameters:
+            return
+        result = self._node.set_parameters_atomically(parameters)
+        if not result.successful:
+            raise MagnetosutureError(result.reason)
+
+    def _as_declared(self, parameters: Sequence[Parameter]) -> list[Parameter]:
+        """Take whole numbers for real ones and any empty list for an empty one of its kind, as `declare` does."""
+        return [self._converted(parameter) for parameter in parameters]
+
+    def _converted(self, parameter: Parameter) -> Parameter:
+        about, value = self._about.get(parameter.name), _plain(parameter.value)
+        if about is None:
+            return parameter
+        if about.kind is tuple and value == []:
+            return Parameter(parameter.name, _type(about), [])
+        if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE, Parameter.Type.INTEGER):
+            return Parameter(parameter.name, _type(about), float(value))
+        if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.INTEGER_ARRAY):
+            return Parameter(parameter.name, _type(about), [float(entry) for entry in value])
+        return parameter
+
+    def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        self._agreed = None
+        asked = {entry.name: _plain(entry.value) for entry in parameters if entry.name in self._about}
+        if not asked:
+            return SetParametersResult(successful=True)
+        try:
+            self._check_lengths(asked)
+            settings = from_mapping(type(self.settings), {**to_mapping(self.settings), **asked})
+            self._agreed = settings, self._prepare(settings)
+        except MagnetosutureError as error:
+            return SetParametersResult(successful=False, reason=_reason(error, asked))
+        return SetParametersResult(successful=True)
+
+    def _check_lengths(self, asked: Mapping[str, Any]) -> None:
+        for name, value in asked.items():
+            if isinstance(value, list) and len(value) > LONGEST_LIST:
+                where = f"{self.settings.GROUP}.{name}"
+                raise ConfigurationError(where, f"{len(value)} entries", f"at most {LONGEST_LIST} while the node runs")
+
+    def _put_in_force(self, parameters: Sequence[Parameter]) -> None:
+        if self._agreed is not None:
+            (self.settings, put_in_force), self._agreed = self._agreed, None
+            put_in_force()
+
+
+def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
+    """Return why a change was refused, in one line: of a long list its beginning and what was expected."""
+    text = " ".join(str(error).split())
+    if len(text) > _LONGEST_REASON:
+        text = f"{text[: _LONGEST_REASON // 2]} … {text[-_LONGEST_REASON // 2 :]}"
+    named = error.name.partition(".")[2] if isinstance(error, ConfigurationError) else ""
+    return (
+        text if named in ("", *asked) else f"{text}; what belongs together is set at once, by set_parameters_atomically"
+    )
+
+
+def _declare_empty(node: Node, about: Described, descriptor: ParameterDescriptor) -> None:
+    """Declare a list that is empty: by its value alone rclpy would take it for one of bytes, for good."""
+    node.declare_parameter(about.name, _type(about), ParameterDescriptor(), ignore_override=True)
+    node.set_parameters([Parameter(about.name, _type(about), [])])
+    node.set_descriptor(about.name, descriptor)
 
 
 def _plain(value: Any) -> Any:
@@ -64,14 +169,17 @@ def _plain(value: Any) -> Any:
     return list(value) if hasattr(value, "typecode") or isinstance(value, tuple) else value
 
 
-def _descriptor(about: Described, read_only: bool) -> ParameterDescriptor:
+def _descriptor(about: Described, read_only: bool, fixed: str) -> ParameterDescriptor:
     quantity = about.quantity
+    expectation = quantity.expectation(about.kind)
     descriptor = ParameterDescriptor(
         name=about.name,
         type=_type(about).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
-        additional_constraints=quantity.expectation(about.kind),
-        read_only=read_only,
+        additional_constraints=f"{expectation}; stays as the node was started with it: {fixed}"
+        if fixed
+        else expectation,
+        read_only=read_only or bool(fixed),
     )
     if quantity.minimum is not None and quantity.maximum is not None:
         if about.kind is float:

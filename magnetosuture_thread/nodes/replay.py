@@ -4,32 +4,37 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, Protocol
 
 import rclpy
 import rclpy.time
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
-from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, CURRENTS, DIAGNOSTICS, NODES
+from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.coil_messages import command_stamp
+from magnetosuture_thread.nodes.replay_losses import Losses
+from magnetosuture_thread.nodes.replay_time import Timeline
 
+PAUSE = "replay/pause"  # service, std_srvs/SetBool
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
+STILL_PERIOD = 0.1  # s of real time between two messages on /clock while it stands still
 START_TIMEOUT = 180.0  # s for all nodes to be there
 # s after we have found all nodes, for the nodes to have found us and each other: DDS announces a node a few times as it
 # starts and then each 3 s, and on a busy machine the first of these get lost.
 SETTLE = 3.2
-QUIET = 0.5  # s without any answer, once the tracker has taken all frames: the graph is done
+QUIET = 0.5  # s without any answer, once all has been taken and answered: the graph is done
+STUCK = 3.0  # s without any answer where poses are left: the model refuses them, or they got lost
 DRAIN_TIMEOUT = 30.0  # s after the last input at the most
 DEPTH = 300  # messages that may wait for a slow node before any is lost
 _AT_ONCE = 100  # outputs taken between two inputs at the most
+_ANSWERS = (topics.NEEDLE_POSE, topics.SEEN_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
 
 
 class Recorded(Protocol):
@@ -51,34 +56,44 @@ class Recorded(Protocol):
 class LiveReplay:
     """A node that plays messages into the graph with /clock, and passes on all outputs.
 
+    What it plays that is an output of a node otherwise, as poses are where no tracker runs, it passes on as well. Its
+    service `replay/pause` lets time stand still.
+
     Args:
         domain: the graph's ROS domain.
-        start: the simulated time to begin with [ns].
-        rate: how much faster than recorded.
+        timeline: the simulated time.
+        played: topics to play.
+        nodes: how many nodes there are to be; all follow /clock.
         receive: called with topic, simulated time [ns] and CDR bytes of every output.
         watch: called while waiting; raises if the graph is broken.
+        say: called with a line for a person when time stands still or goes on.
 
     Attributes:
         published: of each input topic, when the message of a stamp was published [s].
         arrived: of each output topic, when the first message of a stamp arrived [s]; of currents, of a command's stamp.
+        losses: what was played, taken and lost.
     """
 
     def __init__(
         self,
         domain: int,
-        start: int,
-        rate: float,
+        timeline: Timeline,
+        *,
+        played: Collection[topics.Topic],
+        nodes: int,
         receive: Callable[[str, int, bytes], None],
         watch: Callable[[], None],
+        say: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._start = start
-        self._rate = rate
+        self._time = timeline
+        self._nodes = nodes
         self._receive = receive
         self._watch = watch
-        self._began: float | None = None
+        self._say = say
         self._last_answer = time.perf_counter()
+        self._still, self._last_clock = timeline.start, 0.0
         self._taken = 0
-        self._frames_taken = 0
+        self.losses = Losses()
         self.published: dict[str, dict[int, float]] = defaultdict(dict)
         self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
         self._context = Context()
@@ -86,16 +101,21 @@ class LiveReplay:
         self._node = rclpy.create_node("replay", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
+        self._node.create_service(SetBool, PAUSE, self._on_pause)
         self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
         self._inputs = {
             topic.channel.recorded: self._node.create_publisher(topic.message, topic.name, _lossless(topic.qos))
-            for topic in topics.INPUTS
+            for topic in played
         }
+        self._echoed = {topic.channel.recorded for topic in played if topic in topics.OUTPUTS}
+        # Poses are played where no tracker runs.
+        unheard = {*self._echoed, *([topics.TRACKER_STATE.channel.recorded] if self._echoed else [])}
         self._outputs = {
             topic.name: self._node.create_subscription(
                 topic.message, topic.name, self._taker(topic), _lossless(topic.qos), raw=True
             )
             for topic in topics.OUTPUTS
+            if topic.channel.recorded not in unheard
         }
 
     def close(self) -> None:
@@ -104,25 +124,25 @@ class LiveReplay:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def wait_for_graph(self, played: Iterable[str]) -> None:
+    def wait_for_graph(self) -> None:
         """Wait until every played input has a subscriber and every output a publisher.
-
-        Args:
-            played: input topics that will be played, with their leading slash.
 
         Raises:
             GraphError: the nodes do not come, or one ends.
         """
-        needed = [name for name in played if name != CAMERA_INFO.recorded]
         deadline = time.perf_counter() + START_TIMEOUT
         complete: float | None = None
         while complete is None or time.perf_counter() - complete < SETTLE:
             self._watch()
-            self._publish_clock(self._start)
+            self._publish_clock(self._time.start)
             self._executor.spin_once(timeout_sec=0.02)
-            missing = [name for name in needed if not self._inputs[name].get_subscription_count()]
+            missing = [
+                name
+                for name, publisher in self._inputs.items()
+                if name != CAMERA_INFO.recorded and not publisher.get_subscription_count()
+            ]
             missing += [name for name, output in self._outputs.items() if not output.get_publisher_count()]
-            if self._clock.get_subscription_count() < len(NODES):
+            if self._clock.get_subscription_count() < self._nodes:
                 missing.append("/clock")
             if missing:
                 complete = None
@@ -135,32 +155,51 @@ class LiveReplay:
         """Play messages at their times, then wait until the graph has answered.
 
         Args:
-            records: by time; topics that are no inputs are passed over.
+            records: by time; topics that are not played are passed over.
             progress: called with the time played since the start [s].
         """
-        self._began = time.perf_counter()
-        clock = self._start
-        frames = 0
+        self._time.begin()
+        clock = self._time.start
         for record in records:
             publisher = self._inputs.get(record.topic)
             if publisher is None:
                 continue
             clock = self._run_clock(clock, record.time)
             self._publish_clock(record.time)
-            stamp = messages.header_stamp(record.data)
-            if stamp is not None:
-                self.published[record.topic.lstrip("/")][stamp] = time.time()
-            publisher.publish(record.data)
-            frames += record.topic in {channel.recorded for channel in CAMERA.values()}
-            progress((record.time - self._start) * 1e-9)
-        self._drain(clock, frames)
+            self._publish(publisher, record)
+            progress((record.time - self._time.start) * 1e-9)
+        self._drain(clock)
 
-    def _drain(self, clock: int, frames: int) -> None:
-        """Let time go on until the tracker has taken all frames and no more answers come."""
-        deadline = time.perf_counter() + DRAIN_TIMEOUT
+    def play_on(self, records: Callable[[], Iterable[Recorded]]) -> None:
+        """Play messages over and over, for who watches; nothing is recorded any more.
+
+        Time is set back before each pass, and the nodes begin anew.
+        """
+        self._receive = lambda topic, time, data: None
+        while True:
+            self.losses = Losses()
+            self.play(records(), lambda time: None)
+
+    def _publish(self, publisher: Any, record: Recorded) -> None:
+        name, stamp = record.topic.lstrip("/"), messages.header_stamp(record.data)
+        now = time.time()
+        publisher.publish(record.data)
+        self.losses.played[name] += 1
+        if stamp is not None:
+            self.published[name][stamp] = now
+        if record.topic in self._echoed:
+            if stamp is not None:
+                self.arrived[name].setdefault(stamp, now)
+            self.losses.heard(name, stamp, None)
+            self._receive(record.topic, record.time, bytes(record.data))
+
+    def _drain(self, clock: int) -> None:
+        """Let time go on until the graph has taken and answered all, and no more answers come."""
+        deadline = self._time.running() + DRAIN_TIMEOUT
         self._last_answer = time.perf_counter()
-        while time.perf_counter() < deadline:
-            if self._frames_taken >= frames and time.perf_counter() > self._last_answer + QUIET:
+        while self._time.running() < deadline:
+            enough = STUCK if self.losses.poses_waiting else QUIET
+            if not self.losses.frames_waiting and time.perf_counter() > self._last_answer + enough:
                 return
             clock = self._run_clock(clock, clock + round(CLOCK_PERIOD * 1e9))
 
@@ -184,52 +223,46 @@ class LiveReplay:
                 return
 
     def _spin_until(self, simulated: int) -> None:
-        """Take outputs until the wall clock reaches a simulated time."""
-        assert self._began is not None
-        due = self._began + (simulated - self._start) * 1e-9 / self._rate
-        while (left := due - time.perf_counter()) > 0.0:
+        """Take outputs until a simulated time is there."""
+        while (left := self._time.left(simulated)) > 0.0:
             self._watch()
             self._executor.spin_once(timeout_sec=min(left, 0.01))
-
-    def _simulated(self) -> int:
-        """Return the simulated time now [ns]; before playing it stands still."""
-        if self._began is None:
-            return self._start
-        return self._start + round((time.perf_counter() - self._began) * self._rate * 1e9)
+            if self._time.paused and time.perf_counter() - self._last_clock > STILL_PERIOD:
+                self._publish_clock(self._still)
 
     def _taker(self, topic: topics.Topic) -> Callable[[Any, Any], None]:
         """Return the callback of an output topic."""
         name = topic.channel.name
-        answers = topic in (topics.NEEDLE_POSE, topics.SEEN_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
 
-        def take(data: bytes, info: dict[str, int]) -> None:
-            now = time.perf_counter()
+        def take(data: bytes, info: dict[str, Any]) -> None:
             self._taken += 1
             stamp = command_stamp(data) if topic.channel is CURRENTS else messages.header_stamp(data)
             if stamp is not None:
                 # When it reached this process: how long it waited here for its turn is not the graph's delay.
                 self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)
-            if answers:
-                self._last_answer = now
+            if topic in _ANSWERS:
+                self._last_answer = time.perf_counter()
+                self.losses.heard(name, stamp, info["publication_sequence_number"])
             if topic.channel is DIAGNOSTICS:
-                self._frames_taken = max(self._frames_taken, _frames_taken(data))
-            self._receive(topic.channel.recorded, self._simulated(), bytes(data))
+                self.losses.said(data)
+            self._receive(topic.channel.recorded, self._time.now(), bytes(data))
 
         return take
 
+    def _on_pause(self, asked: Any, answer: Any) -> Any:
+        """Let time stand still, or go on."""
+        self._time.pause(asked.data)
+        answer.success = True
+        at = (self._time.now() - self._time.start) * 1e-9
+        answer.message = f"{'paused' if asked.data else 'goes on'} at {at:.2f} s"
+        self._say(answer.message)
+        return answer
+
     def _publish_clock(self, simulated: int) -> None:
+        self._still, self._last_clock = simulated, time.perf_counter()
         self._clock.publish(Clock(clock=rclpy.time.Time(nanoseconds=simulated).to_msg()))
 
 
 def _lossless(qos: QoSProfile) -> QoSProfile:
     """Return a quality of service that waits for slow readers; only the replay has time to."""
     return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=qos.durability)
-
-
-def _frames_taken(data: bytes) -> int:
-    """Return how many frames the tracker says that it has taken; 0 if this is another node's message."""
-    for status in deserialize_message(data, DiagnosticArray).status:
-        for value in status.values:
-            if value.key == "frames":
-                return int(value.value)
-    return 0

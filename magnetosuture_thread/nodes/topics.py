@@ -7,13 +7,21 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_policy_name_from_kind,
+    qos_profile_sensor_data,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from magnetosuture_thread import interface
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import Channel
 
 SENSOR = qos_profile_sensor_data
@@ -48,17 +56,38 @@ class Topic:
         options = QoSOverridingOptions.with_default_policies()
         return node.create_publisher(self.message, self.name, self.qos, qos_overriding_options=options)
 
-    def subscribe(self, node: Node, callback: Callable[[Any], None], *, raw: bool = False) -> Subscription:
+    def subscribe(
+        self,
+        node: Node,
+        callback: Callable[[Any], None],
+        *,
+        raw: bool = False,
+        unheard: Callable[[InvalidInputError], None] | None = None,
+    ) -> Subscription:
         """Subscribe; reliability and depth can be overridden by parameters.
 
         Args:
             node: that subscribes.
             callback: called with each message, or with its CDR bytes.
             raw: whether with its bytes.
+            unheard: called when there is a publisher whose messages cannot come, as its quality of service is
+                less than ours; by default ROS says so in the log.
         """
-        options = QoSOverridingOptions.with_default_policies()
+
+        def mismatched(event: Any) -> None:
+            assert unheard is not None
+            policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
+            expected = str(getattr(self.qos, policy).name).lower()
+            unheard(InvalidInputError(f"publisher of {self.channel.name}", f"another {policy}", expected))
+
         return node.create_subscription(
-            self.message, self.name, callback, self.qos, qos_overriding_options=options, raw=raw
+            self.message,
+            self.name,
+            callback,
+            self.qos,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=mismatched) if unheard else None,
+            raw=raw,
         )
 
     def subscribe_numbered(self, node: Node, callback: Callable[[Any, int], None]) -> Subscription:
@@ -97,6 +126,8 @@ PREDICTED_THREAD = Topic(interface.PREDICTED_THREAD, RELIABLE)
 MARGINS = Topic(interface.MARGINS, RELIABLE)
 THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE)
 OBSTACLE_MARKERS = Topic(interface.OBSTACLE_MARKERS, LATCHED)
+OBSTACLE_SET = Topic(interface.OBSTACLE_SET, LATCHED)
+MATERIAL = Topic(interface.MATERIAL, LATCHED)
 CURRENTS = Topic(interface.CURRENTS, RELIABLE)
 BRIDGE_STATE = Topic(interface.BRIDGE_STATE, LATCHED)
 RIG_CURRENTS = Topic(interface.RIG_CURRENTS, RELIABLE)
@@ -119,6 +150,7 @@ OUTPUTS = (
     DIAGNOSTICS,
 )
 
+SETTINGS = (OBSTACLE_SET, MATERIAL)  # what may be told at any time, or never
 SIMULATED = (TRUE_NEEDLE, TRUE_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,20 +13,18 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.vision.images import decode_image, unpack_image
-from magnetosuture_thread.vision.look import State, no_pose
+from magnetosuture_thread.vision.look import no_pose
+from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
 from magnetosuture_thread.vision.warm_up import warm_up
 
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
-CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
 
 
 class VisionTrackerNode(Node):
@@ -36,9 +35,8 @@ class VisionTrackerNode(Node):
         settings = declare(self, VisionTrackerSettings)
         self.get_logger().info("loading the tracker's kernels; the first start on a machine compiles them")
         warm_up()
-        self._tracker = VisionTracker(settings)
+        self._session = TrackerSession(settings)
         self._health = Health(self)
-        self._frames = self._tracked = 0
         self._words = "nothing seen"
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -69,41 +67,37 @@ class VisionTrackerNode(Node):
     def on_watch(self) -> None:
         """Say so when no frame has come for too long."""
         waited = self._arrival() - self._last_frame
-        if self._frames and waited > SILENCE:
+        if self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
-            self._states.publish(messages.tracker_state(stamp, no_pose(self._missing(), reason, None), 0.0))
+            self._states.publish(messages.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
             self._health.warn(f"{reason}; before that {self._words}")
-
-    def _missing(self) -> State:
-        return State.LOST if self._tracked else State.SEARCHING
 
     def _arrival(self) -> float:
         return float(self._steady.now().nanoseconds * 1e-9)
 
-    def _take(self, message: Image | CompressedImage, decode: Any) -> None:
-        self._frames += 1
+    def _take(self, message: Image | CompressedImage, decode: Callable[[], Any]) -> None:
         self._last_frame = self._arrival()
-        stamp = message.header.stamp
+        stamp, taken = message.header.stamp, 0.0
         try:
             image = np.asarray(decode())
-            began = time.perf_counter()
-            track = self._tracker.track(image, messages.seconds(stamp))
         except InvalidInputError as error:
-            self._states.publish(messages.tracker_state(stamp, no_pose(self._missing(), str(error), None), 0.0))
-            self._health.refuse(error, frames=self._frames, tracked=self._tracked)
-            return
-        taken = time.perf_counter() - began
-        if track.state is State.TRACKED:
+            seen = self._session.on_broken(error)
+        else:
+            began = time.perf_counter()
+            seen = self._session.on_image(messages.seconds(stamp), image)
+            taken = time.perf_counter() - began
+        track = seen.track
+        if seen.tracked:
             # The pose first: the prediction waits for it, and a path of many poses takes some milliseconds.
             self._poses.publish(messages.pose_message(stamp, track.tail, track.heading, track.covariance))
-            if len(track.centreline) > 1:
-                at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
-                self._threads.publish(self._path.message(stamp, points_at(track.centreline, at)))
-            self._tracked += 1
-        self._states.publish(messages.tracker_state(stamp, track, taken))
-        values = {"frames": self._frames, "tracked": self._tracked}
-        if track.state is State.TRACKED:
+            if len(seen.centreline):
+                self._threads.publish(self._path.message(stamp, seen.centreline))
+        self._states.publish(messages.tracker_state(stamp, track, 0.0 if seen.problem else taken))
+        values = {"frames": self._session.frames, "tracked": self._session.tracked}
+        if seen.problem is not None:
+            self._health.refuse(seen.problem, **values)
+        elif seen.tracked:
             self._words = "tracking"
             self._health.ok(self._words, confidence=round(track.confidence, 3), **values)
         else:

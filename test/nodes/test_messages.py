@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion
+from geometry_msgs.msg import Point, Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-from magnetosuture_msgs.msg import BarrierMargin
+from magnetosuture_msgs.msg import BarrierMargin, Disc, ObstacleSet, Outline, Polygon, ThreadMaterial
 
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.model.barriers import BarrierKind
-from magnetosuture_thread.nodes import coil_messages, messages, topics
+from magnetosuture_thread.nodes import coil_messages, messages, thread_messages, topics
 from magnetosuture_thread.resources import share
 from magnetosuture_thread.study.replayed import KINDS
 
@@ -47,6 +47,55 @@ def test_an_orientation_that_is_none_is_refused_whatever_it_holds(value: float, 
         messages.needle_pose(message)
 
 
+@pytest.mark.parametrize("nanosec", [10**9, 2**32 - 1])
+def test_a_stamp_of_more_than_a_second_of_nanoseconds_is_none(nanosec: int):
+    message = messages.pose_message(Time(sec=2**31 - 1, nanosec=nanosec), np.zeros(2), np.array([1.0, 0.0]))
+    with pytest.raises(InvalidInputError, match=r"header\.stamp\.nanosec"):
+        messages.needle_pose(message)
+
+
+@given(sec=st.integers(-(2**31), 2**31 - 1), nanosec=st.integers(0, 10**9 - 1))
+def test_a_stamp_goes_there_and_back(sec: int, nanosec: int):
+    stamp = Time(sec=sec, nanosec=nanosec)
+    assert messages.stamp_of(messages.nanoseconds(stamp)) == stamp
+
+
+def test_obstacles_become_parameters():
+    corners = [Point(x=0.0, y=0.0), Point(x=0.01, y=0.0, z=7.0), Point(x=0.0, y=0.01)]
+    message = ObstacleSet(
+        header=messages.header(STAMP),
+        discs=[Disc(x=0.01, y=-0.002, radius=0.003)],
+        polygons=[Polygon(outline=Outline(corners=corners), holes=[Outline(corners=corners[:2])])],
+    )
+    assert thread_messages.obstacle_values(message) == {
+        "disc_obstacles": [0.01, -0.002, 0.003],
+        "polygon_obstacles": [0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.0],
+        "polygon_sizes": [3, -2],
+    }
+    message.corner_radius = [0.0]
+    assert thread_messages.obstacle_values(message)["corner_radius"] == 0.0
+    message.header.frame_id = "map"
+    with pytest.raises(InvalidInputError, match=r"thread/obstacle_set\.header\.frame_id: got 'map', expected 'dish'"):
+        thread_messages.obstacle_values(message)
+
+
+def test_a_material_becomes_parameters():
+    """Plain numbers: of arrays, as messages have them, no parameter is made."""
+    assert thread_messages.material_values(ThreadMaterial()) == {}
+    message = ThreadMaterial(name="silk_6_0", viscosity=0.9, attachment_offset=[1e-3, 0.0], rest_curvature=[0.0])
+    values = thread_messages.material_values(message)
+    assert values == {
+        "material": "silk_6_0",
+        "diameter": 0.0,
+        "elastic_modulus": 0.0,
+        "paper_stiffness_weight": 0.0,
+        "viscosity": 0.9,
+        "rest_curvature": 0.0,
+        "attachment_offset": [1e-3, 0.0],
+    }
+    assert {type(value) for value in values.values()} == {str, float, list}
+
+
 def test_a_path_is_made_anew_in_the_message_of_the_last():
     maker, points = messages.PathMaker(), np.random.default_rng(1).normal(size=(9, 2))
     maker.message(STAMP, points)
@@ -65,14 +114,14 @@ def test_paths_and_velocities_go_there_and_back():
     )
 
 
-@pytest.mark.parametrize("topic", [*topics.INPUTS, *topics.OUTPUTS], ids=lambda topic: topic.name)
+@pytest.mark.parametrize("topic", [*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS], ids=lambda topic: topic.name)
 def test_every_topic_has_a_type_that_bags_know(topic: topics.Topic):
     assert topic.channel.type_name in typestore().fielddefs
 
 
 def test_the_bags_and_the_graph_have_the_same_own_messages():
     """The same bytes mean the same in both: a type that was rebuilt in one place only would differ."""
-    for topic in (topics.PREDICTED_THREAD, topics.MARGINS, topics.CURRENTS, topics.BRIDGE_STATE):
+    for topic in (topics.PREDICTED_THREAD, topics.MARGINS, topics.CURRENTS, topics.BRIDGE_STATE, *topics.SETTINGS):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())
 

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
 import pytest
+from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import DescribeParameters
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.configuration import described
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.configuration import Configuration, described, quantity, to_mapping
+from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
+from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 
 
-def test_every_setting_is_a_described_read_only_parameter(graph):
+def test_every_setting_is_a_described_parameter(graph):
     node = graph.add(ThreadModelNode, segments=30, length=0.02)
     for about in described(ThreadModelSettings):
         descriptor = node.describe_parameter(about.name)
-        assert descriptor.read_only
+        assert descriptor.read_only == (about.name in FIXED)
         assert about.quantity.description in descriptor.description
         if about.quantity.unit:
             assert about.quantity.unit in descriptor.description
@@ -25,8 +35,144 @@ def test_every_setting_is_a_described_read_only_parameter(graph):
     assert node.get_parameter("material").value == "polyamide_7_0"
     assert node.describe_parameter("length").floating_point_range[0].to_value == 2.0
     assert node.describe_parameter("segments").integer_range[0].from_value == 3
-    refused = node.set_parameters([Parameter("segments", value=40)])[0]
+    # An empty list knows of what it is one.
+    assert node.describe_parameter("disc_obstacles").type == node.get_parameter("disc_obstacles").type_.value == 8
+    assert node.describe_parameter("held_nodes").type == node.get_parameter("held_nodes").type_.value == 7
+
+
+def test_what_stays_for_good_is_read_only_and_says_why(graph):
+    node = graph.add(ThreadModelNode)
+    assert "compiled when it starts" in node.describe_parameter("formulation").additional_constraints
+    assert not node.set_parameters([Parameter("formulation", value="paper")])[0].successful
+    tracker = graph.add(VisionTrackerNode)
+    refused = tracker.set_parameters([Parameter("dish_diameter", value=0.05)])[0]
     assert not refused.successful
+    assert tracker.get_parameter("dish_diameter").value == 0.035
+
+
+@dataclass(frozen=True)
+class Oven(Configuration):
+    """Settings for the tests."""
+
+    GROUP: ClassVar[str] = "oven"
+
+    lit: bool = quantity(False, "whether it burns")
+    temperature: float = quantity(293.0, "of the inside", unit="K", minimum=0.0, maximum=1000.0)
+    trays: int = quantity(2, "how many", minimum=0, maximum=10)
+    dishes: tuple[float, ...] = quantity((), "weight of each", unit="kg", minimum=0.0, maximum=9.0)
+    owners: tuple[str, ...] = quantity((), "names")
+
+    def check(self) -> None:
+        """Refuse a cold fire."""
+        if self.lit and self.temperature < 300.0:
+            raise ConfigurationError("oven.temperature", self.temperature, "at least 300 K when lit")
+
+
+class Kitchen:
+    """Oven settings that a node's parameters change, and what came of it."""
+
+    def __init__(self, node: Node) -> None:
+        self.node, self.in_force, self.refusal = node, Oven(), ""
+        declare(node, Oven, read_only=False, fixed={"trays": "they are screwed in"})
+        self.changeable = Changeable(node, self.in_force, self._prepare)
+
+    def _prepare(self, settings: Oven) -> Callable[[], None]:
+        if self.refusal:
+            raise ConfigurationError("oven.dishes", list(settings.dishes), self.refusal)
+        return lambda: setattr(self, "in_force", settings)
+
+    def set(self, **values: Any) -> str:
+        """Set parameters at once; return why they were refused."""
+        given = [Parameter(name, value=value) for name, value in values.items()]
+        result = self.node.set_parameters_atomically(given)
+        assert self.changeable.settings == self.in_force
+        told = {about.name: self.node.get_parameter(about.name).value for about in described(Oven)}
+        assert {name: list(v) if hasattr(v, "typecode") else v for name, v in told.items()} == to_mapping(self.in_force)
+        assert result.successful == (not result.reason)
+        return str(result.reason)
+
+
+@pytest.fixture
+def kitchen(graph):
+    """An oven in a graph."""
+    made = Kitchen(graph.probe)
+    yield made
+    graph.probe._on_set_parameters_callbacks.clear()
+
+
+def test_a_change_is_in_force_at_once(kitchen):
+    assert not kitchen.set(temperature=350.0, dishes=[1.0, 2.0])
+    assert kitchen.in_force == Oven(temperature=350.0, dishes=(1.0, 2.0))
+    assert not kitchen.set(lit=True)
+    assert kitchen.in_force == Oven(lit=True, temperature=350.0, dishes=(1.0, 2.0))
+
+
+def test_whole_numbers_and_empty_lists_are_taken_as_in_a_file(kitchen):
+    assert not kitchen.set(temperature=350, dishes=[1, 2])
+    assert kitchen.in_force == Oven(temperature=350.0, dishes=(1.0, 2.0))
+    assert not kitchen.set(dishes=[])
+    empty = Parameter("dishes", Parameter.Type.BOOL_ARRAY, [])  # as the command line has it
+    assert kitchen.node.set_parameters([empty])[0].successful
+    assert kitchen.in_force == Oven(temperature=350.0)
+    assert not kitchen.set(owners=["a", "b"])
+    assert not kitchen.set(owners=[])
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"temperature": 1e300}, "out of range"),
+        ({"temperature": math.nan}, "out of range"),
+        ({"temperature": math.inf}, "out of range"),
+        ({"temperature": "hot"}, "Wrong parameter type"),
+        ({"temperature": None}, "cannot be undeclared"),
+        ({"trays": 3}, "read-only"),
+        ({"temperature": 350.0, "trays": 3}, "read-only"),
+        ({"dishes": [1.0, math.nan]}, "oven.dishes: got .*nan.*, expected a list from 0 to 9 kg"),
+        ({"dishes": [10**30]}, ""),
+        ({"dishes": [1.0] * 5000}, "oven.dishes: got '5000 entries', expected at most 1000"),
+        ({"lit": True}, "at least 300 K when lit; what belongs together is set at once"),
+        ({"lit": True, "temperature": 299.0}, "at least 300 K when lit$"),
+        ({"dishes": [99.0] * 1000}, r"^oven.dishes: got \[99.0.* … .*expected a list from 0 to 9 kg$"),
+    ],
+)
+def test_what_is_refused_changes_nothing_and_is_said_in_a_line(kitchen, values, words):
+    try:
+        reason = kitchen.set(**values)
+    except OverflowError:  # rclpy's own word for what no parameter can hold
+        return
+    assert re.search(words, reason)
+    assert "\n" not in reason
+    assert len(reason) < 600
+    assert kitchen.in_force == Oven()
+
+
+def test_what_cannot_be_made_is_refused(kitchen):
+    kitchen.refusal = "fewer"
+    assert kitchen.set(dishes=[1.0]) == "oven.dishes: got [1.0], expected fewer"
+    assert kitchen.in_force == Oven()
+
+
+def test_nothing_is_changed_unless_every_callback_agrees(kitchen):
+    refused = SetParametersResult(successful=False, reason="no")
+    kitchen.node._on_set_parameters_callbacks.append(lambda parameters: refused)
+    assert kitchen.set(temperature=350.0) == "no"
+    kitchen.node._on_set_parameters_callbacks.pop()
+    assert kitchen.in_force == Oven()
+    # Nor later, with something else.
+    assert not kitchen.set(use_sim_time=False)
+    assert kitchen.in_force == Oven()
+
+
+def test_what_is_set_from_inside_goes_the_same_way(kitchen):
+    kitchen.changeable.set({"temperature": 350.0, "dishes": [], "owners": ["a"]})
+    assert kitchen.in_force == Oven(temperature=350.0, owners=("a",))
+    kitchen.changeable.set({})
+    with pytest.raises(MagnetosutureError, match="at least 300 K"):
+        kitchen.changeable.set({"temperature": 100.0, "lit": True})
+    with pytest.raises(MagnetosutureError, match="out of range"):
+        kitchen.changeable.set({"temperature": math.nan})
+    assert kitchen.in_force == Oven(temperature=350.0, owners=("a",))
 
 
 def test_other_nodes_can_ask_for_the_description(graph):

@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
 from nav_msgs.msg import Path
+from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.model import choices
@@ -112,7 +113,8 @@ def test_obstacles_give_margins_contact_and_a_latched_marker(graph):
     assert least.obstacle == 0
     assert least.node == 12
     assert least.clearance == pytest.approx(1e-6, abs=1e-9)
-    assert obstacles[0].markers[0].scale.x == pytest.approx(0.004)
+    assert [marker.action for marker in obstacles[0].markers] == [Marker.DELETEALL, Marker.ADD]
+    assert obstacles[0].markers[1].scale.x == pytest.approx(0.004)
 
 
 def test_polygons_give_margins_and_are_shown_as_triangles(graph):
@@ -124,7 +126,7 @@ def test_polygons_give_margins_and_are_shown_as_triangles(graph):
     graph.wait(lambda: bool(margins and obstacles), "margins and obstacles")
     least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_OBSTACLE)
     assert least.clearance == pytest.approx(1e-3 - 30e-6, abs=1e-9)
-    marker = obstacles[0].markers[0]
+    marker = obstacles[0].markers[1]
     assert marker.type == Marker.TRIANGLE_LIST
     corner = np.array([[p.x, p.y] for p in marker.points]).reshape(-1, 3, 2)
     sides = corner[:, 1:] - corner[:, :1]
@@ -176,6 +178,7 @@ def test_a_step_that_fell_back_is_published_and_said(graph, monkeypatch):
         (lambda p: setattr(p.pose.pose.orientation, "w", 7.0), "a unit quaternion"),
         (lambda p: setattr(p.header, "frame_id", "map"), "'dish'"),
         (lambda p: setattr(p.header, "stamp", stamp(0.9)), "later than"),
+        (lambda p: setattr(p.header, "stamp", Time(sec=2**31 - 1, nanosec=2**32 - 1)), "header.stamp.nanosec"),
     ],
 )
 def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):
@@ -191,6 +194,28 @@ def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):
     graph.wait(lambda: len(predicted) == 2, "the next prediction")
     assert np.isfinite([v.x for v in predicted[1].vertices]).all()
     assert predicted[1].interval == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("at", [Time(sec=-(2**31)), Time(sec=2**31 - 2, nanosec=10**9 - 1)])
+def test_the_first_and_the_last_stamp_that_there_are_go_there_and_back(graph, at):
+    graph.add(ThreadModelNode, initial_shape="straight")
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+    message = pose(1.0)
+    message.header.stamp = at
+    graph.publish(topics.NEEDLE_POSE, message)
+    graph.wait(lambda: bool(predicted and margins), "the start")
+    assert predicted[0].header.stamp == margins[0].header.stamp == at
+
+
+def test_the_thread_hangs_where_it_is_fixed_to_the_needle(graph):
+    graph.add(ThreadModelNode, attachment_offset=[1e-3, -5e-4])
+    predicted = graph.listen(topics.PREDICTED_THREAD)
+    graph.publish(topics.SEEN_THREAD, seen(1.0))
+    for k in range(3):
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, k * 1e-4))
+        graph.wait(lambda k=k: len(predicted) == k + 1, "a prediction")
+    assert predicted[-1].vertices[0].x == pytest.approx(1.2e-3)
+    assert predicted[-1].vertices[0].y == pytest.approx(-5e-4)
 
 
 def test_time_set_back_starts_anew(graph):
@@ -243,3 +268,10 @@ def test_an_unproven_solution_gives_no_margin(graph):
     assert invalid.contact_state == SafetyMargins.CONTACT_UNKNOWN
     assert not invalid.least
     assert len(predicted) == 1
+
+
+def test_a_seen_thread_that_is_cut_off_is_refused_and_ends_nothing(graph):
+    node = graph.add(ThreadModelNode)
+    whole = serialize_message(Path(header=messages.header(graph.now()), poses=[PoseStamped()] * 3))
+    node.on_seen_thread(whole[:-20])
+    assert node._health._refused == 1

@@ -25,6 +25,11 @@ def test_what_is_constant_is_latched(graph):
     graph.wait(lambda: bool(late), "the obstacles, published before anybody listened")
 
 
+def test_settings_are_latched_and_no_input_of_a_replay():
+    assert all(topic.qos is topics.LATCHED for topic in topics.SETTINGS)
+    assert not any(topic in (*topics.INPUTS, *topics.OUTPUTS) for topic in topics.SETTINGS)
+
+
 @pytest.mark.parametrize("depth", [5, 300])
 def test_a_replay_makes_every_queue_reliable_and_deep(depth: int):
     overrides = topics.lossless(depth)["/**"]["ros__parameters"]["qos_overrides"]

@@ -1,0 +1,74 @@
+"""The thread model's settings while it runs: its parameters, the topics that set them, the obstacles it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+
+from magnetosuture_thread.configuration import described
+from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread.model.session import ThreadSession
+from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.nodes import thread_messages, topics
+from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameters import Changeable
+
+LARGEST = 1 << 18  # bytes of a message; what is larger is not even read
+
+
+class ThreadSettings:
+    """Changes a session's settings by the node's parameters.
+
+    A message becomes parameters, so that these always tell what is in force, and there is one way to refuse.
+
+    Args:
+        node: has the session's settings declared as its parameters.
+        session: whose settings they are.
+        health: where a message is said to be refused; who calls a service is told.
+    """
+
+    def __init__(self, node: Node, session: ThreadSession, health: Health) -> None:
+        self._node, self._session, self._health = node, session, health
+        self._names = [about.name for about in described(ThreadModelSettings)]
+        self._parameters = Changeable(node, session.settings, self._prepare)
+        self._obstacles = topics.OBSTACLE_MARKERS.publisher(node)
+        self._show_obstacles()
+        for topic, take in ((topics.OBSTACLE_SET, self.on_obstacles), (topics.MATERIAL, self.on_material)):
+            topic.subscribe(node, take, raw=True, unheard=health.refuse)
+
+    def on_obstacles(self, data: bytes) -> None:
+        """Take another set of obstacles."""
+        self._set(topics.OBSTACLE_SET, data, thread_messages.obstacle_values)
+
+    def on_material(self, data: bytes) -> None:
+        """Take what is newly known of the thread and the liquid."""
+        self._set(topics.MATERIAL, data, thread_messages.material_values)
+
+    def _set(self, topic: topics.Topic, data: bytes, values: Callable[[Any], dict[str, Any]]) -> None:
+        """Set the parameters that a message is about, or say why that cannot be."""
+        try:
+            if len(data) > LARGEST:
+                raise InvalidInputError(topic.channel.name, f"{len(data)} bytes", f"at most {LARGEST}")
+            self._parameters.set(values(thread_messages.decoded(topic, data)))
+        except MagnetosutureError as error:
+            self._health.refuse(error)
+
+    def _prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
+        put_in_force = self._session.prepare(settings)
+
+        def change() -> None:
+            before = self._session.settings
+            put_in_force()
+            if settings.obstacles() != before.obstacles():
+                self._show_obstacles()
+            changed = [name for name in self._names if getattr(settings, name) != getattr(before, name)]
+            if changed:
+                self._node.get_logger().info(f"changed: {', '.join(changed)}")
+
+        return change
+
+    def _show_obstacles(self) -> None:
+        now = self._node.get_clock().now().to_msg()
+        self._obstacles.publish(thread_messages.obstacle_markers(now, self._session.settings.obstacles()))
