@@ -82,7 +82,8 @@ def draw_summary(
 
 
 def _title(summary: Summary) -> str:
-    words = f"{Path(summary.bag).name}, set-up {summary.setup}: {summary.tracked} of {summary.frames} frames tracked"
+    found = "frames tracked" if summary.source == "camera" else "recorded poses taken"
+    words = f"{Path(summary.bag).name}, set-up {summary.setup}: {summary.tracked} of {summary.frames} {found}"
     if summary.simulated:
         words += "\nsimulated: " + summary.simulated
     return words

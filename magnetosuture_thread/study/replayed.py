@@ -109,7 +109,7 @@ class Summary:
         bag: its path.
         setup: the set-up's name.
         simulated: what was simulated, empty if the bag does not say that anything was.
-        frames: camera frames played.
+        frames: camera frames played, or recorded poses.
         tracked: frames in which the needle was found.
         predicted: frames with a predicted thread.
         commands: needle velocity commands played.
@@ -124,6 +124,12 @@ class Summary:
         error_seen: prediction error against the seen centreline [% of length], over `count` frames.
         error_truth: the same against the truth, where the bag holds it.
         currents: difference of the coils' currents from the recorded ones, where the bag holds any.
+        source: `camera`, or `poses` where `frames` are recorded poses.
+        speed: how many seconds of the bag were worked through in a second, of an offline replay; else None.
+        refused: frames and poses that could not be used, by why.
+        dropped: messages that got lost on a way, by which; empty offline, where there are none.
+        damage: what of the bag could not be read, empty if nothing.
+        remark: what else to know of the bag, empty if nothing.
     """
 
     bag: str
@@ -144,6 +150,12 @@ class Summary:
     error_seen: dict[str, float] | None
     error_truth: dict[str, float] | None
     currents: CurrentDifference | None = None
+    source: str = "camera"
+    speed: float | None = None
+    refused: dict[str, int] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
+    damage: str = ""
+    remark: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above."""

@@ -19,16 +19,33 @@ def summary_table(summary: Summary) -> Table:
     table.add_column("", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
     table.add_column("remark", style="dim")
-    table.add_row("camera frames", str(summary.frames), "simulated" if summary.simulated else "")
-    table.add_row("  tracked", str(summary.tracked), _share(summary.tracked, summary.frames))
+    live, by_camera = summary.speed is None, summary.source == "camera"
+    simulated = "simulated" if summary.simulated else ""
+    table.add_row("camera frames" if by_camera else "recorded poses", str(summary.frames), simulated)
+    table.add_row(
+        "  tracked" if by_camera else "  usable", str(summary.tracked), _share(summary.tracked, summary.frames)
+    )
     table.add_row("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames))
-    table.add_row("velocity commands", str(summary.commands), "simulated" if summary.simulated else "")
-    table.add_row("  reached the coils", str(summary.driven), _share(summary.driven, summary.commands))
+    for why, count in summary.refused.items():
+        table.add_row("  not used", str(count), why)
+    if live:
+        table.add_row("velocity commands", str(summary.commands), simulated)
+        table.add_row("  reached the coils", str(summary.driven), _share(summary.driven, summary.commands))
+        table.add_row("messages dropped", str(sum(summary.dropped.values())), "played, and lost on the way")
+        for way, count in summary.dropped.items():
+            if count:
+                table.add_row("  dropped", str(count), way)
+    if summary.damage:
+        table.add_row("the bag is damaged", "", summary.damage)
+    if summary.remark:
+        table.add_row("set-up in doubt", "", summary.remark)
     table.add_section()
-    table.add_row("latency, median", "", "99th percentile, greatest")
+    table.add_row("latency, median" if live else "times, median", "", "99th percentile, greatest")
     for stage, spread in summary.latency.items():
         table.add_row(f"  {stage}", _milliseconds(spread), _tail(spread))
     table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
+    if summary.speed is not None:
+        table.add_row("speed", f"{summary.speed:.3g}", "times as fast as recorded")
     table.add_section()
     table.add_row("least margin", "", "0 or more is safe; lengths are met to 0.1 %")
     for margin in summary.least_margins:

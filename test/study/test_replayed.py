@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from types import SimpleNamespace as Message
 
 import numpy as np
@@ -140,3 +141,28 @@ def test_the_table_says_what_is_simulated_and_fits_a_terminal():
         assert words in text
     assert "truth" not in text
     assert max(len(line) for line in text.splitlines()) <= 80
+    poses = replace(
+        summary,
+        source="poses",
+        speed=52.4,
+        latency={},
+        refused={"a pose that is none": 2},
+        damage="the end is missing",
+        remark="it is another thread",
+    )
+    text = shown(poses)
+    for words in ("recorded poses", "usable", "a pose that is none", "52.4", "the end is missing", "another thread"):
+        assert words in text
+    for words in ("camera frames", "velocity", "latency", "dropped"):
+        assert words not in text
+    text = shown(replace(summary, dropped={"frames not taken by vision_tracker": 3, "poses without an answer": 0}))
+    assert "messages dropped" in text
+    assert "frames not taken" in text
+    assert "without an answer" not in text
+
+
+def shown(summary: Summary) -> str:
+    """Return a summary as a terminal shows it."""
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(summary_table(summary))
+    return console.export_text()

@@ -1,0 +1,164 @@
+"""Keeps the figures of a run as it goes on, and one instant in full: the one that was predicted worst."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.study.replayed import KINDS, Instant, LeastMargin
+from magnetosuture_thread.study.score import LEAST_SEEN
+from magnetosuture_thread.study.sight import Sight
+
+AT_ONCE = 128  # predictions that are scored together
+ROUNDING = 1e-9  # of a length, by which a node may be past its end
+_OBSTACLE = KINDS.index("obstacle")
+_NOTHING, _NONE = np.empty((0, 2)), np.empty(0)
+
+
+def errors_percent(
+    vertices: NDArray[np.float64], curves: Sequence[Points], length: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the errors of many predictions, each against its own curve, as `prediction_error_percent` does of one.
+
+    All curves are laid one behind the other, so that one interpolation serves them all.
+
+    Args:
+        vertices: predicted nodes of each, shape (b, n + 1, 2) [m].
+        curves: where each thread was, shape (m, 2) [m]; m may differ, and be 0.
+        length: of the thread, L [m].
+
+    Returns:
+        The errors [% of L], shape (b,), nan where less than half of a thread is known; and the curves' lengths [m].
+    """
+    counts = np.array([len(curve) for curve in curves])
+    errors, lengths = np.full(len(curves), np.nan), np.zeros(len(curves))
+    there = np.flatnonzero(counts > 1)
+    if not len(there):
+        return errors, lengths
+    points = np.concatenate([curve for curve in curves if len(curve) > 1])
+    last = np.cumsum(counts[there]) - 1
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    steps[last[:-1]] = length  # a gap between one curve and the next
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    begins = along[last - counts[there] + 1]
+    lengths[there] = along[last] - begins
+    at = length * np.arange(1, vertices.shape[1]) / (vertices.shape[1] - 1)
+    within = at <= lengths[there, None] * (1.0 + ROUNDING)
+    wanted = np.minimum(begins[:, None] + at, along[last][:, None])
+    off = [np.interp(wanted, along, points[:, axis]) - vertices[there, 1:, axis] for axis in (0, 1)]
+    known = within.sum(axis=1)
+    mean = np.where(within, np.hypot(*off), 0.0).sum(axis=1) / np.maximum(known, 1)
+    scored = (known > 0) & (lengths[there] >= LEAST_SEEN * length)
+    errors[there] = np.where(scored, 100.0 / length * mean, np.nan)
+    return errors, lengths
+
+
+def instant_of(sight: Sight, prediction: Prediction, margins: Margins | None, step_time: float) -> Instant:
+    """Return a prediction beside what was seen and what is true, not scored yet; see `Tally.take`."""
+    instant = Instant(
+        sight.stamp,
+        vertices=prediction.vertices,
+        stretch=float(np.abs(prediction.stretch).max(initial=0.0)),
+        residual=prediction.residual,
+        step_time=step_time,
+        seen=sight.seen,
+        truth=sight.truth,
+        tail=sight.tail,
+        heading=math.atan2(sight.heading[1], sight.heading[0]),
+    )
+    if margins is not None:
+        instant.least = {KINDS[least.kind]: least.clearance for least in margins.least}
+        near = margins.kind == _OBSTACLE
+        if near.any():
+            instant.clearance = np.full(len(prediction.vertices), np.inf)
+            np.minimum.at(instant.clearance, margins.node[near], margins.clearance[near])
+    return instant
+
+
+class Tally:
+    """The figures of all predictions of a run; of each only numbers are kept, so that a run may be long.
+
+    Args:
+        length: of the thread [m].
+
+    Attributes:
+        contact_frames: those in which the thread touches an obstacle.
+    """
+
+    def __init__(self, length: float) -> None:
+        self._length = length
+        self._least: dict[int, tuple[float, int, int, int]] = {}
+        self._fresh: list[Instant] = []
+        self._done: list[Instant] = []
+        self._worst: Instant | None = None
+        self.contact_frames = 0
+
+    def take(self, sight: Sight, prediction: Prediction, margins: Margins | None, step_time: float) -> None:
+        """Take a prediction of a sight.
+
+        Args:
+            sight: what was seen.
+            prediction: of it.
+            margins: of the prediction, if they prove anything.
+            step_time: that the prediction took [s].
+        """
+        instant = instant_of(sight, prediction, margins, step_time)
+        if margins is not None:
+            for least in margins.least:
+                if least.clearance < self._least.get(least.kind, (np.inf,))[0]:
+                    self._least[least.kind] = (least.clearance, least.node, least.obstacle, sight.stamp)
+            self.contact_frames += bool(margins.touching)
+        self._fresh.append(instant)
+        if len(self._fresh) >= AT_ONCE:
+            self._score()
+
+    @property
+    def instants(self) -> list[Instant]:
+        """Return all predictions, by time, without threads."""
+        self._score()
+        return self._done
+
+    @property
+    def worst(self) -> Instant | None:
+        """Return the prediction farthest from what was seen, in full; where nothing was seen, from the truth."""
+        self._score()
+        return self._worst
+
+    def least_margins(self, start: int) -> list[LeastMargin]:
+        """Return the least margin of each kind; times count from `start` [ns]."""
+        return [
+            LeastMargin(KINDS[kind], clearance, node, obstacle, (stamp - start) * 1e-9)
+            for kind, (clearance, node, obstacle, stamp) in sorted(self._least.items())
+        ]
+
+    def _score(self) -> None:
+        """Score what has come, and keep of it only numbers."""
+        fresh, self._fresh = self._fresh, []
+        if not fresh:
+            return
+        vertices = np.stack([instant.vertices for instant in fresh])
+        by_seen, lengths = errors_percent(vertices, [instant.seen for instant in fresh], self._length)
+        by_truth, _ = errors_percent(vertices, [instant.truth for instant in fresh], self._length)
+        shares = np.minimum(1.0, lengths / self._length)
+        for instant, seen, truth, share in zip(
+            fresh, by_seen.tolist(), by_truth.tolist(), shares.tolist(), strict=True
+        ):
+            instant.error_seen, instant.error_truth, instant.seen_share = seen, truth, share
+            if self._worst is None or _badness(instant) > _badness(self._worst):
+                self._worst = replace(instant)
+            instant.vertices = instant.seen = instant.truth = _NOTHING
+            instant.clearance = instant.tail = _NONE
+        self._done += fresh
+
+
+def _badness(instant: Instant) -> float:
+    """Return the error that counts; less than any where there is none."""
+    errors = (instant.error_seen, instant.error_truth)
+    return next((error for error in errors if math.isfinite(error)), -1.0)
