@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.cli import commands
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS
 from test.study.test_evaluation import write
 
@@ -31,12 +33,28 @@ def test_help_names_every_command_and_the_exit_codes():
         "track",
         "calibrate-camera",
         "calibrate-coils",
+        "coils",
         "evaluate",
         "bench",
         "no medical device",
         "0 done, 1 the job failed, 2 wrong use",
     ):
         assert words in shown.stdout
+
+
+def test_every_file_of_a_command_is_in_the_parser(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    shown = re.findall(r"^    ([a-z-]+)(?: |$)", capsys.readouterr().out, re.MULTILINE)
+    files = {path.stem for path in Path(str(commands.__file__)).parent.glob("*.py")} - {"__init__"}
+    assert sorted(shown) == sorted(name.replace("_", "-") for name in files)
+
+
+def test_help_waits_for_no_package_of_a_command():
+    slow = "numpy", "numba", "cv2", "scipy", "matplotlib", "rclpy"
+    look = f"import sys; from magnetosuture_thread import cli; print([name for name in {slow} if name in sys.modules])"
+    shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, timeout=60, check=True)
+    assert shown.stdout == "[]\n"
 
 
 @pytest.mark.parametrize(
@@ -49,6 +67,7 @@ def test_help_names_every_command_and_the_exit_codes():
         ("track", "--overlay"),
         ("calibrate-camera", "--markers"),
         ("calibrate-coils", "--model"),
+        ("coils", "ACTION"),
         ("evaluate", "--rig"),
         ("bench", "--json"),
     ],
@@ -152,7 +171,7 @@ def test_evaluate_refuses_what_is_no_trajectory(tmp_path: Path):
 
 
 def test_the_words_of_the_command_are_those_of_the_model(capsys: pytest.CaptureFixture[str]):
-    """They are written out in the parser, which would be slow to start if it asked the model."""
+    """They are written out in the command, whose help would be slow if it asked the model."""
     with pytest.raises(SystemExit):
         cli.main(["evaluate", "--help"])
     shown = capsys.readouterr().out

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from magnetosuture_thread.errors import ConfigurationError
+
 
 def number(low: float, high: float) -> Callable[[str], float]:
     """Return an argument type: a number within bounds."""
@@ -43,3 +45,37 @@ def output_file(text: str) -> Path:
     if not path.parent.is_dir() or path.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r} is no file in a folder that exists")
     return path
+
+
+def add_remap(parser: argparse._ActionsContainer) -> None:
+    """Add the option --remap, which may come again; its value is a list of pairs, old name and new."""
+    parser.add_argument(
+        "--remap",
+        type=remap,
+        action="append",
+        default=[],
+        metavar="FROM:=TO",
+        help="another name for a bag's topic; may come again",
+    )
+
+
+def add_source(parser: argparse._ActionsContainer) -> None:
+    """Add --source, --remap and --frame: what of a bag to go by."""
+    parser.add_argument(
+        "--source",
+        choices=("auto", "camera", "poses"),
+        default="auto",
+        help="what to go by: the camera's frames, or the recorded poses (default: the camera where there are frames)",
+    )
+    add_remap(parser)
+    parser.add_argument("--frame", default="dish", metavar="NAME", help="a bag's name of the dish frame")
+
+
+def remap(text: str) -> tuple[str, str]:
+    """Return a topic's name and its new one: an argument type."""
+    from magnetosuture_thread.jobs.bag import remapping
+
+    try:
+        return remapping(text)
+    except ConfigurationError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {error.expectation}") from None

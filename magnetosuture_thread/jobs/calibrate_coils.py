@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import datetime
 import math
-import os
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 from magnetosuture_thread.coils.calibration_fit import CalibrationFit, fit_calibration
 from magnetosuture_thread.coils.measurements import read_measurements
 from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.jobs.output import whole_file
 
 STRONGEST = 1e-3  # T of a background; that of the earth is a twentieth of it
 
@@ -42,23 +41,6 @@ def calibrate_coils(measurements: Path, output: Path, model: str = "loops", name
     )
     date = datetime.date.today().isoformat()
     calibration = replace(fit.calibration, name=name or output.stem, date=date, notes=notes)
-    _write_whole(output, calibration.to_yaml())
+    with whole_file(output) as partial:
+        partial.write_text(calibration.to_yaml(), encoding="utf-8")
     return replace(fit, calibration=calibration)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Write a file that is never seen half-written."""
-    partial: Path | None = None
-    try:
-        handle, made = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.absolute().parent)
-        partial = Path(made)
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        partial.chmod(0o644)
-        partial.replace(path)
-        partial = None
-    except OSError as error:
-        raise BagError(path, f"cannot be written: {error.strerror or error}") from None
-    finally:
-        if partial is not None:
-            partial.unlink(missing_ok=True)

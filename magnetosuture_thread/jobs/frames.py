@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 
+from magnetosuture_thread.bags.damage import counted
+from magnetosuture_thread.bags.folder import PACKED, STORAGES
 from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -44,6 +47,7 @@ class FrameSource:
 
     Args:
         paths: picture files, one folder of pictures, or one bag.
+        remap: new name of a bag's topic by its recorded name.
 
     Attributes:
         count: number of frames.
@@ -51,23 +55,34 @@ class FrameSource:
             apart from others of that name, and numbered where a file is given twice; empty for a bag.
         is_sequence: whether the frames follow one another in time, as in a bag.
         notes: what a bag's writer says of it.
+        doubts: on a bag, a line each: what is damaged, or why damage may not have been noticed.
 
     Raises:
         BagError: a path does not exist, a folder holds no pictures, or a bag cannot be used.
     """
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[Path], *, remap: Mapping[str, str] | None = None) -> None:
         self._files: list[Path] = []
-        self._bag: Bag | None = None
-        self._topic = ""
+        self._recording: Recording | None = None
+        self._channel = CAMERA["raw"]
         self.notes: dict[str, str] = {}
+        self.doubts: list[str] = []
         for path in paths:
-            self._add(path, alone=len(paths) == 1)
-        self.is_sequence = self._bag is not None
+            self._add(path, remap, alone=len(paths) == 1)
+        self.is_sequence = self._recording is not None
+        if remap and self._recording is None:
+            raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
         self.names = _names(self._files)
-        self.count = self._bag.counts[self._topic] if self._bag is not None else len(self._files)
+        recording = self._recording
+        self.count = recording.counts[self._channel.recorded] if recording is not None else len(self._files)
 
-    def _add(self, path: Path, alone: bool) -> None:
+    @property
+    def refused(self) -> list[str]:
+        """Return why frames of a bag could not be taken, a line each, once all have been gone through."""
+        reasons = self._recording.refused if self._recording is not None else {}
+        return [f"{reason}: {counted(count, 'frame')} left out" for reason, count in reasons.items()]
+
+    def _add(self, path: Path, remap: Mapping[str, str] | None, alone: bool) -> None:
         try:
             path.stat()
             is_folder = path.is_dir()
@@ -76,17 +91,17 @@ class FrameSource:
             raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
         except (OSError, ValueError) as error:
             raise BagError(path, f"cannot be read: {error}") from None
-        if path.suffix == ".mcap" or any(file.suffix == ".mcap" for file in inside):
+        if any(file.name.endswith((*STORAGES, *PACKED)) for file in (path, *inside)):
             if not alone:
                 raise BagError(path, "is a bag; expected it alone, without other frames")
-            bag = self._bag = Bag(path)
+            bag = Bag(path, remap=remap)
+            recording = self._recording = Recording(bag)
             self.notes = bag.notes
-            channels = [c for c in CAMERA.values() if bag.topics.get(c.recorded) == c.type_name]
-            channel = max(channels, key=lambda c: bag.counts[c.recorded], default=None)
-            if channel is None or not bag.counts[channel.recorded]:
-                topics = " or ".join(c.recorded for c in CAMERA.values())
-                raise BagError(path, f"holds no camera frames; expected some on {topics}")
-            self._topic = channel.recorded
+            self.doubts = [doubt for doubt in (str(bag.damage or ""), bag.unchecked) if doubt]
+            if recording.camera is None:
+                topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
+                raise BagError(path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
+            self._channel = recording.camera
         elif is_folder:
             pictures = [file for file in inside if file.suffix.lower() in PICTURES and file.is_file()]
             if not pictures:
@@ -97,8 +112,9 @@ class FrameSource:
 
     def __iter__(self) -> Iterator[Frame]:
         """Go through the frames: files in the order given, a folder by name, a bag by time."""
-        if self._bag is not None:
-            for record in self._bag.records({self._topic}):
+        if self._recording is not None:
+            self._recording.refused.clear()
+            for record in self._recording.records([self._channel]):
                 yield self._recorded(record)
             return
         for name, file in zip(self.names, self._files, strict=True):
@@ -111,9 +127,9 @@ class FrameSource:
 
     def rate(self) -> float:
         """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
-        if self._bag is None:
+        if self._recording is None:
             return PICTURE_RATE
-        stamps = [_stamp(record) for record in islice(self._bag.records({self._topic}), FRAMES_FOR_RATE)]
+        stamps = [_stamp(record) for record in islice(self._recording.records([self._channel]), FRAMES_FOR_RATE)]
         intervals = [after - before for before, after in pairwise(stamps) if after > before]
         if not intervals:
             return PICTURE_RATE

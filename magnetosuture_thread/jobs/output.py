@@ -1,27 +1,32 @@
-"""Folders that a job makes whole or not at all."""
+"""Files and folders that a job makes whole or not at all."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from magnetosuture_thread.bags.writer import RecordingEndedError
 from magnetosuture_thread.errors import BagError
 
 
 @contextmanager
-def whole_folder(output: Path) -> Iterator[Path]:
+def whole_folder(output: Path, *, is_recording: bool = False) -> Iterator[Path]:
     """Give a folder to fill, which takes its name only when the block ends without an error.
 
     Args:
         output: the folder to make; must not exist.
+        is_recording: whether it is a recording, which cannot be made again: when the disk is full, what was
+            recorded before stays.
 
     Yields:
-        A hidden folder beside it. Whatever ends the block early, nothing of it is left.
+        A hidden folder beside it. Whatever else ends the block early, nothing of it is left.
 
     Raises:
+        RecordingEndedError: the disk is full; what was recorded is in the output.
         BagError: the output exists or cannot be written.
     """
     partial: Path | None = None
@@ -38,6 +43,12 @@ def whole_folder(output: Path) -> Iterator[Path]:
         yield partial
         partial.rename(output)
         made = []
+    except RecordingEndedError as error:
+        if partial is None or not is_recording:
+            raise
+        partial.rename(output)
+        made = []
+        raise RecordingEndedError(output, error.problem.replace(str(partial), str(output))) from None
     except OSError as error:
         raise BagError(output, f"cannot be written: {error.strerror or error}") from None
     finally:
@@ -46,3 +57,32 @@ def whole_folder(output: Path) -> Iterator[Path]:
         for folder in made:
             if folder.exists() and not any(folder.iterdir()):
                 folder.rmdir()
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a file to write, which takes its name only when the block ends without an error.
+
+    Args:
+        path: the file to make; one that is there is replaced then.
+
+    Yields:
+        A hidden file beside it.
+
+    Raises:
+        BagError: it cannot be written.
+    """
+    partial: Path | None = None
+    try:
+        handle, made = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.absolute().parent)
+        os.close(handle)
+        partial = Path(made)
+        yield partial
+        partial.chmod(0o644)
+        partial.replace(path)
+        partial = None
+    except OSError as error:
+        raise BagError(path, f"cannot be written: {error.strerror or error}") from None
+    finally:
+        if partial is not None:
+            partial.unlink(missing_ok=True)

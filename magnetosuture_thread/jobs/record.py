@@ -1,30 +1,34 @@
-"""The job `magnetosuture record`: a bag of simulated camera frames from a reference trajectory."""
+"""The job `magnetosuture record`: a bag of simulated camera frames, or of poses, from a reference trajectory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.polyline import points_at
+from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.interface import (
+    CAMERA_FRAME,
     CAMERA_INFO,
     COMPRESSED_IMAGE,
-    DISH_FRAME,
     NEEDLE_COMMAND,
+    NEEDLE_POSE,
+    SEEN_THREAD,
     TRUE_NEEDLE,
     TRUE_THREAD,
+    Channel,
 )
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.thread import Attachment
+from magnetosuture_thread.offline.messages import header, make, path_message, placed, pose_message
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.camera.scene import Scene
 from magnetosuture_thread.setups import Setup
@@ -34,6 +38,7 @@ SIZE = (640, 480)
 DISH_SHARE = 0.9115  # of the image's height
 CAMERA_HEIGHT = 0.3  # m above the dish, for the intrinsics in camera_info
 TRUTH_POINTS = 51
+SEEN_POINTS = 64
 EPOCH = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "not set" in ROS
 
 
@@ -47,12 +52,15 @@ def record(
     rate: float = 30.0,
     quality: int = 85,
     seed: int = 0,
+    poses: bool = False,
+    noise: float = 0.0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> int:
-    """Render a trajectory and write it as a bag; return the number of frames.
+    """Write a trajectory as a bag; return the number of frames, or of poses.
 
-    The bag holds JPEG frames and camera_info, the needle velocity command that the trajectory amounts
-    to, and the truth on topics of its own. All of it is simulated, and the bag's notes say so.
+    The bag holds JPEG frames and camera_info, or in their place needle poses and seen threads; besides, the needle
+    velocity command that the trajectory amounts to, and the truth on topics of its own. All of it is simulated, and
+    the bag's notes say so.
 
     Args:
         reference: needle poses and thread.
@@ -60,9 +68,12 @@ def record(
         output: the bag's folder, made here.
         start: time in the trajectory to begin at [s].
         duration: [s]; to the trajectory's end if None.
-        rate: frames a second.
+        rate: frames, or poses, a second.
         quality: of the JPEG frames, 1 to 100.
         seed: of dust and noise.
+        poses: whether poses and seen threads take the place of frames.
+        noise: of these, standard deviation of tail and seen thread [m]; of the heading, the same over the needle's
+            length.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -77,27 +88,15 @@ def record(
     if frames < 1:
         raise BagError(reference.name, f"{end - start:g} s at {rate:g} frames a second hold no frame")
     _check_setup(reference, setup)
-    view = DishView((322.0, 238.0), setup.vision.dish_diameter / (DISH_SHARE * SIZE[1]))
-    scene = Scene(
-        dish_diameter=setup.vision.dish_diameter,
-        needle_length=setup.vision.needle_length,
-        needle_width=setup.vision.needle_width,
-        thread_diameter=setup.model.thread().diameter,
-        obstacles=reference.discs,
-    )
-    camera = DishCamera(scene, view, SIZE, seed)
-    notes = {
-        "setup": setup.name,
-        "simulated": f"camera frames and needle motion, rendered from the reference trajectory {reference.name}",
-    }
+    what = "needle poses and seen thread" if poses else "camera frames and needle motion, rendered"
+    notes = {"setup": setup.name, "simulated": f"{what} from the reference trajectory {reference.name}"}
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
-        topics = _Topics(bag)
+        topics = _PoseTopics(bag, setup, noise, seed) if poses else _FrameTopics(bag, setup, reference, quality, seed)
         for index in range(frames):
             time = start + index / rate
             before, after = max(first, time - 0.5 / rate), min(last, time + 0.5 / rate)
             velocity = (reference.at(after)[0] - reference.at(before)[0]) / (after - before)
-            tail, heading, thread = reference.at(time)
-            topics.write(time, camera, tail, heading, thread, velocity, quality)
+            topics.write(round((time + EPOCH) * 1e9), *reference.at(time), velocity)
             progress((index + 1) / frames)
     return frames
 
@@ -135,63 +134,65 @@ def _numbers(value: Any) -> NDArray[np.float64]:
     return np.asarray(value, dtype=np.float64)
 
 
-class _Topics:
-    """Writes one frame's messages."""
+class _Topics(ABC):
+    """Writes what every bag holds of one instant: the command and the truth.
 
-    def __init__(self, bag: BagWriter) -> None:
+    Args:
+        bag: to write to.
+        channels: besides those.
+    """
+
+    def __init__(self, bag: BagWriter, channels: Sequence[Channel]) -> None:
         self._bag = bag
-        self._types = typestore().types
-        for channel in (COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND, TRUE_NEEDLE, TRUE_THREAD):
+        for channel in (*channels, NEEDLE_COMMAND, TRUE_NEEDLE, TRUE_THREAD):
             bag.add_topic(channel.recorded, channel.type_name)
 
-    def write(
-        self, time: float, camera: DishCamera, tail: Any, heading: float, thread: Any, velocity: Any, quality: int
-    ) -> None:
-        nanoseconds = round((time + EPOCH) * 1e9)
-        header = self._header(nanoseconds, DISH_FRAME)
-        optical = self._header(nanoseconds, "camera")
-        data = encode_jpeg(camera.render(tail, heading, thread), quality)
-        write = self._bag.write_message
-        image = self._make(
-            "sensor_msgs/msg/CompressedImage", header=optical, format="bgr8; jpeg compressed bgr8", data=data
+    def write(self, stamp: int, tail: Points, heading: float, thread: Points, velocity: Points) -> None:
+        """Write an instant."""
+        self._write_seen(stamp, tail, heading, thread)
+        linear = make("geometry_msgs/msg/Vector3", x=float(velocity[0]), y=float(velocity[1]), z=0.0)
+        none = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        twist = make("geometry_msgs/msg/Twist", linear=linear, angular=none)
+        self._put(NEEDLE_COMMAND, stamp, make(NEEDLE_COMMAND.type_name, header=header(stamp), twist=twist))
+        self._put(TRUE_NEEDLE, stamp, placed(stamp, tail, heading))
+        self._put(TRUE_THREAD, stamp, path_message(stamp, _along(thread, TRUTH_POINTS)))
+
+    @abstractmethod
+    def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
+        """Write how the needle and the thread are seen."""
+
+    def _put(self, channel: Channel, stamp: int, message: Any) -> None:
+        self._bag.write_message(channel.recorded, stamp, message)
+
+
+class _FrameTopics(_Topics):
+    """Writes camera frames."""
+
+    def __init__(self, bag: BagWriter, setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> None:
+        super().__init__(bag, (COMPRESSED_IMAGE, CAMERA_INFO))
+        view = DishView((322.0, 238.0), setup.vision.dish_diameter / (DISH_SHARE * SIZE[1]))
+        scene = Scene(
+            dish_diameter=setup.vision.dish_diameter,
+            needle_length=setup.vision.needle_length,
+            needle_width=setup.vision.needle_width,
+            thread_diameter=setup.model.thread().diameter,
+            obstacles=reference.discs,
         )
-        write(COMPRESSED_IMAGE.recorded, nanoseconds, image)
-        write(CAMERA_INFO.recorded, nanoseconds, self._camera_info(optical, camera))
-        write(NEEDLE_COMMAND.recorded, nanoseconds, self._twist(header, velocity))
-        write(TRUE_NEEDLE.recorded, nanoseconds, self._pose(header, tail, heading))
-        at = np.linspace(0.0, np.linalg.norm(np.diff(thread, axis=0), axis=1).sum(), TRUTH_POINTS)
-        poses = [self._pose(header, point, 0.0) for point in points_at(thread, at)]
-        write(TRUE_THREAD.recorded, nanoseconds, self._make("nav_msgs/msg/Path", header=header, poses=poses))
+        self._camera = DishCamera(scene, view, SIZE, seed)
+        self._quality = quality
 
-    def _make(self, type_name: str, **fields: Any) -> Any:
-        return self._types[type_name](**fields)
-
-    def _header(self, nanoseconds: int, frame: str) -> Any:
-        stamp = self._make("builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-    def _pose(self, header: Any, point: Any, angle: float) -> Any:
-        position = self._make("geometry_msgs/msg/Point", x=float(point[0]), y=float(point[1]), z=0.0)
-        turned = self._make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(0.5 * angle), w=np.cos(0.5 * angle))
-        pose = self._make("geometry_msgs/msg/Pose", position=position, orientation=turned)
-        return self._make("geometry_msgs/msg/PoseStamped", header=header, pose=pose)
-
-    def _twist(self, header: Any, velocity: Any) -> Any:
-        linear = self._make("geometry_msgs/msg/Vector3", x=float(velocity[0]), y=float(velocity[1]), z=0.0)
-        none = self._make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-        twist = self._make("geometry_msgs/msg/Twist", linear=linear, angular=none)
-        return self._make("geometry_msgs/msg/TwistStamped", header=header, twist=twist)
-
-    def _camera_info(self, header: Any, camera: DishCamera) -> Any:
-        matrix = camera.view.intrinsics(CAMERA_HEIGHT)
-        whole = self._make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        return self._make(
-            "sensor_msgs/msg/CameraInfo",
-            header=header,
-            height=camera.size[1],
-            width=camera.size[0],
+    def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
+        data = encode_jpeg(self._camera.render(tail, heading, thread), self._quality)
+        optical = header(stamp, CAMERA_FRAME)
+        image = make(COMPRESSED_IMAGE.type_name, header=optical, format="bgr8; jpeg compressed bgr8", data=data)
+        self._put(COMPRESSED_IMAGE, stamp, image)
+        matrix = self._camera.view.intrinsics(CAMERA_HEIGHT)
+        whole = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        information = make(
+            CAMERA_INFO.type_name,
+            header=optical,
+            height=self._camera.size[1],
+            width=self._camera.size[0],
             distortion_model="plumb_bob",
             d=np.zeros(5),
             k=matrix.ravel(),
@@ -201,3 +202,28 @@ class _Topics:
             binning_y=0,
             roi=whole,
         )
+        self._put(CAMERA_INFO, stamp, information)
+
+
+class _PoseTopics(_Topics):
+    """Writes what a tracker would say of the frames."""
+
+    def __init__(self, bag: BagWriter, setup: Setup, noise: float, seed: int) -> None:
+        super().__init__(bag, (NEEDLE_POSE, SEEN_THREAD))
+        self._noise = np.array([noise, noise, noise / setup.vision.needle_length])
+        self._random = np.random.default_rng(seed)
+
+    def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
+        off = self._noise * self._random.standard_normal(3)
+        angle = heading + off[2]
+        pose = pose_message(stamp, tail + off[:2], np.array([np.cos(angle), np.sin(angle)]), np.diag(self._noise**2))
+        self._put(NEEDLE_POSE, stamp, pose)
+        seen = _along(thread, SEEN_POINTS)
+        seen[1:] += self._noise[:2] * self._random.standard_normal(seen[1:].shape)
+        seen[0] = tail + off[:2]  # a seen thread begins at the seen tail
+        self._put(SEEN_THREAD, stamp, path_message(stamp, seen))
+
+
+def _along(thread: Points, count: int) -> Points:
+    """Return equally spaced points of a thread."""
+    return points_at(thread, np.linspace(0.0, np.linalg.norm(np.diff(thread, axis=0), axis=1).sum(), count))

@@ -2,41 +2,45 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
 
-from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.reader import Bag, Record
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NODES, TRUE_THREAD, Channel
-from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE, SLOWER_BRIDGE
-from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.study.currents import CurrentSeries
-from magnetosuture_thread.study.picture import draw_summary
-from magnetosuture_thread.study.replayed import (
-    Collector,
-    Instant,
-    Spread,
-    Summary,
-    error_figures,
-    stage_latencies,
+from magnetosuture_thread.errors import BagError, GraphError
+from magnetosuture_thread.interface import (
+    CAMERA,
+    CAMERA_INFO,
+    CURRENTS,
+    NEEDLE_COMMAND,
+    NEEDLE_POSE,
+    NODES,
+    SEEN_THREAD,
+    TRUE_THREAD,
+    Channel,
 )
-from magnetosuture_thread.vision.images import decode_image, unpack_image
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.jobs.judge import Given, opened, write_results
+from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
+from magnetosuture_thread.offline.changes import CHANGING
+from magnetosuture_thread.offline.predictions import sights
+from magnetosuture_thread.study.currents import CurrentSeries
+from magnetosuture_thread.study.replayed import Collector, Spread, Summary, error_figures, stage_latencies
 
-DEFAULT_SETUP = "petri_35mm_polyamide"
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.replay import LiveReplay
+
 # A replayed bag never moves a needle, so its bridge may arm itself.
 NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE)
+SHORTEST_LOOP = 1.5  # s; nodes take a jump back of a second and less for messages that come late
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
-Times = dict[str, dict[int, float]]
 
 
 def replay(
@@ -45,20 +49,32 @@ def replay(
     *,
     setup_name: str = "",
     rate: float = 1.0,
+    source: str = "auto",
+    start: float = 0.0,
+    duration: float | None = None,
+    loop: bool = False,
+    remap: Mapping[str, str] | None = None,
+    frame: str = "dish",
     say: Say = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> Summary:
-    """Play a bag through the three nodes as processes of their own, and judge what they made of it.
+    """Play a bag through the nodes as processes of their own, and judge what they made of it.
 
     `output` is made at the end, whole or not at all: `bag/` with all outputs, `summary.json`,
     `summary.png` and the nodes' `logs/`. The coil bridge gets the recording driver, whatever the set-up
-    says: a replayed bag never moves a needle.
+    says: a replayed bag never moves a needle. By its poses a bag is played without a tracker.
 
     Args:
-        bag_path: an mcap file, or a folder that holds one.
+        bag_path: a bag.
         output: folder to make.
         setup_name: name or path of the set-up; the one the bag names if empty.
         rate: how much faster than recorded.
+        source: `camera`, `poses`, or `auto`: the camera where there are frames.
+        start: seconds into the bag to begin at; the thread starts as it is first seen from then on.
+        duration: [s]; to the bag's end if None.
+        loop: whether it is played over and over until it is interrupted; the first pass is recorded and judged.
+        remap: other names for topics of the bag, by the old one.
+        frame: the bag's name of the dish frame.
         say: called with a line for a person at each stage.
         progress: called with the share played, 0 to 1.
 
@@ -66,154 +82,209 @@ def replay(
         BagError: the bag cannot be used, or the output exists or cannot be written.
         ConfigurationError: the set-up cannot be used.
         GraphError: a node ended or did not come, or nothing was predicted.
+        KeyboardInterrupt: interrupted before the first pass was done.
     """
-    say(f"checking {bag_path}")
-    bag = Bag(bag_path)
     with ExitStack() as stack:
-        setup = _setup_of(bag, setup_name, Path(stack.enter_context(TemporaryDirectory())), say)
-        return _replay(bag, setup, output, rate, say, progress)
-
-
-def _setup_of(bag: Bag, name: str, spare: Path, say: Say) -> Setup:
-    """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default."""
-    named, text = bag.notes.get("setup", ""), bag.notes.get(SCENARIO_NOTE, "")
-    if name:
-        if named and name != named:
-            say(f"the bag names the set-up {named}; taking {name}")
-        return read_setup(name)
-    if text:  # which says more than a name: the file may have changed, or be on another machine
-        path = spare / f"{named or 'scenario'}.yaml"
-        path.write_text(text, encoding="utf-8")
-        return read_setup(str(path))
-    if not named:
-        say(f"the bag names no set-up; taking {DEFAULT_SETUP}")
-    return read_setup(named or DEFAULT_SETUP)
-
-
-def _replay(bag: Bag, setup: Setup, output: Path, rate: float, say: Say, progress: Progress) -> Summary:
-    """Check the bag, play it and judge what came out."""
-    camera = CAMERA[setup.vision.image_transport]
-    bag.require(camera.recorded, camera.type_name)
-    if bag.counts.get(NEEDLE_COMMAND.recorded):
-        bag.require(NEEDLE_COMMAND.recorded, NEEDLE_COMMAND.type_name)
-    bag.check()
-    if rate < 1.0:
-        say("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
-    if rate > 1.0:
-        say("played faster than recorded: latencies count what waits in the queues")
-    with whole_folder(output) as folder:
-        published, arrived = _play(folder, bag, setup, camera, rate, say, progress)
-        say("judging what came out")
-        return _judge(folder, bag, setup, camera, published, arrived, say)
-
-
-def _play(
-    folder: Path, bag: Bag, setup: Setup, camera: Channel, rate: float, say: Say, progress: Progress
-) -> tuple[Times, Times]:
-    """Play the bag into the graph and record its outputs to `folder`/bag."""
-    # Only here, where it is needed: without ROS the other commands still work.
-    from magnetosuture_thread.nodes import topics
-    from magnetosuture_thread.nodes.processes import (
-        NodeProcesses,
-        environment_of,
-        graph_environment,
-        reserved_domain,
-    )
-    from magnetosuture_thread.nodes.replay import DEPTH, LiveReplay
-
-    qos = folder / "lossless.yaml"
-    qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
-    files = [argument for path in (setup.path, qos) for argument in ("--params-file", str(path.resolve()))]
-    arguments = [*files, "-p", "use_sim_time:=true", *NOTHING_MOVES]
-    notes = {**bag.notes, "setup": setup.name, "replayed": str(bag.path)}
-    inputs = {topic.channel.recorded for topic in topics.INPUTS}
-    played = (inputs & {name for name, count in bag.counts.items() if count}) - {c.recorded for c in CAMERA.values()}
-    played.add(camera.recorded)
-    with reserved_domain() as domain:
-        environment = graph_environment(domain)
-        say(f"starting {', '.join(NODES)} (ROS domain {domain}, this machine only)")
-        with (
-            environment_of(environment),
-            NodeProcesses(NODES, arguments, environment, folder / "logs") as nodes,
-            BagWriter(folder / "bag", notes) as outputs,
-        ):
-            for topic in topics.OUTPUTS:
-                outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
-            live = LiveReplay(domain, bag.start, rate, outputs.write, nodes.check)
-            try:
-                live.wait_for_graph(played)
-                say(f"playing {bag.duration:.1f} s" + (f" at {rate:g} times the speed" if rate != 1.0 else ""))
-                live.play(bag.records(played), lambda time: progress(time / max(bag.duration, 1e-9)))
-            finally:
-                live.close()
-    qos.unlink()
-    return live.published, live.arrived
-
-
-def _judge(
-    folder: Path, bag: Bag, setup: Setup, camera: Channel, published: Times, arrived: Times, say: Say
-) -> Summary:
-    """Put the outputs side by side; write summary.json and summary.png."""
-    collector, recorded, replayed = Collector(setup.model.length), CurrentSeries(), CurrentSeries()
-    for record in bag.records({TRUE_THREAD.recorded, CURRENTS.recorded} & set(bag.topics)):
-        message = record.decode()
-        collector.take(record.topic, message) if record.topic == TRUE_THREAD.recorded else recorded.take(message)
-    for record in Bag(folder / "bag").records():
-        message = record.decode()
-        collector.take(record.topic, message)
-        if record.topic == CURRENTS.recorded:
-            replayed.take(message)
-    instants = collector.instants()
-    if not instants:
-        said = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
-        raise GraphError(
-            f"none of {bag.counts[camera.recorded]} frames gave a prediction, {collector.poses} had a needle; {said}"
+        given = stack.enter_context(
+            opened(
+                bag_path,
+                setup_name=setup_name,
+                source=source,
+                start=start,
+                duration=duration,
+                remap=remap or {},
+                frame=frame,
+                say=say,
+            )
         )
-    commands = published.get(NEEDLE_COMMAND.name, {})
-    summary = Summary(
-        bag=str(bag.path),
-        setup=setup.name,
-        simulated=bag.notes.get("simulated", ""),
-        frames=bag.counts[camera.recorded],
-        tracked=collector.poses,
-        predicted=len(instants),
-        commands=len(commands),
-        driven=len(collector.driven & set(commands)),
-        latency=stage_latencies(published, arrived, collector.driven),
-        step_time=Spread.of([instant.step_time for instant in instants]),
-        least_margins=collector.least_margins(bag.start),
-        contact_frames=collector.contact_frames,
-        stretch=max(instant.stretch for instant in instants),
-        residual=max(instant.residual for instant in instants),
-        seen_share=float(np.mean([instant.seen_share for instant in instants])),
-        error_seen=error_figures([instant.error_seen for instant in instants]),
-        error_truth=error_figures([instant.error_truth for instant in instants]),
-        currents=replayed.against(recorded),
-    )
-    (folder / "summary.json").write_text(json.dumps(summary.to_json(), indent=2) + "\n", encoding="utf-8")
-    if not _draw(folder / "summary.png", bag, setup, camera, instants, summary):
-        say("no picture: the dish is not found in any frame")
+        if loop and given.duration < SHORTEST_LOOP:
+            raise BagError(
+                bag_path, f"gives {given.duration:.2f} s to play over and over; expected {SHORTEST_LOOP:g} s or more"
+            )
+        remark, refused = _look_through(given, say)
+        if rate < 1.0:
+            say("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
+        if rate > 1.0:
+            say("played faster than recorded: latencies count what waits in the queues")
+        folder = stack.enter_context(whole_folder(output))
+        job = _Replay(given, folder, rate, remark, refused, say, progress)
+        summary, problem = job.run(loop)
+    if problem:
+        raise GraphError(f"{problem}; the first pass is in {output}")
     return summary
 
 
-def _draw(path: Path, bag: Bag, setup: Setup, camera: Channel, instants: list[Instant], summary: Summary) -> bool:
-    """Draw the summary around the frame with the greatest prediction error, if the dish can be found."""
-    errors = [instant.error_seen if np.isfinite(instant.error_seen) else -1.0 for instant in instants]
-    chosen = instants[int(np.argmax(errors))]
-    view, frame = None, None
-    for record in bag.records({camera.recorded}):
-        message = record.decode()
-        is_chosen = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == chosen.stamp
-        if view is not None and not is_chosen:
-            continue
-        if setup.vision.image_transport == "compressed":
-            image = decode_image(message.data)
-        else:
-            image = unpack_image(message.data, message.height, message.width, message.step, message.encoding)
-        view = view or VisionTracker(setup.vision).look(image).view
-        if is_chosen:
-            frame = image
-        if view is not None and frame is not None:
-            draw_summary(path, frame, view, chosen, instants, setup.model.obstacles(), bag.start, summary)
-            return True
-    return False
+def _look_through(given: Given, say: Say) -> tuple[str, dict[str, int]]:
+    """Check recorded poses and threads before any node starts; return what is odd, and what cannot be used."""
+    if given.source == "camera":
+        return "", {}
+    looked = sights(given.recording, given.setup, source="poses", start=given.start, duration=given.duration)
+    for _ in looked:
+        pass
+    if remark := looked.thread_problem():
+        say(remark)
+    return remark, dict(looked.refused)
+
+
+@dataclass
+class _Replay:
+    """One replay; see `replay`."""
+
+    given: Given
+    folder: Path
+    rate: float
+    remark: str
+    refused: dict[str, int]
+    say: Say
+    progress: Progress
+
+    @property
+    def channels(self) -> list[Channel]:
+        """Return what is played."""
+        camera = self.given.recording.camera
+        source = (camera, CAMERA_INFO) if self.given.source == "camera" else (NEEDLE_POSE, SEEN_THREAD)
+        counts = self.given.recording.counts
+        return [
+            channel
+            for channel in (*source, NEEDLE_COMMAND, *CHANGING)
+            if channel is not None and counts.get(channel.recorded)
+        ]
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Return the nodes of the graph."""
+        return NODES if self.given.source == "camera" else tuple(name for name in NODES if name != "vision_tracker")
+
+    def run(self, loop: bool) -> tuple[Summary, str]:
+        """Play the bag into the graph, record and judge its outputs; return what went wrong later, as well."""
+        # Only here, where it is needed: without ROS the other commands still work.
+        from magnetosuture_thread.nodes import topics
+        from magnetosuture_thread.nodes.processes import (
+            NodeProcesses,
+            environment_of,
+            graph_environment,
+            reserved_domain,
+        )
+        from magnetosuture_thread.nodes.replay import DEPTH, PAUSE, LiveReplay
+        from magnetosuture_thread.nodes.replay_time import Timeline
+
+        qos = self.folder / "lossless.yaml"
+        qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
+        known = [*topics.INPUTS, *topics.SETTINGS, *topics.OUTPUTS]
+        played = [topic for topic in known if topic.channel in self.channels]
+        problem = ""
+        with reserved_domain() as domain:
+            environment = graph_environment(domain)
+            self.say(f"starting {', '.join(self.nodes)} (ROS domain {domain}, this machine only)")
+            with (
+                environment_of(environment),
+                NodeProcesses(self.nodes, self._arguments(qos), environment, self.folder / "logs") as nodes,
+            ):
+                outputs = BagWriter(self.folder / "bag", self.given.notes)
+                for topic in topics.OUTPUTS:
+                    outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
+                live = LiveReplay(
+                    domain,
+                    Timeline(self.given.begin, self.rate),
+                    played=played,
+                    nodes=len(self.nodes),
+                    receive=outputs.write,
+                    watch=nodes.check,
+                    say=self.say,
+                )
+                try:
+                    with outputs:
+                        self._play(live, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE} std_srvs/srv/SetBool")
+                    self.say("judging what came out")
+                    summary = self._judge(live)
+                    if loop:
+                        problem = self._play_on(live)
+                finally:
+                    live.close()
+        qos.unlink()
+        return summary, problem
+
+    def _arguments(self, qos: Path) -> list[str]:
+        files = [part for path in (self.given.setup.path, qos) for part in ("--params-file", str(path.resolve()))]
+        arguments = [*files, "-p", "use_sim_time:=true", *NOTHING_MOVES]
+        for transport, channel in CAMERA.items():
+            if self.given.source == "camera" and channel == self.given.recording.camera:
+                arguments += ["-p", f"vision_tracker:image_transport:={transport}"]
+        return arguments
+
+    def _play(self, live: LiveReplay, pause: str) -> None:
+        live.wait_for_graph()
+        at = f" at {self.rate:g} times the speed" if self.rate != 1.0 else ""
+        self.say(f"playing {self.given.duration:.1f} s{at}")
+        self.say(f'to pause: {pause} "{{data: true}}", to go on: false')
+        length = max(self.given.duration, 1e-9)
+        live.play(self._records(), lambda time: self.progress(min(1.0, time / length)))
+
+    def _play_on(self, live: LiveReplay) -> str:
+        """Play on for who watches; return what ended it, if it was not a person."""
+        self.say("the first pass is recorded and judged; playing on until Ctrl-C")
+        try:
+            live.play_on(self._records)
+        except KeyboardInterrupt:
+            self.say("ended")
+        except GraphError as error:
+            return str(error)
+        return ""
+
+    def _records(self) -> Iterator[Record]:
+        given = self.given
+        if given.start > 0.0:  # what was said before of obstacles and thread is in force
+            for record in given.recording.records(CHANGING, duration=given.start):
+                yield replace(record, time=given.begin)
+        yield from given.recording.records(self.channels, start=given.start, duration=given.duration)
+
+    def _judge(self, live: LiveReplay) -> Summary:
+        """Put the outputs side by side; write summary.json and summary.png."""
+        given = self.given
+        collector, recorded, replayed = Collector(given.setup.model.length), CurrentSeries(), CurrentSeries()
+        truth = [c for c in (TRUE_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
+        for record in given.recording.records(truth, start=given.start, duration=given.duration):
+            message = record.decode()
+            collector.take(record.topic, message) if record.topic == TRUE_THREAD.recorded else recorded.take(message)
+        made = Bag(self.folder / "bag")
+        for record in made.records(set(made.topics)):
+            message = record.decode()
+            collector.take(record.topic, message)
+            if record.topic == CURRENTS.recorded:
+                replayed.take(message)
+        instants, losses = collector.instants(), live.losses
+        source = NEEDLE_POSE.name if given.source == "poses" else ""
+        frames = losses.played[source] if source else losses.frames_played
+        if not instants:
+            said = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
+            things = "poses" if source else "frames"
+            raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {said}")
+        commands = live.published.get(NEEDLE_COMMAND.name, {})
+        summary = Summary(
+            bag=str(given.recording.path),
+            setup=given.setup.name,
+            simulated=given.recording.notes.get("simulated", ""),
+            frames=frames,
+            tracked=collector.poses,
+            predicted=len(instants),
+            commands=len(commands),
+            driven=len(collector.driven & set(commands)),
+            latency=stage_latencies(live.published, live.arrived, collector.driven),
+            step_time=Spread.of([instant.step_time for instant in instants]),
+            least_margins=collector.least_margins(given.recording.start),
+            contact_frames=collector.contact_frames,
+            stretch=max(instant.stretch for instant in instants),
+            residual=max(instant.residual for instant in instants),
+            seen_share=float(np.mean([instant.seen_share for instant in instants])),
+            error_seen=error_figures([instant.error_seen for instant in instants]),
+            error_truth=error_figures([instant.error_truth for instant in instants]),
+            currents=replayed.against(recorded),
+            source=given.source,
+            refused=self.refused,
+            dropped=losses.dropped(),
+            damage=str(given.recording.damage or ""),
+            remark=self.remark,
+        )
+        errors = [instant.error_seen if np.isfinite(instant.error_seen) else -1.0 for instant in instants]
+        write_results(self.folder, given, instants, instants[int(np.argmax(errors))], summary, self.say)
+        return summary

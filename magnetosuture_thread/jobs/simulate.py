@@ -59,7 +59,7 @@ def simulate(
 
     `output` becomes a bag of all that was said, the truth included, with the nodes' `logs/` beside it; its
     notes hold the scenario and say that it is simulated, and `replay` takes it. It is made at the end, also
-    of a run that was interrupted; of one that never began nothing is left.
+    of a run that was interrupted, or for which the disk was too small; of one that never began nothing is left.
 
     Args:
         scenario: name or path of a set-up with a path for the needle.
@@ -73,7 +73,7 @@ def simulate(
         progress: called with the share done, 0 to 1.
 
     Raises:
-        BagError: the output exists or cannot be written.
+        BagError: the output exists or cannot be written; where the disk was full, what was recorded is there.
         ConfigurationError: the scenario cannot be used.
         GraphError: a node ended or did not come, or the needle never got to the end of its path.
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
@@ -86,7 +86,7 @@ def simulate(
         raise ConfigurationError(
             "vision_tracker.image_transport", setup.vision.image_transport, expectation, str(setup.path)
         )
-    with whole_folder(output) as folder:
+    with whole_folder(output, is_recording=True) as folder:
         problem = _run(setup, folder, output.name, duration, pace, boards, say, progress)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
@@ -137,7 +137,7 @@ def _run(
         SCENARIO_NOTE: setup.path.read_text(encoding="utf-8"),
         "simulated": f"the whole rig, closed loop, scenario {setup.name}",
     }
-    said = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED)
+    said = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS)
     taken = [topic for topic in said if topic is not topics.IMAGE]
     with (
         reserved_domain() as domain,
@@ -168,11 +168,8 @@ def _run(
 
             recorder = Recorder(domain, taken, simulated_clock=pace is not None, receive=receive)
             try:
-                _wait(
-                    recorder,
-                    nodes.check,
-                    {topics.NEEDLE_COMMAND.name, topics.TIP_SETPOINT.name, topics.FAULT_REQUEST.name},
-                )
+                perhaps = (topics.NEEDLE_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, *topics.SETTINGS)
+                _wait(recorder, nodes.check, {topic.name for topic in perhaps})
                 if boards:
                     _arm(CoilClient)
                 say("running" if pace is None else f"running at {pace:g} times the speed")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,6 +77,8 @@ def track(
     settings: VisionTrackerSettings,
     *,
     overlay: Path | None = None,
+    remap: Mapping[str, str] | None = None,
+    say: Callable[[str], None] = lambda text: None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[TrackedFrame]:
     """Track the needle in frames: each by itself, or over time where they are a bag's.
@@ -85,12 +87,16 @@ def track(
         paths: picture files, one folder of pictures, or one bag.
         settings: what to look for.
         overlay: folder or video to draw into.
+        remap: new name of a bag's topic by its recorded name.
+        say: called with a line for a person on what of a bag is damaged or not checked.
         progress: called with the share done, 0 to 1.
 
     Raises:
         BagError: there are no frames, or the overlay cannot be written.
     """
-    source = FrameSource(paths)
+    source = FrameSource(paths, remap=remap)
+    for doubt in source.doubts:
+        say(f"{paths[0]} {doubt}")
     tracker = VisionTracker(settings)
     warm_up()
     results = []
@@ -104,6 +110,8 @@ def track(
                 name = f"frame_{index:06d}" if source.is_sequence else files[index]
                 writer.write(name, _drawn(frame.image, result, settings))
             progress((index + 1) / max(source.count, 1))
+    for line in source.refused:
+        say(line)
     return results
 
 

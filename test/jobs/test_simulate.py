@@ -95,7 +95,7 @@ def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: 
 
 def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     bag = Bag(run[0])
-    bag.check()
+    assert bag.damage is None
     assert "simulated" in bag.notes
     assert bag.notes["setup"].endswith("short")
     for topic in (

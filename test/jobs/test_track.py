@@ -10,9 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.jobs import frames
@@ -208,3 +210,44 @@ def test_frames_that_show_no_dish_or_no_markers_calibrate_nothing(tmp_path: Path
     with pytest.raises(BagError, match="no frame that can be read"):
         calibrate_camera([tmp_path / "broken.png"], 0.035, tmp_path / "camera.yaml")
     assert not (tmp_path / "camera.yaml").exists()
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_bags_of_other_recorders_are_followed_and_what_is_wrong_with_them_is_said(
+    plugin: StoragePlugin, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    kind = "sensor_msgs/msg/CompressedImage"
+    picture = np.frombuffer((SAMPLES / "frame_00.png").read_bytes(), np.uint8)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as bag:
+        connection = bag.add_connection("/cam", kind, typestore=typestore())
+        for index in range(3):
+            time = typestore().types["builtin_interfaces/msg/Time"](index, 0)
+            header = typestore().types["std_msgs/msg/Header"](time, "camera")
+            message = typestore().types[kind](header, "png", picture)
+            bag.write(connection, index * 10**9, bytes(typestore().serialize_cdr(message, kind)))
+    given = [str(tmp_path / "bag"), "--remap", "/cam:=/camera/image_raw"]
+    view = ["--metres-per-pixel", "8e-5", "--centre", "322", "238"]
+    assert cli.main(["track", *given, *view]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "2 searching, 1 tracked" in said
+    assert "has no checksums" in said
+    output = str(tmp_path / "camera.yaml")
+    assert cli.main(["calibrate-camera", *given, "--dish-diameter", "0.035", "--output", output]) == 0
+    assert "has no checksums" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_damaged_bag_is_said(tmp_path: Path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
+        for index in range(3):
+            bag.write("/camera/image_raw/compressed", index * 10**10, b"")
+    file = tmp_path / "bag" / "bag_0.mcap"
+    file.write_bytes(file.read_bytes()[:-40])
+    said: list[str] = []
+    track([file], VisionTrackerSettings(), say=said.append)
+    assert any("is damaged" in line for line in said)
+
+
+def test_pictures_have_no_topic_to_remap():
+    with pytest.raises(BagError, match="is no bag"):
+        FrameSource([SAMPLES / "frame_00.png"], remap={"/a": "/b"})

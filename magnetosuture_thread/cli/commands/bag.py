@@ -1,0 +1,133 @@
+"""The command `magnetosuture bag`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
+
+from magnetosuture_thread.cli.arguments import add_remap, output_file
+from magnetosuture_thread.cli.command import DONE, Subparsers, command
+from magnetosuture_thread.cli.terminal import make_console, printable, progress, sayer, write_json
+
+DAMAGED = 1
+
+DESCRIPTION = """\
+Look through a bag, or make a whole one of what is intact in it. BAG is an mcap or sqlite3 file of any
+recorder, or the folder of a bag.
+"""
+
+CHECK = """\
+Go through all of a bag: every checksum, and every message's time and stamp. For each topic: its type, how
+many messages, their mean rate, when the first and the last came, the greatest gap, and how often a stamp
+went back; the types follow. What is damaged is said, with what is lost; all else is shown as it can be read.
+"""
+
+REPAIR = """\
+Write every intact message of a bag into a new one, with the old one's notes and definitions of types, and
+say how many there are and what is lost, where and when.
+"""
+
+
+def add(subparsers: Subparsers) -> None:
+    """Add the command."""
+    parser = command(subparsers, "bag", "check a recorded bag, or repair it", DESCRIPTION, run_check)
+    actions = parser.add_subparsers(title="what to do", metavar="ACTION", required=True)
+    check = command(actions, "check", "say what a bag holds, and whether it is whole", CHECK, run_check)
+    repair = command(actions, "repair", "make a whole bag of what is intact", REPAIR, run_repair)
+    for action in (check, repair):
+        action.add_argument("bag", type=Path, metavar="BAG", help="a bag's file or folder")
+        add_remap(action)
+    check.add_argument("--frame", default="dish", metavar="NAME", help="the bag's name of the dish frame")
+    check.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
+    repair.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
+
+
+def run_check(options: argparse.Namespace) -> int:
+    """Say what a bag holds, and whether it is whole."""
+    from magnetosuture_thread.jobs.bag import check_bag
+
+    console = make_console()
+    with progress(console, "bag check") as advance:
+        report = check_bag(options.bag, remap=dict(options.remap), frame=options.frame, progress=advance)
+    found = report.to_json()
+    console.print(_table(found))
+    for line in _lines(found):
+        sayer(console)(line)
+    write_json(options.json, json.dumps(found, indent=2, allow_nan=False))
+    return DAMAGED if found["damage"] or found["refused"] else DONE
+
+
+def run_repair(options: argparse.Namespace) -> int:
+    """Write what is intact in a bag into a new one."""
+    from magnetosuture_thread.jobs.bag import repair_bag
+
+    console = make_console()
+    lines: list[str] = []
+    with progress(console, "bag repair") as advance:
+        count = repair_bag(options.bag, options.output, remap=dict(options.remap), say=lines.append, progress=advance)
+    for line in lines:
+        sayer(console)(line)
+    sayer(console)(f"{count} messages in {options.output}")
+    return DONE
+
+
+def _table(found: dict[str, Any]) -> Table:
+    """Return a row for each topic."""
+    table = Table(title=f"{found['messages']} messages in {found['duration_s']:.3f} s", box=SIMPLE_HEAD, padding=0)
+    table.caption = "times in s since the first message; * is taken by our graph"
+    for name in ("topic", "messages", "Hz", "first", "last", "gap", "back"):
+        is_topic = name == "topic"
+        table.add_column(name, justify="left" if is_topic else "right", overflow="fold", no_wrap=not is_topic)
+    for topic in found["topics"]:
+        times = (topic[key] for key in ("rate_hz", "first_s", "last_s", "greatest_gap_s"))
+        table.add_row(
+            Text(_named(topic["topic"]) + (" *" if topic["known"] else "")),
+            str(topic["messages"]),
+            *("-" if value is None else f"{value:.2f}" for value in times),
+            str(topic["stamps_going_back"]),
+        )
+    return table
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    """Return in words what the table does not say."""
+    lines = []
+    for topic in found["topics"]:
+        types = " and ".join(kind.replace("/msg/", "/") for kind in topic["types"])
+        lines.append(f"{_named(topic['topic'])}: {_named(types) or 'no type'}")
+    for topic in found["topics"]:
+        name = _named(topic["topic"])
+        if len(topic["types"]) > 1:
+            lines.append(f"{name} has two types")
+        elif topic["problem"]:
+            lines.append(topic["problem"])
+        if topic["stamps_going_back"]:
+            lines.append(f"{name}: {topic['stamps_going_back']} stamps are before the one before them")
+        if topic["unreadable_stamps"]:
+            lines.append(f"{name}: {topic['unreadable_stamps']} stamps cannot be read")
+    lines += ["; ".join(f"{key} {value}" for key, value in file.items()) for file in found["files"]]
+    lines += [f"{key}: {' '.join(value.split())[:80]}" for key, value in found["notes"].items()]
+    if found["unchecked"]:
+        lines.append(found["unchecked"])
+    lines += [
+        f"{reason}: {count} {'message' if count == 1 else 'messages'} lost"
+        for reason, count in found["refused"].items()
+    ]
+    if found["damage"] is None:
+        is_sure = not found["refused"] and not found["unchecked"]
+        return [*lines, "nothing is damaged"] if is_sure else lines
+    lines.append(found["damage"]["text"])
+    for place in found["damage"]["places"]:
+        lines.append(f"  {place['file']}, bytes {place['start_byte']} to {place['end_byte']}: {place['what']}")
+    return lines
+
+
+def _named(name: str) -> str:
+    """Return a name in a bag in one line."""
+    return printable(name).replace("\n", "\\n")

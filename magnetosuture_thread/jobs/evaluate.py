@@ -1,0 +1,190 @@
+"""The job `magnetosuture evaluate` on bags: a page for each, and a table over all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from magnetosuture_thread.bags.folder import STORAGES, bag_files
+from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
+from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable
+from magnetosuture_thread.jobs.frames import numbered
+from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.workers import WorkerDiedError, run_all
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.bag_table import Row, failed_row, table_csv, table_json
+
+DEPTH = 2  # folders below the one that is given, in which bags are looked for
+LONGEST_NAME = 200  # bytes
+
+Say = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A bag to evaluate.
+
+    Attributes:
+        path: of the bag.
+        name: of its report.
+        options: how.
+        page: the file to write.
+    """
+
+    path: Path
+    name: str
+    options: Options
+    page: Path
+
+
+def evaluate_bags(
+    paths: Sequence[Path],
+    output: Path,
+    options: Options,
+    *,
+    workers: int = 1,
+    say: Say = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> list[Row]:
+    """Evaluate bags, each for itself.
+
+    `output` is made at the end, whole or not at all: NAME.html of each bag, table.csv and table.json. A bag that
+    cannot be evaluated has its row all the same, with the problem in it, and no page. What is written does not depend
+    on the number of workers, but for the times that steps took.
+
+    Args:
+        paths: bags, or folders of bags.
+        output: folder to make.
+        options: how.
+        workers: processes.
+        say: called with a line for a person.
+        progress: called with the share done, 0 to 1.
+
+    Returns:
+        The rows of the table, in the order of the bags.
+
+    Raises:
+        BagError: there are no bags, or the output exists or cannot be written.
+        ConfigurationError: the set-up that was asked for cannot be used.
+    """
+    if options.setup:
+        read_setup(options.setup)  # what is wrong for all is said before anything is done
+    bags = find_bags(paths)
+    names = numbered([_name(bag) for bag in bags], "{}-{}")
+    rows: dict[int, Row] = {}
+    with whole_folder(output) as folder:
+        tasks = [Task(bag, name, options, folder / f"{name}.html") for bag, name in zip(bags, names, strict=True)]
+
+        def done(index: int, result: Row | WorkerDiedError) -> None:
+            task = tasks[index]
+            row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
+            if row["problem"]:
+                task.page.unlink(missing_ok=True)
+                say(f"{task.name}: {row['problem']}")
+            rows[index] = row
+
+        run_all(evaluate_one, tasks, workers, done=done, say=say, progress=progress)
+        ordered = [rows[index] for index in range(len(tasks))]
+        (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
+        (folder / "table.json").write_text(table_json(ordered), encoding="utf-8")
+    return ordered
+
+
+def evaluate_one(task: Task, say: Say, progress: Progress) -> Row:
+    """Return the row of a bag, with the problem in it if there is one: nothing stops the others."""
+    try:
+        return evaluate_bag(
+            task.path, task.name, task.options, task.page, lambda text: say(f"{task.name}: {text}"), progress
+        )
+    except MagnetosutureError as error:
+        return _failed(task, str(error))
+    except Exception as error:  # A mistake of ours, or of a package: this bag's alone.
+        return _failed(task, f"{type(error).__name__}: {error}")
+
+
+def _failed(task: Task, problem: str) -> Row:
+    return failed_row(task.name, printable(str(task.path)), printable(" ".join(problem.split())))
+
+
+def _name(bag: Path) -> str:
+    path = Path(os.path.abspath(bag))
+    name = printable(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
+    return name.encode()[:LONGEST_NAME].decode("utf-8", "ignore")
+
+
+def find_bags(paths: Sequence[Path]) -> list[Path]:
+    """Return the bags at paths, in their order, each once; within a folder by name.
+
+    Args:
+        paths: bags, or folders that hold some, in themselves or up to two folders below.
+
+    Raises:
+        BagError: a path holds none.
+    """
+    found: dict[Path, Path] = {}
+    for path in paths:
+        bags = _bags(path, DEPTH)
+        if not bags:
+            endings = " or ".join(STORAGES)
+            raise BagError(
+                path, f"holds no bags ({endings}), nor do the folders in it" if path.is_dir() else "is no bag"
+            )
+        for bag in bags:
+            found.setdefault(bag.resolve(), bag)
+    return list(found.values())
+
+
+def _bags(path: Path, depth: int) -> list[Path]:
+    try:
+        if not path.exists():
+            raise BagError(path, "does not exist; expected a bag, or a folder of bags")
+        if path.is_file():
+            return [path]
+        inside = sorted(path.iterdir())
+    except (OSError, ValueError) as error:
+        raise BagError(path, f"cannot be read: {error}") from None
+    files = [file for file in inside if file.suffix in STORAGES and file.is_file()]
+    if (path / "metadata.yaml").is_file() or len(files) == 1:
+        return [path]
+    if files and not _is_one(path):
+        return files + [bag for folder in _folders(inside, depth) for bag in _bags(folder, depth - 1)]
+    if files:
+        return [path]
+    return [bag for folder in _folders(inside, depth) for bag in _bags(folder, depth - 1)]
+
+
+def _is_one(path: Path) -> bool:
+    """Return whether the files in a folder are parts of one bag."""
+    try:
+        bag_files(path)
+    except BagError:
+        return False
+    return True
+
+
+def _folders(inside: list[Path], depth: int) -> list[Path]:
+    return [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
+
+
+def is_reference(path: Path) -> bool:
+    """Return whether a path is a reference trajectory, or a folder of them, and no bag."""
+    try:
+        return path.suffix == ".npz" if path.is_file() else any(path.glob("*.npz"))
+    except OSError:
+        return False
+
+
+def kind_of(paths: Sequence[Path]) -> str:
+    """Return `references` or `bags`.
+
+    Raises:
+        ConfigurationError: there are both.
+    """
+    kinds = {path: is_reference(path) for path in paths}
+    if len(set(kinds.values())) > 1:
+        reference = next(str(path) for path, is_one in kinds.items() if is_one)
+        raise ConfigurationError("PATH", reference, "bags alone, or reference trajectories alone, in one call")
+    return "references" if kinds[paths[0]] else "bags"

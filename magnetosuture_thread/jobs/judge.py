@@ -1,0 +1,180 @@
+"""What live and offline replay have in common: the bag and its set-up at the start, figures and picture at the end."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.interface import NEEDLE_COMMAND, SEEN_THREAD, TRUE_THREAD
+from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
+from magnetosuture_thread.offline.predictions import chosen_source
+from magnetosuture_thread.offline.sights import pixels
+from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.study.picture import draw_summary
+from magnetosuture_thread.study.replayed import Instant, Summary
+from magnetosuture_thread.vision.tracker import VisionTracker
+
+DEFAULT_SETUP = "petri_35mm_polyamide"
+PLAIN_SIZE, PLAIN_SHARE = (480, 640), 0.9  # of the picture of a dish that no camera saw, and the dish's part of it
+PLAIN_FLOOR, PLAIN_OUTSIDE = 225, 170  # its brightness
+
+Say = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Given:
+    """A bag to replay, with what else is needed.
+
+    Attributes:
+        recording: the bag.
+        setup: with which.
+        source: `camera` or `poses`.
+        start: seconds into the bag to begin at.
+        duration: of what is replayed [s].
+    """
+
+    recording: Recording
+    setup: Setup
+    source: str
+    start: float
+    duration: float
+
+    @property
+    def begin(self) -> int:
+        """Return the bag's time to begin at [ns]."""
+        return self.recording.start + round(self.start * 1e9)
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Return the notes of a bag made from this one."""
+        return {**self.recording.notes, "setup": self.setup.name, "replayed": str(self.recording.path)}
+
+
+@contextmanager
+def opened(
+    path: Path,
+    *,
+    setup_name: str,
+    source: str,
+    start: float,
+    duration: float | None,
+    remap: Mapping[str, str],
+    frame: str,
+    say: Say,
+) -> Iterator[Given]:
+    """Open a bag to replay, and say what is odd about it.
+
+    Args:
+        path: of the bag.
+        setup_name: name or path of the set-up; the one the bag names if empty.
+        source: `auto`, `camera` or `poses`.
+        start: seconds into the bag to begin at.
+        duration: [s]; to the bag's end if None.
+        remap: other names for topics of the bag, by the old one.
+        frame: the bag's name of the dish frame.
+        say: called with a line for a person.
+
+    Raises:
+        BagError: the bag cannot be used, or has no such time.
+        ConfigurationError: the set-up cannot be used.
+    """
+    say(f"checking {path}")
+    recording = Recording(Bag(path, remap=remap), dish_frame=frame)
+    if recording.damage is not None:
+        say(f"the bag is damaged, what is intact is played: {recording.damage}")
+    elif recording.unchecked:
+        say(recording.unchecked)
+    if not 0.0 <= start <= recording.duration:
+        raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
+    chosen = chosen_source(recording, source)
+    for channel in (SEEN_THREAD, NEEDLE_COMMAND, TRUE_THREAD):
+        if channel.recorded in recording.unfit:
+            raise BagError(path, recording.unfit[channel.recorded])
+    left = recording.duration - start
+    with TemporaryDirectory() as spare:
+        setup = _setup_of(recording.notes, setup_name, Path(spare), say)
+        yield Given(recording, setup, chosen, start, left if duration is None else min(duration, left))
+
+
+def _setup_of(notes: Mapping[str, str], name: str, spare: Path, say: Say) -> Setup:
+    """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default."""
+    named, text = notes.get("setup", ""), notes.get(SCENARIO_NOTE, "")
+    if name:
+        if named and name != named:
+            say(f"the bag names the set-up {named}; taking {name}")
+        return read_setup(name)
+    if text:  # which says more than a name: the file may have changed, or be on another machine
+        path = spare / f"{named or 'scenario'}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return read_setup(str(path))
+    if not named:
+        say(f"the bag names no set-up; taking {DEFAULT_SETUP}")
+    return read_setup(named or DEFAULT_SETUP)
+
+
+def write_results(
+    folder: Path, given: Given, instants: list[Instant], chosen: Instant, summary: Summary, say: Say
+) -> None:
+    """Write summary.json and summary.png.
+
+    Args:
+        folder: that gets them.
+        given: what was replayed.
+        instants: all predictions, by time.
+        chosen: the one to show, in full.
+        summary: the figures.
+        say: called with a line for a person.
+    """
+    text = json.dumps(summary.to_json(), indent=2, allow_nan=False)
+    (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+    found = _frame_of(given, chosen.stamp) if given.source == "camera" else _plain_dish(given)
+    if found is None:
+        say("no picture: the dish is not found in any frame")
+        return
+    frame, view = found
+    obstacles = given.setup.model.obstacles()
+    draw_summary(folder / "summary.png", frame, view, chosen, instants, obstacles, given.recording.start, summary)
+
+
+def _frame_of(given: Given, stamp: int) -> tuple[NDArray[np.uint8], DishView] | None:
+    """Return the camera frame of a stamp, and where the dish is, by the first frame in which it is found."""
+    view, frame = None, None
+    tracker = VisionTracker(given.setup.vision)
+    camera = given.recording.camera
+    assert camera is not None
+    for record in given.recording.records([camera], start=given.start, duration=given.duration):
+        message = record.decode()
+        is_chosen = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
+        if view is not None and not is_chosen:
+            continue
+        try:
+            image = pixels(message, record.type_name)
+            view = view or tracker.look(image).view
+        except InvalidInputError:
+            continue
+        frame = image if is_chosen else frame
+        if view is not None and frame is not None:
+            return frame, view
+    return None
+
+
+def _plain_dish(given: Given) -> tuple[NDArray[np.uint8], DishView]:
+    """Return a drawn dish, where no camera saw the real one."""
+    rows, columns = PLAIN_SIZE
+    diameter = given.setup.vision.dish_diameter
+    view = DishView((0.5 * (columns - 1), 0.5 * (rows - 1)), diameter / (PLAIN_SHARE * rows))
+    v, u = np.mgrid[:rows, :columns]
+    inside = np.hypot(u - view.centre_px[0], v - view.centre_px[1]) < 0.5 * PLAIN_SHARE * rows
+    return np.where(inside, PLAIN_FLOOR, PLAIN_OUTSIDE).astype(np.uint8), view

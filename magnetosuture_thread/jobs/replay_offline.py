@@ -1,0 +1,201 @@
+"""The job `magnetosuture replay --offline`: a recorded bag through the same core, without a graph."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, TRACKER_STATE, Channel
+from magnetosuture_thread.jobs.judge import Given, opened, write_results
+from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.model.session import WAITING
+from magnetosuture_thread.offline import messages
+from magnetosuture_thread.offline.packing import packed_margins, packed_prediction
+from magnetosuture_thread.offline.predictions import Step, predictions, sights
+from magnetosuture_thread.offline.sights import NOT_NEWER, Sights
+from magnetosuture_thread.offline.unpacking import stamp_of
+from magnetosuture_thread.study.replayed import Spread, Summary, error_figures
+from magnetosuture_thread.study.tally import Tally
+from magnetosuture_thread.vision.session import Seen
+
+Say = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+def replay_offline(
+    bag_path: Path,
+    output: Path,
+    *,
+    setup_name: str = "",
+    source: str = "auto",
+    start: float = 0.0,
+    duration: float | None = None,
+    remap: Mapping[str, str] | None = None,
+    frame: str = "dish",
+    say: Say = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> Summary:
+    """Put a bag through tracker and model without a graph, and judge what they made of it.
+
+    `output` is made at the end, whole or not at all: `bag/`, `summary.json` and `summary.png`. The bag holds pose
+    and seen thread, prediction and margins, each logged at its own stamp, with the numbers that the live graph
+    gives. Two runs write it alike to the last bit: times that steps took are in the summary alone. The coil bridge
+    has no part in it: what it does depends on real time.
+
+    Args:
+        bag_path: a bag.
+        output: folder to make.
+        setup_name: name or path of the set-up; the one the bag names if empty.
+        source: `camera`, `poses`, or `auto`: the camera where there are frames.
+        start: seconds into the bag to begin at.
+        duration: [s]; to the bag's end if None.
+        remap: other names for topics of the bag, by the old one.
+        frame: the bag's name of the dish frame.
+        say: called with a line for a person at each stage.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: the bag cannot be used, nothing in it was predicted, or the output exists or cannot be written.
+        ConfigurationError: the set-up cannot be used.
+    """
+    with (
+        opened(
+            bag_path,
+            setup_name=setup_name,
+            source=source,
+            start=start,
+            duration=duration,
+            remap=remap or {},
+            frame=frame,
+            say=say,
+        ) as given,
+        whole_folder(output) as folder,
+    ):
+        what = "camera frames" if given.source == "camera" else "recorded poses"
+        say(f"predicting by the {what} of {given.duration:.1f} s")
+        seen = sights(
+            given.recording,
+            given.setup,
+            source=given.source,
+            start=given.start,
+            duration=given.duration,
+            progress=progress,
+        )
+        tally, refused = Tally(given.setup.model.length), Counter[str]()
+        with BagWriter(folder / "bag", given.notes) as bag:
+            steps, made = predictions(seen, given.setup.model), _Output(bag, seen)
+            began = time.perf_counter()  # kernels are loaded
+            for step in steps:
+                made.write(step)
+                if step.outcome.prediction is not None:
+                    tally.take(step.sight, step.outcome.prediction, step.margins, step.step_time)
+                elif step.outcome.problem is not None:
+                    refused[_kind(step.outcome.problem)] += 1
+            taken = time.perf_counter() - began
+        say(f"{given.duration / taken:.3g} times as fast as it was recorded; judging what came out")
+        summary, remark = _summary(given, seen, tally, refused, given.duration / taken), seen.thread_problem()
+        if remark:
+            say(remark)
+        assert tally.worst is not None
+        write_results(folder, given, tally.instants, tally.worst, summary, say)
+        return summary
+
+
+def _kind(problem: Exception) -> str:
+    """Return why a pose was refused, without the numbers."""
+    if not isinstance(problem, InvalidInputError):
+        return "a program that was not solved"
+    return NOT_NEWER if problem.field == "needle pose stamp" else f"a {problem.field} that cannot be used"
+
+
+def _summary(given: Given, seen: Sights, tally: Tally, refused: Counter[str], speed: float) -> Summary:
+    """Return the figures.
+
+    Raises:
+        BagError: nothing was predicted.
+    """
+    refused = refused + seen.refused + given.recording.refused
+    instants = tally.instants
+    if not instants:
+        words = "; ".join(f"{count} times {why}" for why, count in refused.most_common()) or WAITING
+        raise BagError(
+            given.recording.path,
+            f"gave no prediction: {seen.found} of {seen.count} {_things(given.source)} had a needle; {words}",
+        )
+    return Summary(
+        bag=str(given.recording.path),
+        setup=given.setup.name,
+        simulated=given.recording.notes.get("simulated", ""),
+        frames=seen.count,
+        tracked=seen.found,
+        predicted=len(instants),
+        commands=0,
+        driven=0,
+        latency={},
+        step_time=Spread.of([instant.step_time for instant in instants]),
+        least_margins=tally.least_margins(given.recording.start),
+        contact_frames=tally.contact_frames,
+        stretch=max(instant.stretch for instant in instants),
+        residual=max(instant.residual for instant in instants),
+        seen_share=float(np.mean([instant.seen_share for instant in instants])),
+        error_seen=error_figures([instant.error_seen for instant in instants]),
+        error_truth=error_figures([instant.error_truth for instant in instants]),
+        source=given.source,
+        speed=speed,
+        refused=dict(refused.most_common()),
+        damage=str(given.recording.damage or ""),
+        remark=seen.thread_problem(),
+    )
+
+
+def _things(source: str) -> str:
+    return "frames" if source == "camera" else "poses"
+
+
+class _Output:
+    """Writes what the nodes would have published.
+
+    Args:
+        bag: to write to.
+        seen: whose frames and records it gets as they go by.
+    """
+
+    def __init__(self, bag: BagWriter, seen: Sights) -> None:
+        self._bag = bag
+        states = [TRACKER_STATE] if seen.source == "camera" else []
+        for channel in (NEEDLE_POSE, *states, SEEN_THREAD, PREDICTED_THREAD, MARGINS):
+            bag.add_topic(channel.recorded, channel.type_name)
+        seen.on_frame, seen.on_record = self._frame, self._record
+
+    def write(self, step: Step) -> None:
+        """Write what came of a sight."""
+        stamp, outcome, prediction = step.outcome.stamp, step.outcome, step.outcome.prediction
+        if prediction is not None:
+            self._bag.write(
+                PREDICTED_THREAD.recorded, max(stamp, 0), packed_prediction(stamp, prediction, step.settings.material)
+            )
+        if isinstance(outcome.problem, InvalidInputError):
+            return  # as live: a pose that is refused gets no answer
+        reason = WAITING if outcome.waiting else str(outcome.problem) if prediction is None else prediction.status
+        self._bag.write(MARGINS.recorded, max(stamp, 0), packed_margins(stamp, step.margins, reason))
+
+    def _frame(self, stamp: int, seen: Seen) -> None:
+        track = seen.track
+        if seen.tracked:
+            self._write(NEEDLE_POSE, stamp, messages.pose_message(stamp, track.tail, track.heading, track.covariance))
+            if len(seen.centreline):
+                self._write(SEEN_THREAD, stamp, messages.path_message(stamp, seen.centreline))
+        self._write(TRACKER_STATE, stamp, messages.tracker_state(stamp, track))
+
+    def _record(self, record: Record) -> None:
+        self._bag.write(record.topic, max(stamp_of(record), 0), record.data)
+
+    def _write(self, channel: Channel, stamp: int, message: object) -> None:
+        self._bag.write_message(channel.recorded, max(stamp, 0), message)

@@ -1,0 +1,181 @@
+"""The job and the command `calibrate`: from bags to a file that thread_model loads."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import cli
+from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
+from magnetosuture_thread.jobs.calibrate import Request, calibrate, material_named, settings_of
+from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.calibration.parameters import stiffness_over_drag
+from magnetosuture_thread.study.reference import ReferenceTrajectory
+from test.study.calibration.runs import LENGTH, rig_run
+
+TRUE = 1.6e-9  # m^4/s; the material's is 1.3e-9
+SETUP = """\
+thread_model:
+  ros__parameters:
+    material: polyamide_7_0
+    length: 0.019
+    segments: 12
+    attachment: pinned
+    longest_step: 0.07
+"""
+ONE = ("--parameters", "elastic_modulus")
+
+
+def trajectory(phase: float = 0.0) -> ReferenceTrajectory:
+    """Return a run of the rig's rod as a reference trajectory."""
+    sights = rig_run(TRUE, phase=phase)
+    headings = np.unwrap([math.atan2(sight.heading[1], sight.heading[0]) for sight in sights])
+    times = np.array([(sight.stamp - sights[0].stamp) * 1e-9 for sight in sights])
+    tails, threads = (np.array([getattr(sight, name) for sight in sights]) for name in ("tail", "truth"))
+    return ReferenceTrajectory("rig", times, tails, headings, threads, (), {"material": {"L_m": LENGTH}})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a set-up and two bags of poses with noise."""
+    folder = tmp_path_factory.mktemp("calibrate")
+    setup = folder / "lab.yaml"
+    setup.write_text(SETUP)
+    for name, phase in (("one", 0.0), ("two", 1.5)):
+        record(trajectory(phase), read_setup(str(setup)), folder / name, rate=15.0, poses=True, noise=2e-5)
+    return folder
+
+
+def run(folder: Path, *arguments: str) -> int:
+    """Run the command."""
+    return cli.main(["calibrate", *arguments, "--setup", str(folder / "lab.yaml")])
+
+
+def test_bags_give_a_file_a_picture_and_figures_whatever_the_workers(folder: Path, tmp_path: Path, capsys):
+    texts = []
+    for workers in ("1", "2"):
+        output, figures = tmp_path / f"{workers}.yaml", tmp_path / f"{workers}.json"
+        bags = [str(folder / name) for name in ("one", "two")]
+        code = run(
+            folder,
+            *bags,
+            *ONE,
+            "--material",
+            "poly",
+            "--output",
+            str(output),
+            "--workers",
+            workers,
+            "--json",
+            str(figures),
+        )
+        assert code == 0
+        texts.append((output.read_bytes(), figures.read_bytes(), output.with_suffix(".png").read_bytes()))
+    assert texts[0] == texts[1]
+    shown = capsys.readouterr().out
+    assert "stiffness over drag" in shown
+    assert "simulated: " in shown
+    values = json.loads(texts[0][1])
+    assert values["finished"]
+    assert values["parameters"][0]["value"] == pytest.approx(TRUE, rel=0.05)
+    assert [row["truth_held_out"] < 0.5 for row in values["bags"]] == [True, True]
+    settings = read_setup(str(tmp_path / "1.yaml")).model
+    assert stiffness_over_drag(settings) == pytest.approx(TRUE, rel=0.05)
+    assert settings.attachment == "pinned"
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"{n}.{end}" for n in (1, 2) for end in ("yaml", "json", "png")
+    }
+
+
+def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):
+    output = tmp_path / "best.yaml"
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", "calibrate", str(folder / "one")]
+    command += ["--setup", str(folder / "lab.yaml"), "--output", str(output), "--workers", "2"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        for line in process.stdout:
+            if line.startswith("tried"):
+                process.send_signal(signal.SIGINT)
+                break
+        rest, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (130, "")
+    assert "interrupted; writing the best so far" in rest
+    assert output.read_text().startswith("# BEST SO FAR, NOT FINISHED")
+    assert stiffness_over_drag(read_setup(str(output)).model) == pytest.approx(TRUE, rel=0.2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["best.png", "best.yaml"]
+
+
+def test_ctrl_c_before_anything_is_known_leaves_nothing(folder: Path, tmp_path: Path, monkeypatch, capsys):
+    def stop(*given: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("magnetosuture_thread.jobs.calibrate.fit", stop)
+    assert run(folder, str(folder / "one"), "--output", str(tmp_path / "none.yaml")) == 1
+    assert "interrupted" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["nowhere"], 1, "nowhere: does not exist"),
+        (["one", "--parameters", "elastic_module"], 2, "did you mean elastic_modulus"),
+        (["one", "--material", "steel"], 2, "material: got 'steel', expected one of polyamide_7_0, silk_6_0"),
+        (["one", "--against", "truth", "--remap", "/truth/thread:=/elsewhere"], 1, "holds no truth"),
+        (["one", "--source", "camera"], 1, "camera/image_raw"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(
+    folder: Path, tmp_path: Path, capsys, arguments: list[str], code: int, words: str
+):
+    name, *more = arguments
+    assert run(folder, str(folder / name), *more, "--output", str(tmp_path / "found.yaml")) == code
+    errors = " ".join(capsys.readouterr().err.split())
+    assert errors.startswith("error: ")
+    assert words in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bags_of_different_threads_are_refused(folder: Path, tmp_path: Path):
+    setup = read_setup("petri_150mm_silk")
+    still = replace(trajectory(), metadata={})
+    record(still, setup, tmp_path / "silk", rate=15.0, poses=True)
+    record(still, read_setup("petri_35mm_polyamide"), tmp_path / "polyamide", rate=15.0, poses=True)
+    request = Request(setup=str(folder / "lab.yaml"))
+    with pytest.raises(
+        InvalidInputError, match="silk: got a thread with material silk_6_0, expected polyamide_7_0, as"
+    ):
+        calibrate([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", request)
+
+
+def test_a_bag_of_another_length_is_refused(folder: Path, tmp_path: Path):
+    setup = tmp_path / "long.yaml"
+    setup.write_text(SETUP.replace("0.019", "0.15") + "vision_tracker:\n  ros__parameters:\n    thread_length: 0.15\n")
+    with pytest.raises(BagError, match="is it another thread"):
+        calibrate([folder / "one"], tmp_path / "found.yaml", Request(setup=str(setup)))
+
+
+def test_a_material_is_told_by_how_it_begins():
+    assert material_named("silk") == "silk_6_0"
+    assert material_named("polyamide_7_0") == "polyamide_7_0"
+    for text in ("", "steel"):
+        with pytest.raises(ConfigurationError, match="or how it begins"):
+            material_named(text)
+
+
+def test_another_material_comes_with_its_own_numbers():
+    setup = read_setup("petri_35mm_polyamide")
+    own = replace(setup, model=replace(setup.model, elastic_modulus=3e9, diameter=7e-5))
+    assert settings_of(own, Request(material="polyamide")) == own.model
+    silk = settings_of(own, Request(material="silk", formulation="paper"))
+    assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")

@@ -1,0 +1,262 @@
+"""Evaluating bags: pages and table, whatever becomes of one of the bags."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import cli
+from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
+from magnetosuture_thread.interface import CURRENTS, NEEDLE_POSE, OBSTACLE_SET, PREDICTED_THREAD, SEEN_THREAD, Channel
+from magnetosuture_thread.jobs import evaluate_bag as job
+from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
+from magnetosuture_thread.jobs.evaluate_bag import Options
+from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions
+from magnetosuture_thread.jobs.replay_offline import replay_offline
+from magnetosuture_thread.study.bag_table import TIMES, Row
+from magnetosuture_thread.study.report.moments import Moment
+from magnetosuture_thread.study.report.pictures import Picture, draw_moment
+
+
+def without_times(rows: list[Row]) -> list[Row]:
+    """Return rows without what differs from run to run."""
+    return [{name: value for name, value in row.items() if name not in TIMES} for row in rows]
+
+
+def broken(path: Path) -> Path:
+    """Make a bag of which nothing can be read."""
+    path.mkdir()
+    (path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    return path
+
+
+def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
+    (row,) = evaluate_bags([short_bag], tmp_path / "out", Options())
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["pull.html", "table.csv", "table.json"]
+    assert row["bag"] == "pull"
+    assert row["setup"] == "petri_35mm_polyamide"
+    assert "straight_pull" in str(row["simulated"])
+    assert (row["frames"], row["predicted"], row["problem"]) == (30, 28, "")
+    assert 0.0 < float(str(row["error_truth_mean_percent"])) < 1.0
+    assert 0.0 < float(str(row["error_seen_mean_percent"])) < 1.0
+    assert row["recorded_error_truth_frames"] == 0
+    assert json.loads((tmp_path / "out" / "table.json").read_text())["bags"] == [row]
+    page = (tmp_path / "out" / "pull.html").read_text()
+    assert "28 of 30" in page
+    assert page.count("data:image/jpeg;base64,") == 1
+    assert "Simulated camera frame at" in page
+
+
+def test_what_is_wrong_with_one_bag_is_in_its_row(tmp_path: Path, short_bag: Path):
+    said: list[str] = []
+    rows = evaluate_bags([broken(tmp_path / "=x"), short_bag], tmp_path / "out", Options(duration=0.4), say=said.append)
+    assert "nothing intact" in str(rows[0]["problem"])
+    assert rows[1]["problem"] == ""
+    assert not (tmp_path / "out" / "=x.html").exists()
+    with (tmp_path / "out" / "table.csv").open(newline="") as stream:
+        assert [row["bag"] for row in csv.DictReader(stream)] == ["'=x", "pull"]
+    assert any(line.startswith("=x: ") for line in said)
+
+
+def test_workers_change_nothing_but_times(tmp_path: Path, short_bag: Path):
+    bags = [short_bag, shutil.copytree(short_bag, tmp_path / "again" / "pull"), broken(tmp_path / "x")]
+    options = Options(duration=0.4)
+    one, two = (evaluate_bags(bags, tmp_path / f"out{n}", options, workers=n) for n in (1, 2))
+    assert without_times(one) == without_times(two)
+    assert [row["bag"] for row in two] == ["pull", "pull-2", "x"]
+    assert {path.name for path in (tmp_path / "out2").glob("*.html")} == {"pull.html", "pull-2.html"}
+
+
+def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_bag: Path):
+    replay_offline(short_bag, tmp_path / "replay")
+    both = tmp_path / "both"
+    with BagWriter(both, {"setup": "petri_35mm_polyamide"}) as writer:
+        for bag, names in (
+            (Bag(short_bag), {"/camera/image_raw/compressed", "/truth/thread"}),
+            (Bag(tmp_path / "replay" / "bag"), {NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded}),
+        ):
+            for name in names:
+                writer.add_topic(name, bag.topics[name])
+            for record in bag.records(names):
+                late = 20_000_000 if name in (NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded) else 0
+                writer.write(record.topic, record.time + late, record.data)
+    (row,) = evaluate_bags([both], tmp_path / "out", Options())
+    assert row["recorded_error_truth_frames"] == 28
+    assert row["recorded_error_truth_mean_percent"] == pytest.approx(row["error_truth_mean_percent"], abs=1e-9)
+    assert row["latency_frame_to_prediction_median_s"] == pytest.approx(0.02)
+    assert row["latency_command_to_currents_median_s"] is None
+    assert row["simulated"] == ""
+
+
+def test_against_and_formulation_are_as_asked_for(tmp_path: Path, short_bag: Path):
+    options = Options(against="seen", formulation="paper", duration=0.4)
+    (row,) = evaluate_bags([short_bag], tmp_path / "out", options)
+    assert (row["error_truth_frames"], row["formulation"]) == (0, "paper")
+    (row,) = evaluate_bags([short_bag], tmp_path / "no", Options(source="poses"))
+    assert "/needle/measured_cp" in str(row["problem"])
+
+
+def test_a_wrong_set_up_is_said_at_once(tmp_path: Path, short_bag: Path):
+    with pytest.raises(ConfigurationError):
+        evaluate_bags([short_bag], tmp_path / "out", Options(setup="none"))
+    with pytest.raises(BagError, match="exists already"):
+        evaluate_bags([short_bag], tmp_path, Options())
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interruption_leaves_nothing(tmp_path: Path, short_bag: Path):
+    def interrupt(share: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_bags([short_bag], tmp_path / "out", Options(), progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def touched(*paths: Path) -> None:
+    """Make empty files, with their folders."""
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_bags_are_found_two_folders_down_each_once(tmp_path: Path):
+    touched(tmp_path / "b" / "b_0.mcap", tmp_path / "b" / "metadata.yaml", tmp_path / "c" / "d" / "one.db3")
+    touched(tmp_path / "c" / "e" / "x.mcap", tmp_path / "c" / "e" / "y.mcap", tmp_path / "c" / "f" / "g" / "deep.mcap")
+    touched(tmp_path / "s" / "s_0.mcap", tmp_path / "s" / "s_1.mcap", tmp_path / ".hidden" / "h.mcap")
+    found = [str(path.relative_to(tmp_path)) for path in find_bags([tmp_path / "b", tmp_path])]
+    assert found == ["b", "c/d", "c/e/x.mcap", "c/e/y.mcap", "s"]
+
+
+def test_where_no_bag_is_that_is_said(tmp_path: Path):
+    for path, words in ((tmp_path, "holds no bags"), (tmp_path / "none", "does not exist")):
+        with pytest.raises(BagError, match=words):
+            find_bags([path])
+
+
+def test_trajectories_and_bags_are_not_mixed(tmp_path: Path):
+    touched(tmp_path / "r" / "a.npz", tmp_path / "b" / "b.mcap")
+    assert kind_of([tmp_path / "r"]) == kind_of([tmp_path / "r" / "a.npz"]) == "references"
+    assert kind_of([tmp_path / "b"]) == "bags"
+    with pytest.raises(ConfigurationError, match="bags alone, or reference trajectories alone"):
+        kind_of([tmp_path / "r", tmp_path / "b"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["b"], "--output: got None"),
+        (["b", "--output", "o", "--segments", "9"], "only for reference trajectories"),
+        (["r", "--workers", "2"], "only for bags"),
+        (["r", "--setup", "x"], "only for bags"),
+    ],
+)
+def test_options_of_the_other_kind_are_refused(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    words: str,
+):
+    touched(tmp_path / "r" / "a.npz", tmp_path / "b" / "b.mcap")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["evaluate", *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_the_command_ends_with_1_where_a_bag_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert cli.main(["evaluate", str(broken(tmp_path / "x")), "--output", str(tmp_path / "out")]) == 1
+    assert "nothing intact" in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "out" / "table.json").exists()
+
+
+def copied(source: Path, target: Path, more: Sequence[tuple[Channel, int, bytes]], leave: str = "") -> Path:
+    """Copy a bag, with messages at times [ns] added and a topic left out."""
+    bag = Bag(source)
+    with BagWriter(target, bag.notes) as writer:
+        for name, type_name in bag.topics.items():
+            writer.add_topic(name, type_name)
+        for channel in {channel for channel, _, _ in more}:
+            writer.add_topic(channel.recorded, channel.type_name)
+        for channel, time, data in more:
+            writer.write(channel.recorded, time, data)
+        for record in bag.records(set(bag.topics) - {leave}):
+            writer.write(record.topic, record.time, record.data)
+    return target
+
+
+def test_a_picture_has_the_obstacles_that_were_in_force(
+    tmp_path: Path, short_bag: Path, monkeypatch: pytest.MonkeyPatch
+):
+    store = typestore()
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    disc = store.types["magnetosuture_msgs/msg/Disc"](x=0.0, y=0.012, radius=0.002)
+    message = store.types[OBSTACLE_SET.type_name](
+        header=store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="dish"),
+        discs=[disc],
+        polygons=[],
+        corner_radius=np.empty(0),
+    )
+    data = bytes(store.serialize_cdr(message, OBSTACLE_SET.type_name))
+    bag = copied(short_bag, tmp_path / "changed", [(OBSTACLE_SET, Bag(short_bag).start, data)])
+    shown: list[Moment] = []
+
+    def draw(moment: Moment, *arguments: Any, **named: Any) -> Picture:
+        shown.append(moment)
+        return draw_moment(moment, *arguments, **named)
+
+    monkeypatch.setattr(job, "draw_moment", draw)
+    evaluate_bags([bag], tmp_path / "out", Options(duration=0.4))
+    assert [moment.obstacles for moment in shown] == [(ObstacleDisc((0.0, 0.012), 0.002),)] * len(shown)
+    assert shown
+    assert "Simulated camera frame at" in (tmp_path / "out" / "changed.html").read_text()
+
+
+def test_broken_currents_cost_no_figure(tmp_path: Path, short_bag: Path):
+    bag = copied(short_bag, tmp_path / "b", [(CURRENTS, Bag(short_bag).start + 10**8, b"\0\1\0\0abc")])
+    (row,) = evaluate_bags([bag], tmp_path / "out", Options(duration=0.4))
+    assert row["problem"] == ""
+
+
+def test_why_nothing_was_predicted_is_said(tmp_path: Path, short_bag: Path):
+    replay_offline(short_bag, tmp_path / "replay")
+    bag = copied(tmp_path / "replay" / "bag", tmp_path / "b", [], leave=SEEN_THREAD.recorded)
+    (row,) = evaluate_bags([bag], tmp_path / "out", Options(source="poses"))
+    assert str(row["problem"]).endswith("had a needle; waiting for the thread to be seen")
+
+
+def test_recorded_predictions_of_frames_that_nobody_asks_for_hide_none(monkeypatch: pytest.MonkeyPatch):
+    def record(stamp: int) -> Record:
+        seconds, rest = divmod(stamp, 10**9)
+        return Record("/thread/predicted", "", stamp, struct.pack("<4sIII", b"\0\1\0\0", seconds, rest, 0))
+
+    points = [SimpleNamespace(x=0.0, y=0.0), SimpleNamespace(x=1.0, y=0.0)]
+    monkeypatch.setattr(Record, "decode", lambda self: SimpleNamespace(vertices=points))
+    recording: Any = SimpleNamespace(
+        counts={PREDICTED_THREAD.recorded: 1}, records=lambda *a, **n: (record(k * 10**6) for k in range(2000))
+    )
+    predicted = RecordedPredictions(recording, 0.0, None)
+    assert predicted.of(5 * 10**6) is not None
+    assert predicted.of(1500 * 10**6) is not None
+
+
+def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short_bag: Path):
+    said: list[str] = []
+    bag = shutil.copytree(short_bag, tmp_path / "a\n\x1b[31m[b]<i>")
+    (row,) = evaluate_bags([bag], tmp_path / "out", Options(duration=0.3), say=said.append)
+    assert str(row["bag"]).isprintable()
+    assert str(row["path"]).isprintable()
+    assert (tmp_path / "out" / f"{row['bag']}.html").exists()

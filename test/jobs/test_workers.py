@@ -1,0 +1,62 @@
+"""Work in several processes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from magnetosuture_thread.jobs.workers import ONE_THREAD, WorkerDiedError, run_all
+
+SOURCE = """
+import os
+from magnetosuture_thread.jobs.workers import ONE_THREAD
+
+def work(task, say, progress):
+    say(f"task {task}")
+    progress(0.5)
+    if task == 3:
+        os._exit(9)
+    return task * task, os.getpid(), [os.environ.get(name) for name in ONE_THREAD]
+"""
+BEFORE = {name for name in ONE_THREAD if name in os.environ}
+
+
+@pytest.fixture
+def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return work of a module that other processes find too: square a number; 3 ends the process."""
+    name = f"work_{tmp_path.name.replace('-', '_')}"
+    (tmp_path / f"{name}.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return importlib.import_module(name).work
+
+
+def test_each_task_is_done_once_and_a_process_that_dies_takes_only_its_own_with_it(work: Any):
+    results: dict[int, Any] = {}
+    said: list[str] = []
+    shares: list[float] = []
+    run_all(work, [1, 2, 3, 4, 5], 2, done=results.__setitem__, say=said.append, progress=shares.append)
+    assert isinstance(results.pop(2), WorkerDiedError)
+    assert {index: square for index, (square, _, _) in results.items()} == {0: 1, 1: 4, 3: 16, 4: 25}
+    assert all(threads == ["1"] * len(ONE_THREAD) for _, _, threads in results.values())
+    assert sorted(said) == [f"task {n}" for n in (1, 2, 3, 4, 5)]
+    assert shares[-1] == pytest.approx(1.0)
+    assert not any(os.environ.get(name) == "1" for name in ONE_THREAD if name not in BEFORE)
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_what_ends_the_call_ends_the_processes(work: Any, workers: int):
+    def interrupt(text: str) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_all(work, [1, 2, 4], workers, done=lambda index, result: None, say=interrupt)
+
+
+def test_one_task_needs_no_process_of_its_own(work: Any):
+    results: list[Any] = []
+    run_all(work, [2], 8, done=lambda index, result: results.append(result))
+    assert results[0][:2] == (4, os.getpid())
