@@ -160,6 +160,13 @@ class CoilBridgeSettings(Configuration):
     roboclaw_timeout: float = quantity(
         0.2, "without a packet for this long a board stops by itself; whole tenths", unit="s", minimum=0.1, maximum=1.0
     )
+    roboclaw_answer_timeout: float = quantity(
+        0.03,
+        "that a board has for an answer, of which it needs 1 or 2 ms over USB; it may miss one",
+        unit="s",
+        minimum=0.03,
+        maximum=1.0,
+    )
 
     @property
     def reach(self) -> float:

@@ -41,6 +41,10 @@ SLOWER_BRIDGE = ("-p", "coil_bridge:rate:=100.0")
 BRIDGE_AND_RECORDER = ("-p", "path_follower:audience:=2")
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
 
+# Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
+# for 75 ms, as happens with two busy cores, would be taken for dead.
+PATIENT_DRIVER = {"roboclaw_answer_timeout": 0.2, "roboclaw_timeout": 0.5}
+
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
 
@@ -199,8 +203,8 @@ def _arm(make: type[CoilClient]) -> None:
 def _wired(folder: str, coils: int) -> list[str]:
     """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
     ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
-    both = {
-        "coil_bridge": {"driver": "roboclaw", "autostart": "active", "roboclaw_ports": ports},
+    both: dict[str, dict[str, object]] = {
+        "coil_bridge": {"driver": "roboclaw", "autostart": "active", "roboclaw_ports": ports, **PATIENT_DRIVER},
         "rig_simulator": {"power_stage": "roboclaw", "power_stage_ports": ports},
     }
     given = [f"{node}:{name}:={value}" for node, values in both.items() for name, value in values.items()]

@@ -8,6 +8,7 @@ driver takes such a board for dead.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from magnetosuture_thread.rig.power.stage import PowerStage
 
 ASK = b"?"
 PATIENCE = 5.0  # s for the boards to be taken away
+AHEAD = -10  # of the processes that boards would not share a processor with, where the user may say so
 
 
 class StageProcess:
@@ -118,5 +120,7 @@ def serve(stage: PowerStage, asks: BinaryIO, answers: BinaryIO) -> int:
 
 
 if __name__ == "__main__":
+    with suppress(OSError):  # only some may
+        os.nice(AHEAD)
     with open(sys.stdin.fileno(), "rb", 0) as asking, open(sys.stdout.fileno(), "wb", 0) as answering:
         sys.exit(serve(PowerStage(*json.loads(sys.argv[1])), asking, answering))

@@ -70,7 +70,9 @@ class LineThread:
             problem = "closed"
             port = None
             try:
-                port = ExchangePort(self._path, self._settings.roboclaw_baud_rate)
+                port = ExchangePort(
+                    self._path, self._settings.roboclaw_baud_rate, self._settings.roboclaw_answer_timeout
+                )
                 self._connect(port)
                 ready_at = time.monotonic()
                 self._serve()

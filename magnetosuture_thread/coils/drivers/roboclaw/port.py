@@ -8,8 +8,6 @@ from typing import Any
 
 import serial
 
-ANSWER_TIMEOUT = 0.03  # s that a board has for an answer; over USB it takes 1 or 2 ms
-
 
 class DeviceError(Exception):
     """A board or its line that does not work; its text is for a person."""
@@ -21,17 +19,24 @@ class ExchangePort(serial.Serial):
     What is written is kept until the answer is read, so that a packet goes out in one piece: a board drops one
     with a gap of 10 ms in it, and the maker's library writes a packet in up to five pieces.
 
+    Args:
+        path: of the port.
+        baud_rate: of the line.
+        answer_timeout: that a board has for an answer [s].
+
     Attributes:
+        answer_timeout: as given.
         answer: the bytes that were read since `begin`.
     """
 
-    def __init__(self, path: str, baud_rate: int) -> None:
+    def __init__(self, path: str, baud_rate: int, answer_timeout: float) -> None:
+        self.answer_timeout = answer_timeout
         self._packet = bytearray()
         self.answer = bytearray()
         self._until = 0.0
         try:
             # The lock comes before anything is changed at the port, and so does not disturb who has it.
-            super().__init__(path, baud_rate, timeout=ANSWER_TIMEOUT, write_timeout=ANSWER_TIMEOUT, exclusive=True)
+            super().__init__(path, baud_rate, timeout=answer_timeout, write_timeout=answer_timeout, exclusive=True)
         except (serial.SerialException, ValueError) as error:
             raise DeviceError(_why_not(path, error)) from error
 
@@ -40,7 +45,7 @@ class ExchangePort(serial.Serial):
         self.reset_input_buffer()
         self._packet.clear()
         self.answer.clear()
-        self._until = time.monotonic() + ANSWER_TIMEOUT
+        self._until = time.monotonic() + self.answer_timeout
 
     def write(self, b: Any, /) -> int:
         """Keep bytes of a packet until the answer is read."""
@@ -61,7 +66,7 @@ class ExchangePort(serial.Serial):
             if time.monotonic() >= self._until:
                 return b""
             super().write(packet)
-            self._until = time.monotonic() + ANSWER_TIMEOUT
+            self._until = time.monotonic() + self.answer_timeout
         if time.monotonic() >= self._until:
             size = min(size, self.in_waiting)
         data = super().read(size)

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import serial
 
-from magnetosuture_thread.coils.drivers.roboclaw import port as port_module
 from magnetosuture_thread.coils.drivers.roboclaw import rules
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
@@ -23,6 +22,9 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.rig.power import packets
 from magnetosuture_thread.rig.power.board import RoboClawBoard
 from magnetosuture_thread.rig.power.packets import checksum
+
+ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
+HELD_UP = 3.0 * ANSWER_TIMEOUT
 
 
 class Peer:
@@ -82,17 +84,22 @@ def peer() -> Iterator[Peer]:
 
 
 @pytest.fixture
-def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Give boards that do answer all the time they may need on a busy machine."""
-    monkeypatch.setattr(port_module, "ANSWER_TIMEOUT", 5.0)
+def port(peer: Peer) -> Iterator[ExchangePort]:
+    """Our end of it."""
+    made = ExchangePort(peer.path, 115200, ANSWER_TIMEOUT)
+    yield made
+    made.close()
+
+
+def wait_for(port: ExchangePort, answer_timeout: float) -> None:
+    """Let a board have more time for an answer."""
+    port.timeout = port.answer_timeout = answer_timeout
 
 
 @pytest.fixture
-def port(peer: Peer) -> Iterator[ExchangePort]:
-    """Our end of it."""
-    made = ExchangePort(peer.path, 115200)
-    yield made
-    made.close()
+def patient(port: ExchangePort) -> None:
+    """Give boards that do answer all the time they may need on a busy machine."""
+    wait_for(port, 5.0)
 
 
 def board(port: ExchangePort, tenths: int = 2, hurries: bool = False) -> Board:
@@ -139,8 +146,8 @@ def test_only_the_right_byte_acknowledges(peer, port, reply: bytes):
         board(port).write_zero()
 
 
-def test_one_packet_may_get_lost(peer, port, monkeypatch):
-    monkeypatch.setattr(port_module, "ANSWER_TIMEOUT", 0.5)
+def test_one_packet_may_get_lost(peer, port):
+    wait_for(port, 0.5)
     replies = iter([b"", b"\xff"])
     peer.answer(lambda _: next(replies))
     board(port).write_zero()
@@ -159,9 +166,6 @@ def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     with pytest.raises(DeviceError, match="no valid answer to ReadVersion"):
         board(port).set_up()
     assert len(port.answer) < 48  # which the library would wait for
-
-
-HELD_UP = 3.0 * port_module.ANSWER_TIMEOUT
 
 
 def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port, monkeypatch):
@@ -253,8 +257,8 @@ def test_a_current_is_counted_the_way_that_its_duty_goes(peer, patient, port):
     assert made.currents == pytest.approx((3.0, -6.0), abs=0.05)
 
 
-def test_a_second_attempt_takes_what_is_newest(peer, port, monkeypatch):
-    monkeypatch.setattr(port_module, "ANSWER_TIMEOUT", 0.5)
+def test_a_second_attempt_takes_what_is_newest(peer, port):
+    wait_for(port, 0.5)
     replies = iter([b"", b"\xff"])
     peer.answer(lambda _: next(replies))
     made = board(port)
@@ -346,7 +350,7 @@ def test_a_slow_coil_that_is_turned_round_again_and_again_has_no_broken_wire(pee
 
 def test_a_port_is_locked(peer, port):
     with pytest.raises(DeviceError, match="is held by another process"):
-        ExchangePort(peer.path, 115200)
+        ExchangePort(peer.path, 115200, ANSWER_TIMEOUT)
 
 
 def test_what_is_no_port_is_named(tmp_path, monkeypatch):
@@ -354,11 +358,11 @@ def test_what_is_no_port_is_named(tmp_path, monkeypatch):
         raise PermissionError(errno.EACCES, "denied")
 
     with pytest.raises(DeviceError, match="there is no"):
-        ExchangePort(str(tmp_path / "none"), 115200)
+        ExchangePort(str(tmp_path / "none"), 115200, ANSWER_TIMEOUT)
     with monkeypatch.context() as patch:
         patch.setattr(os, "open", forbid)
         with pytest.raises(DeviceError, match=r"no permission for .*dialout"):
-            ExchangePort("/dev/ttyACM0", 115200)
+            ExchangePort("/dev/ttyACM0", 115200, ANSWER_TIMEOUT)
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot open"):
-        ExchangePort(str(tmp_path / "file"), 115200)
+        ExchangePort(str(tmp_path / "file"), 115200, ANSWER_TIMEOUT)

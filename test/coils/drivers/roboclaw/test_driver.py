@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.calibration import CoilCalibration
-from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver, port
+from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.drivers.roboclaw import driver as driver_module
 from magnetosuture_thread.coils.field import coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -29,6 +29,7 @@ from magnetosuture_thread.rig.power.board import RoboClawBoard
 
 CURRENTS = (3.0, -6.0, 1.5, 0.0)
 DUTIES = [(4095, -8191), (2047, 0)]
+PATIENT = {"roboclaw_answer_timeout": 0.5}  # no loss that is only the busy machine's
 
 ANOTHER = """
 import sys, time
@@ -100,9 +101,8 @@ def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
         assert driver.state().warnings == ()
 
 
-def test_what_stays_in_force_is_written_often_enough(bench, monkeypatch):
-    monkeypatch.setattr(port, "ANSWER_TIMEOUT", 5.0)  # no loss on a busy machine
-    driver = bench.open(patience=60.0, roboclaw_timeout=0.5)
+def test_what_stays_in_force_is_written_often_enough(bench):
+    driver = bench.open(patience=60.0, roboclaw_timeout=0.5, **PATIENT)
     driver.apply(np.array(CURRENTS))
     bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
     since = bench.boards[0].timeline[0][0]
@@ -328,11 +328,10 @@ def tapped(board: RoboClawBoard, then: Callable[[bytes], bytes]) -> list[tuple[i
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_stop_wins_over_what_was_asked_before_it(bench, monkeypatch, shared: bool):
-    monkeypatch.setattr(port, "ANSWER_TIMEOUT", 0.5)  # no other loss on a busy machine
+def test_a_stop_wins_over_what_was_asked_before_it(bench, shared: bool):
     if shared:
         bench.share()
-    driver = bench.open(patience=60.0)
+    driver = bench.open(patience=60.0, **PATIENT)
 
     def stop(answer: bytes) -> bytes:
         driver.apply(np.zeros(4))

@@ -16,9 +16,11 @@ from magnetosuture_thread.coils.drivers.roboclaw import line as line_module
 from magnetosuture_thread.coils.drivers.roboclaw.driver import CLOSING
 from magnetosuture_thread.coils.drivers.roboclaw.line import LineThread
 from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox, Report
-from magnetosuture_thread.coils.drivers.roboclaw.port import ANSWER_TIMEOUT, DeviceError
+from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError
 from magnetosuture_thread.coils.drivers.roboclaw.rules import Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+
+ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
 
 
 class Stub:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.drivers.roboclaw import port
-
 CURRENTS = (3.0, -6.0, 1.5, 0.0)
 DUTIES = [(4095, -8191), (2047, 0)]
 
@@ -14,12 +12,11 @@ DUTIES = [(4095, -8191), (2047, 0)]
 @pytest.mark.parametrize("currents", [CURRENTS, (0.0, 0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_board_whose_power_was_gone_is_a_loss_however_soon_it_is_back(
-    bench, monkeypatch, shared: bool, currents: tuple[float, ...]
+    bench, shared: bool, currents: tuple[float, ...]
 ):
-    monkeypatch.setattr(port, "ANSWER_TIMEOUT", 5.0)  # no other loss on a busy machine
     if shared:
         bench.share()
-    driver = bench.open(patience=60.0)
+    driver = bench.open(patience=60.0, roboclaw_answer_timeout=0.5)  # no loss that is only the busy machine's
     driver.apply(np.array(currents))
     bench.wait(lambda: bench.duties(1) == (DUTIES[1] if any(currents) else (0, 0)), "the duties")
     with bench.stage.lines[-1].lock:
