@@ -213,7 +213,7 @@ class ThreadPredictor:
             ends[node] = position
         nodes = tuple(ends)
         begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
-        way = float(np.linalg.norm(end - begin, axis=1).max())
+        way = max(map(math.dist, begin.tolist(), end.tolist()))
         wanted = max(interval / self._longest_step, way / (LONGEST_WAY * self.thread.segment_length), 1.0)
         substeps = min(self._most_substeps, math.ceil(wanted - 1e-9))
         residuals, worst, converged = Residuals(0.0, 0.0, 0.0), None, True
@@ -240,7 +240,8 @@ class ThreadPredictor:
     ) -> Prediction:
         assert self._state is not None
         positions = self._state.positions
-        lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        along = positions[1:] - positions[:-1]
+        lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
         return Prediction(
             stamp=pose.stamp,
             formulation=self._formulation.name,
@@ -276,6 +277,6 @@ def check_pose(pose: NeedlePose) -> None:
 
 def _between(first: Points, second: Points, part: float) -> Points:
     """Return the direction between two unit vectors; where they are opposite, the second."""
-    mixed = (1.0 - part) * first + part * second
-    size = math.sqrt(mixed @ mixed)
-    return np.asarray(mixed / size) if size > 1e-6 else second
+    mixed = [(1.0 - part) * a + part * b for a, b in zip(first.tolist(), second.tolist(), strict=True)]
+    size = math.hypot(*mixed)
+    return np.array([value / size for value in mixed]) if size > 1e-6 else second

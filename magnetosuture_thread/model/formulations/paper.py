@@ -115,7 +115,7 @@ class PaperFormulation:
         """Move the driven nodes and let the thread follow; see `Formulation`."""
         unit, options = self._thread.segment_length, self._options
         before, velocities = state.positions / unit, state.velocities / unit
-        moved, known = driven(before, drive, unit)
+        moved, known = driven(before, *drive.arrays(), unit)
         start, gain = moved if options.lead_ahead else before, min(options.gain, 1.0 / interval)
         if state.interval == 0.0:
             self._memory.forget()

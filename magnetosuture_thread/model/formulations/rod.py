@@ -28,24 +28,18 @@ a compliance of 1e-7 instead of slacks, and where the barriers are linearised is
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance
-from magnetosuture_thread.model.formulations.rod_program import LONGEST_RATIO, Rod, assemble
-from magnetosuture_thread.model.formulations.step import (
-    ROW_REACH,
-    Drive,
-    Memory,
-    StepSolution,
-    ThreadState,
-    driven,
-    remember_push,
-)
+from magnetosuture_thread.model.formulations.rod_program import Rod
+from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, go_on, set_out, take
+from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
+from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
+from magnetosuture_thread.model.solvers.banded import STATUS
 from magnetosuture_thread.model.thread import Attachment, Thread
 
 MOST_SOLVES = 8  # in a step
@@ -90,38 +84,56 @@ class RodFormulation:
             mechanics.end_corrected_weights(thread.segments),
             mechanics.bending_bands(thread.segments, glued),
         )
-        self._memory = Memory.of(nodes, dimension, thread.segments, 2 * nodes)
+        self._axes, self._banded = (0, 1, 2)[:dimension], _structured(solver)
+        self._give(Memory.of(nodes, dimension, thread.segments, 2 * nodes))
 
     def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
         """Move the driven nodes and let the thread follow; see `Formulation`."""
         unit, segments = self._thread.segment_length, self._thread.segments
-        before = state.positions / unit
-        velocities = last = state.velocities / unit
-        start, known = driven(before, drive, unit)
         if state.interval == 0.0:
             self._memory.forget()
-        about = _extrapolated(start, velocities, known, interval, state.interval)
-        worst, solves, status = Residuals(0.0, 0.0, 0.0), 0, SOLVED
+        motion = set_out(state.positions, state.velocities, *drive.arrays(), unit, interval, state.interval)
+        worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
         while True:
-            contacts, off = self._assemble(
-                solves, about, start, before, last, known, drive.heading, interval, state.interval
+            code, contacts, solves, off, word, residuals = go_on(
+                self._axes,
+                self._rod,
+                self._memory,
+                self._near.data,
+                self._workspace,
+                motion,
+                drive.heading,
+                interval,
+                state.interval,
+                self._tolerance,
+                MOST_SOLVES,
+                solves,
             )
-            if off <= 1.0 or solves == MOST_SOLVES:
+            worst, status = worst.or_worse(Residuals(*residuals)), status if status != SOLVED else STATUS[word]
+            if code == ENDED:
                 break
-            program = self._memory.program(segments + contacts, known)
-            solution = self._solver.solve(program, velocities, self._memory.multipliers[: segments + contacts])
+            if code == NO_ROOM:
+                self._give(self._memory.with_room())
+                continue
+            count = segments + contacts
+            program = self._memory.program(count, motion.known)
+            solution = self._solver.solve(program, motion.velocities, self._memory.multipliers[:count])
             if not solution.residuals.largest <= self._tolerance:
                 self._memory.forget()
                 raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
-            worst, solves, velocities = worst.or_worse(solution.residuals), solves + 1, solution.velocities
+            take(self._memory, motion, solution.velocities, solution.multipliers, interval)
+            worst, solves, solver = worst.or_worse(solution.residuals), solves + 1, solution.solver
             status = status if status != SOLVED else solution.status
-            self._memory.multipliers[: segments + contacts] = solution.multipliers
-            remember_push(self._memory.node, solution.multipliers[segments:], self._memory.push)
-            about = start + interval * velocities  # known nodes have moved, and have no velocity
-        end = ThreadState(about * unit, (about - before) * (unit / interval), interval)
+        end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
-        return StepSolution(end, solution.solver, status, worst, solves, converged=off <= 1.0)
+        return StepSolution(end, solver, status, worst, solves, converged=off <= 1.0)
+
+    def _give(self, memory: Memory) -> None:
+        """Take memory for the step, and as much for the structured solver."""
+        self._memory = memory
+        nodes, dimension = memory.linear.shape
+        self._workspace = self._banded.workspace(nodes, dimension, len(memory.first))
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the chords of the segments' arcs; see `Formulation`."""
@@ -137,48 +149,11 @@ class RodFormulation:
             ObstacleAvoidance(self._surroundings, 0.5 * self._thread.diameter).rows(positions),
         ]
 
-    def _assemble(
-        self,
-        solves: int,
-        about: Points,
-        start: Points,
-        before: Points,
-        last: Points,
-        known: NDArray[np.bool_],
-        heading: Points,
-        interval: float,
-        last_interval: float,
-    ) -> tuple[int, float]:
-        while True:
-            contacts, off = assemble(
-                solves,
-                self._rod,
-                self._memory,
-                self._near.data,
-                about,
-                start,
-                before,
-                last,
-                known,
-                heading,
-                interval,
-                last_interval,
-            )
-            if contacts >= 0:
-                return contacts, off
-            self._memory = self._memory.with_room()
 
+def _structured(solver: Solver) -> BandedSolver:
+    """Return the structured solver if it is the first to be tried, else one that does nothing.
 
-def _extrapolated(
-    start: Points, velocities: Points, known: NDArray[np.bool_], interval: float, last_interval: float
-) -> Points:
-    """Return where the thread would be if it moved on as it did: the first guess, of second order.
-
-    Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
-    farther than a segment: then the guess is where the thread is.
+    A step does not leave compiled code for it. Of its subclasses nobody knows how they solve.
     """
-    if last_interval <= 0.0 or interval > LONGEST_RATIO * last_interval:
-        return start
-    end = start + interval * velocities
-    end[known] = start[known]
-    return end if np.abs(end - start).max() <= 1.0 else start
+    first = solver.first if isinstance(solver, FallbackSolver) else solver
+    return first if type(first) is BandedSolver else BandedSolver(iterations=0)

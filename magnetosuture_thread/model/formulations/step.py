@@ -53,6 +53,11 @@ class Drive:
     positions: Points
     heading: Points
 
+    def arrays(self) -> tuple[NDArray[np.int64], Points]:
+        """Return the nodes and where they are at the end, for compiled code."""
+        ends = np.ascontiguousarray(self.positions, dtype=np.float64).reshape(len(self.nodes), len(self.heading))
+        return np.array(self.nodes, dtype=np.int64), ends
+
 
 @dataclass(frozen=True)
 class StepSolution:
@@ -263,10 +268,12 @@ def remember_push(node: NDArray[np.int64], multipliers: Vector, push: Vector) ->
         push[node[c]] = max(push[node[c]], multipliers[c])
 
 
-def driven(positions: Points, drive: Drive, unit: float) -> tuple[Points, NDArray[np.bool_]]:
-    """Return the positions with the driven nodes moved, and which nodes these are; positions in units [m]."""
+@compiled
+def driven(positions: Points, nodes: NDArray[np.int64], ends: Points, unit: float) -> tuple[Points, NDArray[np.bool_]]:
+    """Return positions [D] with the driven nodes moved to their ends [m], and which nodes these are."""
     moved, known = positions.copy(), np.zeros(len(positions), dtype=np.bool_)
-    for node, position in zip(drive.nodes, drive.positions, strict=True):
-        moved[node] = position / unit
-        known[node] = True
+    for k in range(len(nodes)):
+        for a in range(positions.shape[1]):
+            moved[nodes[k], a] = ends[k, a] / unit
+        known[nodes[k]] = True
     return moved, known

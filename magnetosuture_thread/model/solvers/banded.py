@@ -20,6 +20,8 @@ QPALM. Deviation: the slacks are folded into the rows as compliances, and the ch
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,6 +37,24 @@ STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "s
 SOLVED, LIMIT, INDEFINITE, NOT_FINITE, STALLED = range(5)
 
 
+class Workspace(NamedTuple):
+    """What the compiled solver works with; kept from step to step, so that no step pays for memory.
+
+    Attributes:
+        tolerance: scaled residual at which it stops.
+        iterations: the most Newton steps it may take.
+        band: of the matrix, shape (m d + 3 d, 3 d + 1).
+        vectors: seven of them, of the unknowns and of the rows.
+        pushing: which rows push.
+    """
+
+    tolerance: float
+    iterations: int
+    band: NDArray[np.float64]
+    vectors: NDArray[np.float64]
+    pushing: NDArray[np.bool_]
+
+
 class BandedSolver:
     """Solves programs of chains, in time linear in the number of nodes.
 
@@ -46,40 +66,27 @@ class BandedSolver:
     name = "banded"
 
     def __init__(self, tolerance: float = 1e-8, iterations: int = 60) -> None:
-        self._tolerance = tolerance
-        self._iterations = iterations
-        self._size = (0, 0)
-        self._band = np.empty((0, 0))
-        self._vectors = np.empty((0, 0))
-        self._pushing = np.empty(0, dtype=np.bool_)
+        self._workspace = Workspace(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
 
     def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
         """Solve one program, started from a guess; see `Solver`."""
         nodes, dimension = program.linear.shape
-        self._reserve(nodes, dimension, len(program.first))
+        workspace = self.workspace(nodes, dimension, len(program.first))
         u, found, axes = velocities.copy(), multipliers.copy(), (0, 1, 2)[:dimension]
-        status, iterations, residuals = solve_and_judge(
-            axes,
-            program,
-            u,
-            found,
-            self._tolerance,
-            self._iterations,
-            self._band,
-            self._vectors,
-            self._pushing,
-        )
+        status, iterations, residuals = solve_and_judge(axes, program, u, found, workspace)
         return Solution(u, found, self.name, STATUS[status], iterations, Residuals(*residuals))
 
-    def _reserve(self, nodes: int, dimension: int, rows: int) -> None:
-        """Keep the workspace from step to step, so that no step pays for memory."""
+    def workspace(self, nodes: int, dimension: int, rows: int) -> Workspace:
+        """Return what the compiled solver needs for programs of at most so many rows."""
         width = SPAN * dimension
-        if self._size != (nodes, dimension):
-            self._band, self._size = np.empty((nodes * dimension + width, width + 1)), (nodes, dimension)
-        wanted = max(nodes * dimension + width, rows)
-        if self._vectors.shape[1] < wanted:
-            self._vectors = np.empty((7, 2 * wanted))
-            self._pushing = np.empty(2 * wanted, dtype=np.bool_)
+        unknowns = nodes * dimension + width
+        if self._workspace.band.shape != (unknowns, width + 1):
+            self._workspace = self._workspace._replace(band=np.empty((unknowns, width + 1)))
+        wanted = max(unknowns, rows)
+        if self._workspace.vectors.shape[1] < wanted:
+            vectors, pushing = np.empty((7, 2 * wanted)), np.empty(2 * wanted, dtype=np.bool_)
+            self._workspace = self._workspace._replace(vectors=vectors, pushing=pushing)
+        return self._workspace
 
 
 @compiled
@@ -206,13 +213,10 @@ def solve(
     program: ChainProgram,
     u: NDArray[np.float64],
     multipliers: Vector,
-    tolerance: float,
-    iterations: int,
-    band: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    pushing: NDArray[np.bool_],
+    workspace: Workspace,
 ) -> tuple[int, int]:
     """Improve u and the multipliers in place; return status and iterations."""
+    tolerance, iterations, band, vectors, pushing = workspace
     d, width = len(axes), SPAN * len(axes)
     nodes, rows, unknowns = len(program.linear), len(program.first), program.linear.size
     step, force, smooth = vectors[0], vectors[1, :unknowns], vectors[2, :unknowns]
@@ -288,12 +292,8 @@ def solve_and_judge(
     program: ChainProgram,
     u: NDArray[np.float64],
     multipliers: Vector,
-    tolerance: float,
-    iterations: int,
-    band: NDArray[np.float64],
-    vectors: NDArray[np.float64],
-    pushing: NDArray[np.bool_],
+    workspace: Workspace,
 ) -> tuple[int, int, tuple[float, float, float]]:
     """Solve, and judge by code that knows nothing of how it was solved; once into compiled code is cheaper."""
-    status, taken = solve(axes, program, u, multipliers, tolerance, iterations, band, vectors, pushing)
+    status, taken = solve(axes, program, u, multipliers, workspace)
     return status, taken, compiled_residuals(program, u, multipliers)

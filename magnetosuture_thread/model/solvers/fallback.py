@@ -18,15 +18,19 @@ class FallbackSolver:
     Args:
         solvers: in the order in which they are tried.
         tolerance: the largest residual with which a solution is accepted.
+
+    Attributes:
+        first: of the solvers.
     """
 
     def __init__(self, solvers: Sequence[Solver], tolerance: float) -> None:
         self._solvers, self._tolerance = tuple(solvers), tolerance
-        self.name = self._solvers[0].name
+        self.first = self._solvers[0]
+        self.name = self.first.name
 
     def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
         """Return the first solution that passes, else the best; see `Solver`."""
-        solution = self._solvers[0].solve(program, velocities, multipliers)
+        solution = self.first.solve(program, velocities, multipliers)
         if solution.residuals.largest <= self._tolerance:
             return solution
         tried, best = [f"{solution.solver}: {solution.status}"], solution

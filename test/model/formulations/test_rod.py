@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
 from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, ThreadState
-from magnetosuture_thread.model.formulations.rod import _extrapolated
+from magnetosuture_thread.model.formulations.rod_step import set_out
 from magnetosuture_thread.model.formulations.step import Memory
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector
 from magnetosuture_thread.model.solvers import BandedSolver
@@ -148,13 +148,16 @@ def test_a_short_step_and_a_long_one_lead_to_the_same_place():
 
 
 def test_the_first_guess_goes_on_as_before_unless_that_is_noise_or_too_far():
-    start, velocities = straight(polyamide()) / polyamide().segment_length, np.full((26, 2), 3.0)
-    known = np.arange(26) == 0
-    onwards = _extrapolated(start, velocities, known, DT, DT)
-    np.testing.assert_allclose(onwards[1:], start[1:] + 3.0 * DT)
-    np.testing.assert_array_equal(onwards[0], start[0])
+    unit, lead_node, end = polyamide().segment_length, np.array([0]), np.array([[1e-4, 2e-4]])
+    start, velocities = straight(polyamide()), np.full((26, 2), 3.0 * unit)
+    onwards = set_out(start, velocities, lead_node, end, unit, DT, DT)
+    np.testing.assert_allclose(onwards.about[1:], start[1:] / unit + 3.0 * DT)
+    np.testing.assert_array_equal(onwards.about[0], end[0] / unit)
+    np.testing.assert_array_equal(onwards.known, np.arange(26) == 0)
     for last_interval, speeds in ((0.0, velocities), (0.1 * DT, velocities), (DT, 100.0 * velocities)):
-        np.testing.assert_array_equal(_extrapolated(start, speeds, known, DT, last_interval), start)
+        still = set_out(start, speeds, lead_node, end, unit, DT, last_interval)
+        np.testing.assert_array_equal(still.about, still.start)
+        np.testing.assert_array_equal(still.start[1:], start[1:] / unit)
 
 
 def test_a_thread_pulled_hard_needs_no_more_than_a_few_solves():

@@ -1,0 +1,164 @@
+"""A step of the formulation `rod` in compiled code, for as long as the structured solver gets on with it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles import SurroundingsData
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.formulations.rod_program import LONGEST_RATIO, Rod, assemble
+from magnetosuture_thread.model.formulations.step import Memory, driven, remember_push
+from magnetosuture_thread.model.program import ChainProgram, Vector
+from magnetosuture_thread.model.solvers import banded
+
+ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `go_on` got
+
+
+class Motion(NamedTuple):
+    """A step under way, in units of the segment length.
+
+    Attributes:
+        before: where the nodes are, shape (n + 1, d).
+        start: the same with the driven nodes moved.
+        last: velocities over the last step.
+        velocities: those of this step, better with each solve.
+        about: where they lead.
+        known: the driven nodes, shape (n + 1,).
+    """
+
+    before: Points
+    start: Points
+    last: Points
+    velocities: Points
+    about: Points
+    known: NDArray[np.bool_]
+
+
+@compiled
+def set_out(
+    positions: Points,
+    velocities: Points,
+    nodes: NDArray[np.int64],
+    ends: Points,
+    unit: float,
+    interval: float,
+    last_interval: float,
+) -> Motion:
+    """Return a step's beginning, and where the thread would be if it moved on as it did: a guess of second order.
+
+    Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
+    farther than a segment: then the guess is where the thread is.
+
+    Args:
+        positions: of all nodes, shape (n + 1, d) [m].
+        velocities: over the last step [m/s].
+        nodes: that are driven, shape (k,).
+        ends: where these are at the end of the step, shape (k, d) [m].
+        unit: D [m].
+        interval: dt [s].
+        last_interval: of the last step, 0 if there was none [s].
+    """
+    before, last = positions / unit, velocities / unit
+    start, known = driven(before, nodes, ends, unit)
+    about = start.copy()
+    if last_interval > 0.0 and interval <= LONGEST_RATIO * last_interval:
+        for i in range(len(start)):
+            for a in range(start.shape[1]):
+                if not known[i]:
+                    about[i, a] = start[i, a] + interval * last[i, a]
+                    if not abs(about[i, a] - start[i, a]) <= 1.0:
+                        return Motion(before, start, last, last.copy(), start.copy(), known)
+    return Motion(before, start, last, last.copy(), about, known)
+
+
+@compiled
+def go_on(
+    axes: tuple[int, ...],
+    rod: Rod,
+    memory: Memory,
+    surroundings: SurroundingsData,
+    workspace: banded.Workspace,
+    motion: Motion,
+    heading: Points,
+    interval: float,
+    last_interval: float,
+    tolerance: float,
+    most_solves: int,
+    solves: int,
+) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
+    """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
+
+    Args:
+        axes: 0 to d - 1.
+        rod: the thread.
+        memory: has the program in the end, and its multipliers.
+        surroundings: obstacles [m].
+        workspace: of the structured solver; one without iterations leaves every solve to the caller.
+        motion: where the step has got to; written.
+        heading: unit vector along the needle at the end of the step, shape (d,).
+        interval: dt [s].
+        last_interval: of the last step, 0 if there was none [s].
+        tolerance: the largest residual with which a solution is accepted.
+        most_solves: of a step.
+        solves: how many this step has had.
+
+    Returns:
+        `ENDED`, `NO_ROOM` for all contacts in the memory, or `UNSOLVED`, and then the program is there for
+        another solver; the number of contacts; solves; how far off the barriers are, see `assemble`; the
+        first status that is not 0, see `banded.STATUS`; the largest residual of each kind.
+    """
+    worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
+    while True:
+        contacts, off = assemble(
+            solves,
+            rod,
+            memory,
+            surroundings,
+            motion.about,
+            motion.start,
+            motion.before,
+            motion.last,
+            motion.known,
+            heading,
+            interval,
+            last_interval,
+        )
+        if contacts < 0:
+            return NO_ROOM, contacts, solves, off, status, worst
+        if off <= 1.0 or solves == most_solves:
+            return ENDED, contacts, solves, off, status, worst
+        if workspace.iterations == 0:
+            return UNSOLVED, contacts, solves, off, status, worst
+        rows = segments + contacts
+        program = ChainProgram(
+            memory.blocks,
+            memory.couplings,
+            memory.linear,
+            motion.known,
+            memory.first[:rows],
+            memory.gradient[:rows],
+            memory.lower[:rows],
+            memory.upper[:rows],
+            memory.compliance[:rows],
+        )
+        velocities, multipliers = motion.velocities.copy(), memory.multipliers[:rows].copy()
+        word, _, found = banded.solve_and_judge(axes, program, velocities, multipliers, workspace)
+        if not max(found) <= tolerance:
+            return UNSOLVED, contacts, solves, off, status, worst
+        take(memory, motion, velocities, multipliers, interval)
+        worst = (max(worst[0], found[0]), max(worst[1], found[1]), max(worst[2], found[2]))
+        status, solves = status if status != 0 else word, solves + 1
+
+
+@compiled
+def take(memory: Memory, motion: Motion, velocities: Points, multipliers: Vector, interval: float) -> None:
+    """Take a solution: its velocities, where they lead, and its multipliers as a guess for the next one."""
+    segments = len(velocities) - 1
+    memory.multipliers[: len(multipliers)] = multipliers
+    remember_push(memory.node, multipliers[segments:], memory.push)
+    motion.velocities[:] = velocities
+    motion.about[:] = motion.start + interval * velocities  # known nodes have moved, and have no velocity
