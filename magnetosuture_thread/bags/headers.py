@@ -5,8 +5,18 @@ from __future__ import annotations
 import struct
 
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.interface import DISH_FRAME
 
-_FORMS = {b"\0\1": struct.Struct("<iII"), b"\0\0": struct.Struct(">iII")}  # by the bytes' order
+LITTLE_ENDIAN = b"\0\1"  # what plain CDR begins with, as every ROS 2 machine of today writes it
+_BIG_ENDIAN = b"\0\0"
+_STAMP, _LENGTH, _FRAME = 4, 12, 16  # where the stamp begins, the length of the frame's name, and the name
+_FORMS = {LITTLE_ENDIAN: struct.Struct("<iII"), _BIG_ENDIAN: struct.Struct(">iII")}
+_NAME = DISH_FRAME.encode() + b"\0"
+_DISH = {
+    LITTLE_ENDIAN: len(_NAME).to_bytes(4, "little") + _NAME,
+    _BIG_ENDIAN: len(_NAME).to_bytes(4, "big") + _NAME,
+}
+DISH_END = _FRAME + len(_NAME)  # where a header in the dish frame ends
 
 
 def stamp_and_frame(topic: str, data: bytes) -> tuple[int, str]:
@@ -20,13 +30,17 @@ def stamp_and_frame(topic: str, data: bytes) -> tuple[int, str]:
         BagError: no header can be read there.
     """
     form = _FORMS.get(data[:2])
-    start = 4 + 12
-    if form is not None and len(data) >= start:
-        seconds, nanoseconds, length = form.unpack_from(data, 4)
-        frame = data[start : start + length]
+    if form is not None and len(data) >= _FRAME:
+        seconds, nanoseconds, length = form.unpack_from(data, _STAMP)
+        frame = data[_FRAME : _FRAME + length]
         if 0 < length == len(frame) and frame.endswith(b"\0"):
             try:
                 return seconds * 10**9 + nanoseconds, frame[:-1].decode()
             except UnicodeDecodeError:
                 pass
     raise BagError(topic, "a message has no header that can be read")
+
+
+def is_in_dish(data: bytes) -> bool:
+    """Return whether a message that begins with a header is in the dish frame, as `stamp_and_frame` would say."""
+    return data[_LENGTH:DISH_END] == _DISH.get(data[:2])

@@ -8,7 +8,7 @@ from typing import Any
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.conversion import CONVERSIONS, UNSTAMPED_TWIST, UnfitError, moved
-from magnetosuture_thread.bags.headers import stamp_and_frame
+from magnetosuture_thread.bags.headers import is_in_dish, stamp_and_frame
 from magnetosuture_thread.bags.reader import Bag, Record
 from magnetosuture_thread.bags.transforms import TF_MESSAGE, TOPICS, Rigid, Transforms
 from magnetosuture_thread.bags.types import typestore
@@ -148,16 +148,14 @@ class Recording:
         """Return a record as our graph would have it; the reason where it cannot be one."""
         conversions = CONVERSIONS.get(channel.type_name)
         is_ours = record.type_name == channel.type_name and record.decoder.is_ours
+        if is_ours and (conversions is None or (self._dish_frame == DISH_FRAME and is_in_dish(record.data))):
+            return record if record.topic == channel.recorded else self._said(record, channel, record.data)
         if conversions is None:
-            if not is_ours:
-                return f"its type {record.type_name} is defined in another way than ours"
-            return self._said(record, channel, record.data)
+            return f"its type {record.type_name} is defined in another way than ours"
         frame, stamp = self._dish_frame, record.time
         try:
             if record.type_name != UNSTAMPED_TWIST:
                 stamp, frame = stamp_and_frame(record.topic, record.data)
-            if is_ours and frame == DISH_FRAME == self._dish_frame:
-                return self._said(record, channel, record.data)
             message = conversions[record.type_name](record.decode(), record.time)
         except (BagError, UnfitError, AttributeError, TypeError, ValueError) as problem:
             # Fields that are not there, or are of other kinds: another definition of the type.

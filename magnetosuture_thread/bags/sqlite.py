@@ -84,14 +84,14 @@ class SqliteFile:
                     query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
                     between = f" AND {_USABLE} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
                     rows = database.execute(query + between, (*wanted, start, end))
-                    yield from (Item(time, topic, data) for time, topic, data in rows)
+                    yield from (Item(time, self.connections[topic], data) for time, topic, data in rows)
                     return
                 query = "SELECT timestamp, topic_id, data FROM messages WHERE id = ?"
                 for time, number in self._rows:
                     if start <= time <= end:
-                        for row in database.execute(query, (number,)):
-                            if row[1] in wanted:
-                                yield Item(*row)
+                        for said, topic, data in database.execute(query, (number,)):
+                            if topic in wanted:
+                                yield Item(said, self.connections[topic], data)
         except sqlite3.Error as error:
             raise BagError(self.path, f"cannot be read any more: {error}") from None
 

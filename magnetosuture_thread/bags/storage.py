@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,10 +52,10 @@ class Connection:
 
 
 class Item(NamedTuple):
-    """A recorded message as it is in a file: time [ns], number of its connection, bytes."""
+    """A recorded message as it is in a file: time [ns], who said it, bytes."""
 
     time: int
-    connection: int
+    connection: Connection
     data: bytes
 
 
@@ -111,10 +112,12 @@ def in_order(parts: Iterable[tuple[int, Callable[[], Iterator[Item]]]]) -> Itera
             following = next(waiting, None)
         if not heap:
             continue
-        _, part, item, items = heap[0]
+        _, part, item, items = heapq.heappop(heap)
         yield item
-        after = next(items, None)
-        if after is None:
-            heapq.heappop(heap)
-        else:
-            heapq.heapreplace(heap, (after.time, part, after, items))
+        # What comes before anything of another part needs no sorting.
+        until = min(heap[0][0] if heap else math.inf, following[0] if following is not None else math.inf)
+        for item in items:
+            if item.time >= until:
+                heapq.heappush(heap, (item.time, part, item, items))
+                break
+            yield item

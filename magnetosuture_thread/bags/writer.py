@@ -128,10 +128,8 @@ class BagWriter:
             raise BagError(self._connections[number].topic, f"a message of the time {time} ns; expected 0 to {LATEST}")
         if self._closed:
             raise BagError(self.folder, "is closed; nothing more can be written to it")
-        chunks = self._writer.chunks
         try:
-            self._writer.add_message(number, time, data)
-            if self._writer.chunks != chunks:
+            if self._writer.add_message(number, time, data):
                 self._reserve.grow(_SPARE + INDEX_SIZE * self._writer.chunks)
         except OSError as error:
             raise self._end_early(error) from None

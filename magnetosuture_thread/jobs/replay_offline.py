@@ -20,7 +20,6 @@ from magnetosuture_thread.offline import messages
 from magnetosuture_thread.offline.packing import packed_margins, packed_prediction
 from magnetosuture_thread.offline.predictions import Step, predictions, sights
 from magnetosuture_thread.offline.sights import NOT_NEWER, Sights
-from magnetosuture_thread.offline.unpacking import stamp_of
 from magnetosuture_thread.study.replayed import Spread, Summary, error_figures
 from magnetosuture_thread.study.tally import Tally
 from magnetosuture_thread.vision.session import Seen
@@ -194,8 +193,8 @@ class _Output:
                 self._write(SEEN_THREAD, stamp, messages.path_message(stamp, seen.centreline))
         self._write(TRACKER_STATE, stamp, messages.tracker_state(stamp, track))
 
-    def _record(self, record: Record) -> None:
-        self._bag.write(record.topic, max(stamp_of(record), 0), record.data)
+    def _record(self, stamp: int, record: Record) -> None:
+        self._bag.write(record.topic, max(stamp, 0), record.data)
 
     def _write(self, channel: Channel, stamp: int, message: object) -> None:
         self._bag.write_message(channel.recorded, max(stamp, 0), message)

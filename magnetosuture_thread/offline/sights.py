@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +34,8 @@ NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
 )
 Progress = Callable[[float], None]
 _CHANGING = {channel.recorded for channel in CHANGING}
+_TRUE, _SEEN = TRUE_THREAD.recorded, SEEN_THREAD.recorded
+_NOTHING = np.empty((0, 2))
 
 
 class Sights(Iterator[Sight]):
@@ -46,7 +47,7 @@ class Sights(Iterator[Sight]):
         found: of these with a needle.
         refused: the others, by why.
         on_frame: called with stamp and what was seen in each frame, before its sight is given.
-        on_record: called with each recorded pose and seen thread, before its sight is given.
+        on_record: called with stamp and each recorded pose and seen thread, before its sight is given.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class Sights(Iterator[Sight]):
         self.count = self.found = 0
         self.refused: Counter[str] = Counter()
         self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
-        self.on_record: Callable[[Record], None] = lambda record: None
+        self.on_record: Callable[[int, Record], None] = lambda stamp, record: None
         self._dish = setup.vision.dish_diameter
         self._length = setup.model.length
         self._threads = self._measured = self._odd = 0
@@ -108,7 +109,7 @@ class Sights(Iterator[Sight]):
         waiting: deque[Sight | Record] = deque()
         parts: dict[str, dict[int, Points]] = {channel.recorded: {} for channel in awaited}
         for record in records:
-            if record.topic in (TRUE_THREAD.recorded, SEEN_THREAD.recorded):
+            if record.topic in parts:
                 self._keep(parts[record.topic], record)
             elif record.topic in _CHANGING:
                 waiting.append(record)
@@ -130,37 +131,38 @@ class Sights(Iterator[Sight]):
             yield self._whole(head, parts)
 
     def _keep(self, known: dict[int, Points], record: Record) -> None:
-        if record.topic == SEEN_THREAD.recorded:
-            self.on_record(record)
+        stamp = stamp_of(record)
+        if record.topic == _SEEN:
+            self.on_record(stamp, record)
         try:
             points = read_path(record)
         except InvalidInputError as error:
             self.refused[f"{record.topic}: {error}"] += 1
-            points = np.empty((0, 2))
-        if record.topic == SEEN_THREAD.recorded and len(points):
+            points = _NOTHING
+        if record.topic == _SEEN and len(points):
             self._check_place(record.topic, points)
             if self._threads % MEASURED == 0:
                 length = float(arc_lengths(points)[-1]) / self._length
                 self._odd += not SHORTEST <= length <= LONGEST
                 self._measured += 1
             self._threads += 1
-        known[stamp_of(record)] = points
+        known[stamp] = points
         if len(known) > 2 * EARLY:  # of a frame that never came
             del known[next(iter(known))]
 
     def _whole(self, sight: Sight, parts: dict[str, dict[int, Points]]) -> Sight:
-        none = np.empty((0, 2))
-        truth = parts.get(TRUE_THREAD.recorded, {}).get(sight.stamp, none)
-        seen = parts.get(SEEN_THREAD.recorded, {}).get(sight.stamp, none)
+        truth = parts.get(_TRUE, {}).get(sight.stamp, _NOTHING)
+        seen = parts.get(_SEEN, {}).get(sight.stamp, _NOTHING)
         if not len(truth) and not len(seen):
             return sight
-        return replace(sight, truth=truth, seen=seen if self.source == "poses" else sight.seen)
+        seen = seen if self.source == "poses" else sight.seen
+        return Sight(sight.stamp, sight.tail, sight.heading, seen, truth, sight.reason, sight.processing)
 
     def _pose(self, record: Record) -> Sight:
         """Return what a recorded pose says."""
         self.count += 1
-        self.on_record(record)
         stamp = stamp_of(record)
+        self.on_record(stamp, record)
         try:
             tail, heading = read_pose(record)
         except InvalidInputError as error:
@@ -168,7 +170,7 @@ class Sights(Iterator[Sight]):
             return Sight(stamp, reason=str(error))
         self._check_place(record.topic, tail)
         self.found += 1
-        return Sight(stamp, tail, heading)
+        return Sight(stamp, tail, heading, _NOTHING, _NOTHING)
 
     def _frame(self, record: Record) -> Sight:
         """Return what a camera frame says, as `thread_model` would get it."""
@@ -199,7 +201,7 @@ class Sights(Iterator[Sight]):
 
     def _check_place(self, topic: str, points: Points) -> None:
         """Refuse what is farther away than the dish is wide."""
-        if np.abs(points).max() > self._dish:  # what is not finite is refused by the model
+        if np.maximum.reduce(np.abs(points), axis=None) > self._dish:  # what is not finite is refused by the model
             worst = points.reshape(-1, 2)[np.abs(points).reshape(-1, 2).max(axis=1).argmax()]
             where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {self._dish:g} m wide"
             raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another set-up's?")
@@ -218,10 +220,9 @@ def pixels(message: Any, type_name: str) -> Any:
 
 def _telling(records: Iterator[Record], begin: int, whole: float, progress: Progress) -> Iterator[Record]:
     """Go through records and tell how far, a thousand times at the most: showing it takes longer than a step."""
-    told = 0.0
+    following, pause = begin, max(round(whole * 1e6), 1)
     for record in records:
-        share = min(1.0, (record.time - begin) * 1e-9 / max(whole, 1e-9))
-        if share >= told:
-            progress(share)
-            told = share + 1e-3
+        if record.time >= following:
+            progress(min(1.0, (record.time - begin) * 1e-9 / max(whole, 1e-9)))
+            following = record.time + pause
         yield record

@@ -6,28 +6,29 @@ What is not laid out as these readers expect is left to the bags' type store, wh
 from __future__ import annotations
 
 import struct
-from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.bags.headers import DISH_END, LITTLE_ENDIAN, is_in_dish
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_of
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_POSE
 
-LITTLE_ENDIAN = b"\x00\x01"  # what plain CDR begins with, as every ROS 2 machine of today writes it
-_BEGIN = struct.Struct("<4xiII")  # stamp, and the length of the frame's name
+_STAMPS = (struct.Struct(">4xiI"), struct.Struct("<4xiI"))  # by the bytes' order
+_SHORTEST = _STAMPS[0].size + 4  # of a header, where the length of the frame's name ends
 _POSE = struct.Struct("<7d")  # position and quaternion
+_COUNT = struct.Struct("<I")
+_LONGEST = 256  # bytes of the names of frames that are passed over in a path
 
 
 def stamp_of(record: Record) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
-    if len(record.data) < _BEGIN.size:
+    if len(record.data) < _SHORTEST:
         return record.time
-    seconds, nanoseconds, _ = struct.unpack_from("<4xiII" if record.data[1] & 1 else ">4xiII", record.data)
+    seconds, nanoseconds = _STAMPS[record.data[1] & 1].unpack_from(record.data)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
@@ -68,62 +69,42 @@ def _require_dish(frame: str, topic: str) -> None:
         raise InvalidInputError(f"{topic}.header.frame_id", repr(frame), repr(DISH_FRAME))
 
 
-def _after_header(data: bytes) -> int | None:
-    """Return where a header in the dish frame ends; None if there is none in plain CDR."""
-    if len(data) < _BEGIN.size or data[:2] != LITTLE_ENDIAN:
-        return None
-    length = _BEGIN.unpack_from(data)[2]
-    end = _BEGIN.size + length
-    return end if data[_BEGIN.size : end] == _NAME else None
-
-
-_NAME = DISH_FRAME.encode() + b"\0"
-
-
 def _aligned(at: int, to: int) -> int:
     """Return the next place of a size in CDR, which counts from behind its first four bytes."""
     return 4 + (at - 4 + to - 1) // to * to
 
 
-def _quick_pose(data: bytes) -> Any:
-    end = _after_header(data)
-    if end is None or len(data) < _aligned(end, 8) + _POSE.size:
+_POSE_AT, _COUNT_AT = _aligned(DISH_END, 8), _aligned(DISH_END, 4)
+_PATH_AT = _COUNT_AT + _COUNT.size
+_NAME_AT = _PATH_AT + 8  # the length of the frame's name in a path's first pose
+
+
+def _is_plain(data: bytes) -> bool:
+    """Return whether a message is in the dish frame, and written as our machines write it."""
+    return data[:2] == LITTLE_ENDIAN and is_in_dish(data)
+
+
+def _quick_pose(data: bytes) -> tuple[float, ...] | None:
+    if not _is_plain(data) or len(data) < _POSE_AT + _POSE.size:
         return None
-    return _POSE.unpack_from(data, _aligned(end, 8))
-
-
-@cache
-def _layout(name: int) -> np.dtype[np.void]:
-    """Return the layout of one stamped pose after another, the frame's name having a given length."""
-    gap = _aligned(4 + 12 + name, 8) - (4 + 12 + name)
-    return np.dtype([("stamp", "<u4", 2), ("length", "<u4"), ("name", "V", name + gap), ("pose", "<f8", 7)])
+    return _POSE.unpack_from(data, _POSE_AT)
 
 
 def _quick_path(data: bytes) -> Points | None:
     """Return a path whose poses all have frames of one length, so that they lie at equal distances."""
-    end = _after_header(data)
-    if end is None:
+    if not _is_plain(data) or len(data) < _PATH_AT:
         return None
-    at = _aligned(end, 4)
-    if len(data) < at + 4:
-        return None
-    count, at = int.from_bytes(data[at : at + 4], "little"), at + 4
+    (count,) = _COUNT.unpack_from(data, _COUNT_AT)
     if count == 0:
         return np.empty((0, 2))
-    if len(data) < at + 12:
+    if len(data) < _NAME_AT + _COUNT.size:
         return None
-    name = int.from_bytes(data[at + 8 : at + 12], "little")
-    first = _aligned(at + 12 + name, 8) + _POSE.size  # where the second pose begins: from there all are alike
-    if len(data) < first:
+    (name,) = _COUNT.unpack_from(data, _NAME_AT)
+    first = _aligned(_NAME_AT + _COUNT.size + name, 8)
+    stride = first + _POSE.size - _PATH_AT
+    if len(data) < _PATH_AT + count * stride or (count > 1 and name > _LONGEST):
         return None
-    points = np.empty((count, 2))
-    points[0] = np.frombuffer(data, "<f8", 2, first - _POSE.size)
-    if count > 1:
-        layout = _layout(name)
-        if name > 256 or len(data) < first + (count - 1) * layout.itemsize:
-            return None
-        others = np.frombuffer(data, layout, count - 1, first)
-        if (others["length"] != name).any():
-            return None
-        points[1:] = others["pose"][:, :2]
-    return points
+    names = np.ndarray((count,), "<u4", data, _NAME_AT, (stride,))
+    if names.tobytes() != data[_NAME_AT : _NAME_AT + _COUNT.size] * count:
+        return None
+    return np.array(np.ndarray((count, 2), "<f8", data, first, (stride, 8)), np.float64)

@@ -62,24 +62,35 @@ def errors_percent(
 
 def instant_of(sight: Sight, prediction: Prediction, margins: Margins | None, step_time: float) -> Instant:
     """Return a prediction beside what was seen and what is true, not scored yet; see `Tally.take`."""
-    instant = Instant(
+    instant = _without_clearance(sight, prediction, margins, step_time)
+    instant.clearance = _clearance(instant, margins)
+    return instant
+
+
+def _without_clearance(sight: Sight, prediction: Prediction, margins: Margins | None, step_time: float) -> Instant:
+    return Instant(
         sight.stamp,
         vertices=prediction.vertices,
-        stretch=float(np.abs(prediction.stretch).max(initial=0.0)),
+        stretch=float(np.maximum.reduce(np.abs(prediction.stretch), initial=0.0)),
         residual=prediction.residual,
         step_time=step_time,
+        clearance=_NONE,
+        least={} if margins is None else {KINDS[least.kind]: least.clearance for least in margins.least},
         seen=sight.seen,
         truth=sight.truth,
         tail=sight.tail,
         heading=math.atan2(sight.heading[1], sight.heading[0]),
     )
-    if margins is not None:
-        instant.least = {KINDS[least.kind]: least.clearance for least in margins.least}
-        near = margins.kind == _OBSTACLE
-        if near.any():
-            instant.clearance = np.full(len(prediction.vertices), np.inf)
-            np.minimum.at(instant.clearance, margins.node[near], margins.clearance[near])
-    return instant
+
+
+def _clearance(instant: Instant, margins: Margins | None) -> NDArray[np.float64]:
+    """Return the least clearance of an obstacle for each node, inf where none; empty if no node is near any."""
+    if margins is None or KINDS[_OBSTACLE] not in instant.least:
+        return _NONE
+    near = margins.kind == _OBSTACLE
+    clearance = np.full(len(instant.vertices), np.inf)
+    np.minimum.at(clearance, margins.node[near], margins.clearance[near])
+    return clearance
 
 
 class Tally:
@@ -95,9 +106,10 @@ class Tally:
     def __init__(self, length: float) -> None:
         self._length = length
         self._least: dict[int, tuple[float, int, int, int]] = {}
-        self._fresh: list[Instant] = []
+        self._fresh: list[tuple[Instant, Margins | None]] = []
         self._done: list[Instant] = []
         self._worst: Instant | None = None
+        self._badness = -math.inf
         self.contact_frames = 0
 
     def take(self, sight: Sight, prediction: Prediction, margins: Margins | None, step_time: float) -> None:
@@ -109,13 +121,12 @@ class Tally:
             margins: of the prediction, if they prove anything.
             step_time: that the prediction took [s].
         """
-        instant = instant_of(sight, prediction, margins, step_time)
         if margins is not None:
             for least in margins.least:
                 if least.clearance < self._least.get(least.kind, (np.inf,))[0]:
                     self._least[least.kind] = (least.clearance, least.node, least.obstacle, sight.stamp)
             self.contact_frames += bool(margins.touching)
-        self._fresh.append(instant)
+        self._fresh.append((_without_clearance(sight, prediction, margins, step_time), margins))
         if len(self._fresh) >= AT_ONCE:
             self._score()
 
@@ -143,22 +154,22 @@ class Tally:
         fresh, self._fresh = self._fresh, []
         if not fresh:
             return
-        vertices = np.stack([instant.vertices for instant in fresh])
-        by_seen, lengths = errors_percent(vertices, [instant.seen for instant in fresh], self._length)
-        by_truth, _ = errors_percent(vertices, [instant.truth for instant in fresh], self._length)
+        instants = [instant for instant, _ in fresh]
+        vertices = np.stack([instant.vertices for instant in instants])
+        by_seen, lengths = errors_percent(vertices, [instant.seen for instant in instants], self._length)
+        by_truth, _ = errors_percent(vertices, [instant.truth for instant in instants], self._length)
         shares = np.minimum(1.0, lengths / self._length)
+        # The error that counts; less than any where there is none.
+        badness = np.where(np.isfinite(by_seen), by_seen, np.where(np.isfinite(by_truth), by_truth, -1.0))
         for instant, seen, truth, share in zip(
-            fresh, by_seen.tolist(), by_truth.tolist(), shares.tolist(), strict=True
+            instants, by_seen.tolist(), by_truth.tolist(), shares.tolist(), strict=True
         ):
             instant.error_seen, instant.error_truth, instant.seen_share = seen, truth, share
-            if self._worst is None or _badness(instant) > _badness(self._worst):
-                self._worst = replace(instant)
+        at = int(badness.argmax())
+        if badness[at] > self._badness:
+            worst, margins = fresh[at]
+            self._worst, self._badness = replace(worst, clearance=_clearance(worst, margins)), badness[at]
+        for instant in instants:
             instant.vertices = instant.seen = instant.truth = _NOTHING
-            instant.clearance = instant.tail = _NONE
-        self._done += fresh
-
-
-def _badness(instant: Instant) -> float:
-    """Return the error that counts; less than any where there is none."""
-    errors = (instant.error_seen, instant.error_truth)
-    return next((error for error in errors if math.isfinite(error)), -1.0)
+            instant.tail = _NONE
+        self._done += instants

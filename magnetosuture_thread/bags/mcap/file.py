@@ -99,7 +99,7 @@ class McapFile:
                     places.append((time, first + MESSAGE.size, last, channel))
         places.sort()
         for time, first, last, channel in places:
-            yield Item(time, channel, data[first:last])
+            yield Item(time, self.connections[channel], data[first:last])
 
 
 def _load(stream: BinaryIO, piece: Piece) -> bytes:

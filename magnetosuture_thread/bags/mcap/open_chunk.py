@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any, NamedTuple
 
 from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, McapRecord, Message, Schema
+from mcap.opcode import Opcode
+from mcap.records import Channel, McapRecord, Schema
+
+from magnetosuture_thread.bags.mcap.layout import HEAD, MESSAGE
+
+_MESSAGE = struct.Struct("<BQHIQQ")  # the head of a message's record, and what is before the data
+_INDEX = struct.Struct("<BQHI")  # the head of an index of messages, its channel, and its size
+
+
+class Waiting(NamedTuple):
+    """A message that waits: number of its channel, which one of it, time [ns], CDR bytes."""
+
+    channel: int
+    sequence: int
+    time: int
+    data: bytes
 
 
 class Filled(NamedTuple):
@@ -30,52 +47,62 @@ class OpenChunk:
 
     Nothing but a list that grows: whatever interrupts a recorder between two messages or within one, as Ctrl-C may,
     what waits is whole.
+
+    Attributes:
+        size: number of bytes of the messages so far.
     """
 
     def __init__(self) -> None:
-        self._messages: list[Message] = []
-        self._size = 0
+        self._messages: list[Waiting] = []
         self._first = self._last = 0
+        self.size = 0
 
     def __len__(self) -> int:
         """Return the number of messages that wait."""
         return len(self._messages)
 
     @property
-    def size(self) -> int:
-        """Return the number of bytes of the messages so far."""
-        return self._size
-
-    @property
     def span(self) -> int:
         """Return the time from the first message to the last [ns]."""
         return self._last - self._first
 
-    def add(self, message: Message) -> None:
+    def add(self, message: Waiting) -> None:
         """Take a message."""
-        time, is_first = message.log_time, not self._messages
+        time, is_first = message.time, not self._messages
         self._messages.append(message)
-        self._size += len(message.data)
-        self._first = time if is_first else min(self._first, time)
-        self._last = time if is_first else max(self._last, time)
+        self.size += len(message.data)
+        if is_first or time < self._first:
+            self._first = time
+        if is_first or time > self._last:
+            self._last = time
 
     def filled(self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]) -> Filled:
         """Return what the chunk will hold: the messages, with the channels and types that they need."""
-        content = RecordBuilder()
+        content: list[bytes] = []
+        size = 0
         entries: dict[int, list[tuple[int, int]]] = {}
         told: set[int] = set()
-        for message in self._messages:
-            channel = channels[message.channel_id]
-            if channel.id not in entries:
+        for number, sequence, time, data in self._messages:
+            if number not in entries:
+                channel = channels[number]
                 if channel.schema_id and channel.schema_id not in told:
-                    schemas[channel.schema_id].write(content)
+                    content.append(as_bytes(schemas[channel.schema_id]))
+                    size += len(content[-1])
                     told.add(channel.schema_id)
-                channel.write(content)
-                entries[channel.id] = []
-            entries[channel.id].append((message.log_time, content.count))
-            message.write(content)
-        times = [message.log_time for message in self._messages]
-        return Filled(taken_from(content), entries, min(times), max(times))
+                content.append(as_bytes(channel))
+                size += len(content[-1])
+                entries[number] = []
+            entries[number].append((time, size))
+            content += (_MESSAGE.pack(Opcode.MESSAGE, MESSAGE.size + len(data), number, sequence, time, time), data)
+            size += _MESSAGE.size + len(data)
+        times = [message.time for message in self._messages]
+        return Filled(b"".join(content), entries, min(times), max(times))
+
+
+def index_of(channel: int, entries: list[tuple[int, int]]) -> bytes:
+    """Return the record that tells time and place of a channel's messages in a chunk."""
+    places = struct.pack(f"<{2 * len(entries)}Q", *chain.from_iterable(entries))
+    return _INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX.size - HEAD.size + len(places), channel, len(places)) + places
 
 
 def taken_from(builder: Any) -> bytes:

@@ -31,8 +31,6 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
-    Message,
-    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
@@ -41,7 +39,7 @@ from mcap.records import (
 )
 
 from magnetosuture_thread.bags.mcap.layout import HEAD, MAGIC
-from magnetosuture_thread.bags.mcap.open_chunk import OpenChunk, as_bytes, taken_from
+from magnetosuture_thread.bags.mcap.open_chunk import OpenChunk, Waiting, as_bytes, index_of, taken_from
 from magnetosuture_thread.bags.storage import Connection
 
 CHUNK_SIZE = 256 * 1024  # bytes of messages, unpacked
@@ -125,17 +123,20 @@ class McapWriter:
         )
         return number
 
-    def add_message(self, channel: int, time: int, data: bytes) -> None:
-        """Take a message; with it a chunk may go to the disk.
+    def add_message(self, channel: int, time: int, data: bytes) -> bool:
+        """Take a message, and return whether a chunk went to the disk with it.
 
         Raises:
             OSError: as `flush`.
         """
         waiting = self._state.waiting
-        waiting.add(Message(channel, time, data, time, self._sequences[channel]))
-        self._sequences[channel] += 1
-        if waiting.size > CHUNK_SIZE or waiting.span > CHUNK_SPAN:
+        sequence = self._sequences[channel]
+        waiting.add(Waiting(channel, sequence, time, data))
+        self._sequences[channel] = sequence + 1
+        is_full = waiting.size > CHUNK_SIZE or waiting.span > CHUNK_SPAN
+        if is_full:
             self.flush()
+        return is_full
 
     def flush(self) -> None:
         """Bring the messages so far to the disk.
@@ -149,11 +150,10 @@ class McapWriter:
         content, entries, first, last = before.waiting.filled(self._channels, self._schemas)
         packed = self._packer.compress(content)
         body = as_bytes(Chunk("zstd", packed, last, first, zlib.crc32(content), len(content)))
-        index, places = RecordBuilder(), dict[int, int]()
+        indices, places = b"", dict[int, int]()
         for channel, messages in entries.items():
-            places[channel] = before.size + len(body) + index.count
-            MessageIndex(channel, messages).write(index)
-        indices = taken_from(index)
+            places[channel] = before.size + len(body) + len(indices)
+            indices += index_of(channel, messages)
         listed = ChunkIndex(
             chunk_length=len(body),
             chunk_start_offset=before.size,
