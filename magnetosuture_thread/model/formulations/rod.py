@@ -35,7 +35,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance
 from magnetosuture_thread.model.formulations.rod_program import Rod
-from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, go_on, set_out, take
+from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, go_on, take
 from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
@@ -85,6 +85,7 @@ class RodFormulation:
             mechanics.bending_bands(thread.segments, glued),
         )
         self._axes, self._banded = (0, 1, 2)[:dimension], _structured(solver)
+        self._motion = Motion.of(nodes, dimension)
         self._give(Memory.of(nodes, dimension, thread.segments, 2 * nodes))
 
     def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
@@ -92,7 +93,7 @@ class RodFormulation:
         unit, segments = self._thread.segment_length, self._thread.segments
         if state.interval == 0.0:
             self._memory.forget()
-        motion = set_out(state.positions, state.velocities, *drive.arrays(), unit, interval, state.interval)
+        motion, (nodes, ends) = self._motion, drive.arrays()
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
         while True:
             code, contacts, solves, off, word, residuals = go_on(
@@ -102,6 +103,10 @@ class RodFormulation:
                 self._near.data,
                 self._workspace,
                 motion,
+                state.positions,
+                state.velocities,
+                nodes,
+                ends,
                 drive.heading,
                 interval,
                 state.interval,

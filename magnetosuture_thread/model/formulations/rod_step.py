@@ -19,7 +19,7 @@ ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `go_on` got
 
 
 class Motion(NamedTuple):
-    """A step under way, in units of the segment length.
+    """A step under way, in units of the segment length; kept from step to step, so that none pays for memory.
 
     Attributes:
         before: where the nodes are, shape (n + 1, d).
@@ -37,9 +37,16 @@ class Motion(NamedTuple):
     about: Points
     known: NDArray[np.bool_]
 
+    @classmethod
+    def of(cls, nodes: int, dimension: int) -> Motion:
+        """Return memory for every step of a thread."""
+        before, start, last, velocities, about = np.zeros((5, nodes, dimension))
+        return cls(before, start, last, velocities, about, np.zeros(nodes, dtype=np.bool_))
+
 
 @compiled
 def set_out(
+    motion: Motion,
     positions: Points,
     velocities: Points,
     nodes: NDArray[np.int64],
@@ -47,13 +54,14 @@ def set_out(
     unit: float,
     interval: float,
     last_interval: float,
-) -> Motion:
-    """Return a step's beginning, and where the thread would be if it moved on as it did: a guess of second order.
+) -> None:
+    """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
 
     Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
     farther than a segment: then the guess is where the thread is.
 
     Args:
+        motion: written.
         positions: of all nodes, shape (n + 1, d) [m].
         velocities: over the last step [m/s].
         nodes: that are driven, shape (k,).
@@ -62,17 +70,19 @@ def set_out(
         interval: dt [s].
         last_interval: of the last step, 0 if there was none [s].
     """
-    before, last = positions / unit, velocities / unit
-    start, known = driven(before, nodes, ends, unit)
-    about = start.copy()
-    if last_interval > 0.0 and interval <= LONGEST_RATIO * last_interval:
-        for i in range(len(start)):
-            for a in range(start.shape[1]):
-                if not known[i]:
-                    about[i, a] = start[i, a] + interval * last[i, a]
-                    if not abs(about[i, a] - start[i, a]) <= 1.0:
-                        return Motion(before, start, last, last.copy(), start.copy(), known)
-    return Motion(before, start, last, last.copy(), about, known)
+    motion.before[:], motion.last[:] = positions / unit, velocities / unit
+    motion.velocities[:] = motion.last
+    motion.start[:], motion.known[:] = driven(motion.before, nodes, ends, unit)
+    motion.about[:] = motion.start
+    if not (last_interval > 0.0 and interval <= LONGEST_RATIO * last_interval):
+        return
+    for i in range(len(positions)):
+        for a in range(positions.shape[1]):
+            if not motion.known[i]:
+                motion.about[i, a] = motion.start[i, a] + interval * motion.last[i, a]
+                if not abs(motion.about[i, a] - motion.start[i, a]) <= 1.0:
+                    motion.about[:] = motion.start
+                    return
 
 
 @compiled
@@ -83,6 +93,10 @@ def go_on(
     surroundings: SurroundingsData,
     workspace: banded.Workspace,
     motion: Motion,
+    positions: Points,
+    velocities: Points,
+    nodes: NDArray[np.int64],
+    ends: Points,
     heading: Points,
     interval: float,
     last_interval: float,
@@ -99,18 +113,24 @@ def go_on(
         surroundings: obstacles [m].
         workspace: of the structured solver; one without iterations leaves every solve to the caller.
         motion: where the step has got to; written.
+        positions: see `set_out`, as are the following.
+        velocities: over the last step [m/s].
+        nodes: that are driven, shape (k,).
+        ends: where these are at the end of the step, shape (k, d) [m].
         heading: unit vector along the needle at the end of the step, shape (d,).
         interval: dt [s].
         last_interval: of the last step, 0 if there was none [s].
         tolerance: the largest residual with which a solution is accepted.
         most_solves: of a step.
-        solves: how many this step has had.
+        solves: how many this step has had; with none it sets out.
 
     Returns:
         `ENDED`, `NO_ROOM` for all contacts in the memory, or `UNSOLVED`, and then the program is there for
         another solver; the number of contacts; solves; how far off the barriers are, see `assemble`; the
         first status that is not 0, see `banded.STATUS`; the largest residual of each kind.
     """
+    if solves == 0:
+        set_out(motion, positions, velocities, nodes, ends, rod.unit, interval, last_interval)
     worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
     while True:
         contacts, off = assemble(
@@ -145,11 +165,11 @@ def go_on(
             memory.upper[:rows],
             memory.compliance[:rows],
         )
-        velocities, multipliers = motion.velocities.copy(), memory.multipliers[:rows].copy()
-        word, _, found = banded.solve_and_judge(axes, program, velocities, multipliers, workspace)
+        u, multipliers = motion.velocities.copy(), memory.multipliers[:rows].copy()
+        word, _, found = banded.solve_and_judge(axes, program, u, multipliers, workspace)
         if not max(found) <= tolerance:
             return UNSOLVED, contacts, solves, off, status, worst
-        take(memory, motion, velocities, multipliers, interval)
+        take(memory, motion, u, multipliers, interval)
         worst = (max(worst[0], found[0]), max(worst[1], found[1]), max(worst[2], found[2]))
         status, solves = status if status != 0 else word, solves + 1
 

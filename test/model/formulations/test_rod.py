@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
 from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, ThreadState
-from magnetosuture_thread.model.formulations.rod_step import set_out
+from magnetosuture_thread.model.formulations.rod_step import Motion, set_out
 from magnetosuture_thread.model.formulations.step import Memory
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector
 from magnetosuture_thread.model.solvers import BandedSolver
@@ -150,12 +150,13 @@ def test_a_short_step_and_a_long_one_lead_to_the_same_place():
 def test_the_first_guess_goes_on_as_before_unless_that_is_noise_or_too_far():
     unit, lead_node, end = polyamide().segment_length, np.array([0]), np.array([[1e-4, 2e-4]])
     start, velocities = straight(polyamide()), np.full((26, 2), 3.0 * unit)
-    onwards = set_out(start, velocities, lead_node, end, unit, DT, DT)
+    onwards, still = Motion.of(26, 2), Motion.of(26, 2)
+    set_out(onwards, start, velocities, lead_node, end, unit, DT, DT)
     np.testing.assert_allclose(onwards.about[1:], start[1:] / unit + 3.0 * DT)
     np.testing.assert_array_equal(onwards.about[0], end[0] / unit)
     np.testing.assert_array_equal(onwards.known, np.arange(26) == 0)
     for last_interval, speeds in ((0.0, velocities), (0.1 * DT, velocities), (DT, 100.0 * velocities)):
-        still = set_out(start, speeds, lead_node, end, unit, DT, last_interval)
+        set_out(still, start, speeds, lead_node, end, unit, DT, last_interval)
         np.testing.assert_array_equal(still.about, still.start)
         np.testing.assert_array_equal(still.start[1:], start[1:] / unit)
 
