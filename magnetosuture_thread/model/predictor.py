@@ -278,5 +278,8 @@ def check_pose(pose: NeedlePose) -> None:
 def _between(first: Points, second: Points, part: float) -> Points:
     """Return the direction between two unit vectors; where they are opposite, the second."""
     mixed = [(1.0 - part) * a + part * b for a, b in zip(first.tolist(), second.tolist(), strict=True)]
-    size = math.hypot(*mixed)
+    square = 0.0
+    for value in mixed:  # `hypot`, and `sum` from Python 3.12 on, round in another way than numpy
+        square += value * value
+    size = math.sqrt(square)
     return np.array([value / size for value in mixed]) if size > 1e-6 else second

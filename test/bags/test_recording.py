@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from magnetosuture_thread.bags.headers import DISH_END, is_in_dish, stamp_and_frame
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.remap import remapping
@@ -197,6 +198,16 @@ def test_what_is_ours_is_passed_on_byte_for_byte(tmp_path: Path):
     recording = Recording(bag)
     assert [r.data for r in recording.records([TRUE_NEEDLE, IMAGE])] == [r.data for r in bag.records()]
     assert [r.time for r in recording.records([TRUE_NEEDLE], start=0.5)] == [2 * SECOND]
+
+
+@pytest.mark.parametrize("little", [True, False])
+@pytest.mark.parametrize("frame", ["dish", "/dish", "dis", "dishes", "", "DISH"])
+def test_the_dish_frame_is_told_from_the_bytes(frame: str, little: bool):
+    data = bytes(typestore().serialize_cdr(pose_stamped(frame=frame), TRUE_NEEDLE.type_name, little_endian=little))
+    assert stamp_and_frame("/topic", data) == (SECOND, frame)
+    assert is_in_dish(data) == (frame == "dish")
+    assert not is_in_dish(b"\0\7" + data[2:])  # an order that nobody knows
+    assert not any(is_in_dish(data[:length]) for length in range(DISH_END))
 
 
 def image(compressed: bool) -> Any:

@@ -369,6 +369,8 @@ def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: p
         {"max_acceleration": -1.0},
         {"rate": 0.0},
         {"roboclaw_timeout": 0.0},
+        {"roboclaw_answer_timeout": 0.02},
+        {"roboclaw_answer_timeout": 1.5},
         {"keep_out": 0.03},
     ],
 )

@@ -84,7 +84,7 @@ class RodFormulation:
             mechanics.end_corrected_weights(thread.segments),
             mechanics.bending_bands(thread.segments, glued),
         )
-        self._axes, self._banded = (0, 1, 2)[:dimension], _structured(solver)
+        self._axes, (self._banded, self._at_once) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
         self._motion = Motion.of(nodes, dimension)
         self._give(Memory.of(nodes, dimension, thread.segments, 2 * nodes))
 
@@ -93,6 +93,9 @@ class RodFormulation:
         unit, segments = self._thread.segment_length, self._thread.segments
         if state.interval == 0.0:
             self._memory.forget()
+        # Compiled code would be compiled anew for another layout, in the middle of a run.
+        positions = np.ascontiguousarray(state.positions, np.float64)
+        velocities = np.ascontiguousarray(state.velocities, np.float64)
         motion, (nodes, ends) = self._motion, drive.arrays()
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
         while True:
@@ -103,14 +106,14 @@ class RodFormulation:
                 self._near.data,
                 self._workspace,
                 motion,
-                state.positions,
-                state.velocities,
+                positions,
+                velocities,
                 nodes,
                 ends,
                 drive.heading,
                 interval,
                 state.interval,
-                self._tolerance,
+                self._at_once,
                 MOST_SOLVES,
                 solves,
             )
@@ -127,8 +130,9 @@ class RodFormulation:
                 self._memory.forget()
                 raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
             take(self._memory, motion, solution.velocities, solution.multipliers, interval)
-            worst, solves, solver = worst.or_worse(solution.residuals), solves + 1, solution.solver
-            status = status if status != SOLVED else solution.status
+            worst, solves = worst.or_worse(solution.residuals), solves + 1
+            if status == SOLVED:
+                status, solver = solution.status, solution.solver
         end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
@@ -155,10 +159,13 @@ class RodFormulation:
         ]
 
 
-def _structured(solver: Solver) -> BandedSolver:
+def _structured(solver: Solver, tolerance: float) -> tuple[BandedSolver, float]:
     """Return the structured solver if it is the first to be tried, else one that does nothing.
 
-    A step does not leave compiled code for it. Of its subclasses nobody knows how they solve.
+    A step does not leave compiled code for it while its residuals are within the tolerance that is returned
+    too. Of its subclasses nobody knows how they solve.
     """
-    first = solver.first if isinstance(solver, FallbackSolver) else solver
-    return first if type(first) is BandedSolver else BandedSolver(iterations=0)
+    first = solver
+    if type(solver) is FallbackSolver:
+        first, tolerance = solver.first, min(tolerance, solver.tolerance)
+    return first if type(first) is BandedSolver else BandedSolver(iterations=0), tolerance

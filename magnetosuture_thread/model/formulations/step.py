@@ -65,8 +65,8 @@ class StepSolution:
 
     Attributes:
         state: the thread at the end of the step.
-        solver: the solver's name.
-        status: its own word for the last solve; of a solve that was not at once accepted, if there was one.
+        solver: name of the solver of the solve that the status is of.
+        status: its own word for the last solve; for the first that it did not solve at once, if there was one.
         residuals: the largest of each kind over the step's solves.
         solves: number of programs solved.
         converged: whether the end satisfies the barriers themselves, not only their last linearisation; of

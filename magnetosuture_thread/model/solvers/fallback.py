@@ -21,17 +21,18 @@ class FallbackSolver:
 
     Attributes:
         first: of the solvers.
+        tolerance: as given.
     """
 
     def __init__(self, solvers: Sequence[Solver], tolerance: float) -> None:
-        self._solvers, self._tolerance = tuple(solvers), tolerance
+        self._solvers, self.tolerance = tuple(solvers), tolerance
         self.first = self._solvers[0]
         self.name = self.first.name
 
     def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
         """Return the first solution that passes, else the best; see `Solver`."""
         solution = self.first.solve(program, velocities, multipliers)
-        if solution.residuals.largest <= self._tolerance:
+        if solution.residuals.largest <= self.tolerance:
             return solution
         tried, best = [f"{solution.solver}: {solution.status}"], solution
         still, free = np.zeros_like(program.linear), np.zeros(len(program.first))
@@ -39,7 +40,7 @@ class FallbackSolver:
             solution = solver.solve(program, still, free)
             if solution.residuals.largest < best.residuals.largest:
                 best = solution
-            if solution.residuals.largest <= self._tolerance:
+            if solution.residuals.largest <= self.tolerance:
                 break
             tried.append(f"{solution.solver} from a cold start: {solution.status}")
         return best._replace(status=f"{best.status}, after {', '.join(tried)}")

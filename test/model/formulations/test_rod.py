@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
-from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, ThreadState
+from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, StepSolution, ThreadState
 from magnetosuture_thread.model.formulations.rod_step import Motion, set_out
 from magnetosuture_thread.model.formulations.step import Memory
-from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector
-from magnetosuture_thread.model.solvers import BandedSolver
+from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector
+from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.thread import Attachment, Thread
 from test.model.formulations.scenes import (
     DT,
@@ -370,3 +371,83 @@ def test_a_solution_is_refused_by_its_residual_whatever_the_solver_says():
     formulation = RodFormulation(thread, Surroundings((), 0.01), LyingSolver(), 1e-5)
     with pytest.raises(SolverError, match=r"liar ended with status 'solved' and residual 2\.0e-05"):
         formulation.step(ThreadState.at_rest(straight(thread)), lead(np.zeros(2)), DT)
+
+
+class Hidden:
+    """Solves with another solver, where compiled code cannot see it; under a name of its own, if it has one."""
+
+    def __init__(self, solver: Solver, name: str = "") -> None:
+        self._solver, self.name = solver, name or solver.name
+        self._renames = bool(name)
+
+    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+        """Solve one program; see `Solver`."""
+        solution = self._solver.solve(program, velocities, multipliers)
+        return solution._replace(solver=self.name) if self._renames else solution
+
+
+def among_discs(solver: Solver) -> RodFormulation:
+    """Return a formulation of a glued thread with two discs beside it."""
+    discs = tuple(Disc((-0.009 + 0.006 * k, 0.0025), 0.0015) for k in range(2))
+    return RodFormulation(polyamide(Attachment.GLUED), Surroundings(discs, 0.05), solver, TOLERANCE)
+
+
+def assert_same(one: StepSolution, other: StepSolution) -> None:
+    """Assert that two steps are the same to the last bit."""
+    np.testing.assert_array_equal(one.state.positions, other.state.positions)
+    np.testing.assert_array_equal(one.state.velocities, other.state.velocities)
+    assert replace(one, state=other.state) == other
+
+
+@pytest.mark.parametrize(("coarse", "strict"), [(BandedSolver(iterations=1), 1.0), (BandedSolver(0.1), 1e-4)])
+def test_a_step_goes_on_with_the_other_solvers_where_compiled_code_leaves_it(coarse: BandedSolver, strict: float):
+    """It fails now and then, or is good enough for the step, but not for who would ask the others."""
+    thread = polyamide(Attachment.GLUED)
+    both = FallbackSolver((coarse, Hidden(BandedSolver(), "second")), strict * TOLERANCE)
+    steps, expected = (
+        followed(among_discs(solver), straight(thread), lambda k: k * 6e-5 * np.array([0.3, 1.0]), 60)
+        for solver in (both, Hidden(both))
+    )
+    for one, other in zip(steps, expected, strict=True):
+        assert_same(one, other)
+    helped = [done for done in steps if done.solver == "second"]
+    assert 0 < len(helped) < len(steps)
+    assert all("solved, after banded: " in done.status for done in helped)
+    assert all(done.status == "solved" for done in steps if done.solver == "banded")
+
+
+@pytest.mark.parametrize("hides", [False, True])
+def test_a_step_that_failed_leaves_nothing_to_the_next(hides: bool):
+    state = followed(among_discs(BandedSolver()), straight(polyamide()), lambda k: k * 6e-5 * east(), 20)[-1].state
+    hasty = BandedSolver(iterations=2)
+    used, fresh = (among_discs(Hidden(hasty) if hides else hasty) for _ in range(2))
+    with pytest.raises(SolverError, match="banded ended with status 'iteration limit'"):
+        used.step(state, lead(state.positions[0] + np.array([0.0, 3e-3])), DT)
+    onwards = lead(state.positions[0] + 6e-5 * east())
+    assert_same(used.step(state, onwards, DT), fresh.step(state, onwards, DT))
+
+
+def test_a_step_that_needs_more_room_is_none_the_worse():
+    thread, hundreds = polyamide(), tuple(Disc((-0.0004 * k, 0.0012), 0.0009) for k in range(80))
+    grown, fresh = formulated(thread, hundreds), formulated(thread, hundreds)
+    state = ThreadState.at_rest(straight(thread))
+    room = vars(fresh)["_memory"].node.size
+    grown.step(state, lead(np.zeros(2)), DT)
+    expected = grown.step(state, lead(np.array([6e-5, 0.0])), DT)
+    assert_same(fresh.step(state, lead(np.array([6e-5, 0.0])), DT), expected)
+    assert vars(fresh)["_memory"].node.size > room
+
+
+def test_a_step_keeps_its_memory_to_itself():
+    """States that were given out or in stay as they are, whatever their layout."""
+    formulation, thread = among_discs(BandedSolver()), polyamide()
+    start = straight(thread)
+    given = ThreadState(np.asfortranarray(start), np.asfortranarray(np.zeros_like(start)), DT)
+    first = formulation.step(given, lead(np.array([6e-5, 0.0])), DT)
+    kept = first.state.positions.copy(), first.state.velocities.copy()
+    formulation.step(first.state, lead(np.array([2e-4, 0.0])), DT)
+    np.testing.assert_array_equal(given.positions, start)
+    np.testing.assert_array_equal(first.state.positions, kept[0])
+    np.testing.assert_array_equal(first.state.velocities, kept[1])
+    given = ThreadState(start, np.zeros_like(start), DT)
+    assert_same(among_discs(BandedSolver()).step(given, lead(np.array([6e-5, 0.0])), DT), first)

@@ -16,7 +16,7 @@ from magnetosuture_thread.coils.drivers.roboclaw import line as line_module
 from magnetosuture_thread.coils.drivers.roboclaw.driver import CLOSING
 from magnetosuture_thread.coils.drivers.roboclaw.line import LineThread
 from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox, Report
-from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError
+from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
 from magnetosuture_thread.coils.drivers.roboclaw.rules import Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
@@ -135,6 +135,21 @@ def test_a_line_that_is_ended_tries_nothing_twice(monkeypatch):
     assert clock.slept == [board_module.QUIET]
     assert connected(clock, 0, 1, ends=True)[1].exchanges == 1
     assert clock.slept == [board_module.QUIET]
+
+
+def test_a_board_has_as_long_for_an_answer_as_is_set(bench):
+    bench.stage.open()
+    (path, *_), settings = bench.settings().roboclaw_ports, bench.settings(roboclaw_answer_timeout=0.25)
+    line, opened = LineThread(0, path, {0: 128}, settings, Mailbox(2, [""], 0.1)), []
+
+    def connect(port: ExchangePort) -> None:
+        opened.append((port.timeout, port.write_timeout, port.answer_timeout))
+        line.end()
+
+    vars(line)["_connect"] = connect
+    line.start()
+    line.join(10.0)
+    assert opened == [(0.25, 0.25, 0.25)]
 
 
 @pytest.mark.parametrize("boards", [(0,), (0, 1)])
