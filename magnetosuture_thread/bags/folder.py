@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from magnetosuture_thread.bags.notes import from_custom_data
 from magnetosuture_thread.errors import BagError
 
 STORAGES = (".mcap", ".db3")
@@ -22,10 +23,12 @@ class BagFiles:
     Attributes:
         files: in the order in which they were recorded.
         missing: names of those that metadata.yaml tells and that are not there.
+        notes: what metadata.yaml says that our writer said of the bag.
     """
 
     files: list[Path]
     missing: list[str]
+    notes: dict[str, str]
 
 
 def bag_files(path: Path) -> BagFiles:
@@ -49,32 +52,33 @@ def bag_files(path: Path) -> BagFiles:
     if path.is_file():
         if path.name.endswith(PACKED):
             raise BagError(path, f"is packed as a whole; unpack it first: zstd -d {path.name}")
-        return BagFiles([path], [])
-    told = _told(path / "metadata.yaml")
+        return BagFiles([path], [], {})
+    told, notes = _told(path / "metadata.yaml")
     if told:
         there = {file.name: file for file in files}
         listed, missing = [there[n] for n in told if n in there], [n for n in told if n not in there]
         if listed:
-            return BagFiles(listed, missing)
+            return BagFiles(listed, missing, notes)
     packed = [file for file in inside if file.name.endswith(PACKED)]
     if packed and not files:
         raise BagError(path, f"is packed as a whole; unpack it first: zstd -d {packed[0].name}")
     if not files:
-        raise BagError(path, "holds no .mcap file")
+        raise BagError(path, f"holds no {' or '.join(STORAGES)} file")
     if len(files) > 1 and not _is_split(files):
         kind = files[0].suffix if len({file.suffix for file in files}) == 1 else ".mcap and .db3"
         raise BagError(path, f"holds {len(files)} {kind} files; name one of them")
-    return BagFiles(files, [])
+    return BagFiles(files, [], notes)
 
 
-def _told(path: Path) -> list[str]:
-    """Return the files that metadata.yaml names; none where it cannot be read."""
+def _told(path: Path) -> tuple[list[str], dict[str, str]]:
+    """Return the files that metadata.yaml names, and its notes; none where it cannot be read."""
     try:
         content: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-        names = content["rosbag2_bagfile_information"]["relative_file_paths"]
-        return list(dict.fromkeys(Path(name).name for name in names))  # one that is told twice is read once
-    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError, RecursionError):
-        return []
+        information = content["rosbag2_bagfile_information"]
+        names = dict.fromkeys(Path(name).name for name in information["relative_file_paths"])  # one told twice is one
+        return list(names), from_custom_data(information.get("custom_data"))
+    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError, AttributeError, RecursionError):
+        return [], {}
 
 
 def _by_number(path: Path) -> tuple[str, int, str]:

@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Mapping
 
 NOTES = "magnetosuture"  # name of the mcap record that holds our notes
+_PREFIX = f"{NOTES}."  # of our entries in metadata.yaml
 _CHECKSUM = "crc32"  # of all other entries of the record
 
 
@@ -26,6 +27,20 @@ def opened(entries: Mapping[str, str], *, vouched: bool) -> dict[str, str] | Non
     if vouched or entries.get(_CHECKSUM) == _checksum(notes):
         return notes
     return None
+
+
+def as_custom_data(notes: Mapping[str, str]) -> dict[str, str]:
+    """Return notes, with their checksum, as entries of metadata.yaml."""
+    return {_PREFIX + key: value for key, value in sealed(notes).items()} if notes else {}
+
+
+def from_custom_data(entries: object) -> dict[str, str]:
+    """Return notes from metadata.yaml; none where nothing says that they are as they were written."""
+    if not isinstance(entries, Mapping):
+        return {}
+    words = {str(key): str(value) for key, value in entries.items()}
+    ours = {key.removeprefix(_PREFIX): value for key, value in words.items() if key.startswith(_PREFIX)}
+    return opened(ours, vouched=False) or {}
 
 
 def _checksum(notes: Mapping[str, str]) -> str:

@@ -95,7 +95,7 @@ class Bag:
         self.damage = together([*(storage.damage for storage in self._storages), *lost])
         self.unchecked = next((storage.unchecked for storage in self._storages if storage.unchecked), "")
         self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
-        self.notes: dict[str, str] = next((storage.notes for storage in self._storages if storage.notes), {})
+        self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
         if not any(storage.counts for storage in self._storages):
             raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
         filled = [storage for storage in self._storages if storage.counts]

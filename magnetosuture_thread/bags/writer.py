@@ -14,7 +14,7 @@ import yaml
 
 from magnetosuture_thread.bags.damage import counted
 from magnetosuture_thread.bags.mcap.writing import INDEX_SIZE, McapWriter
-from magnetosuture_thread.bags.notes import NOTES, sealed
+from magnetosuture_thread.bags.notes import NOTES, as_custom_data, sealed
 from magnetosuture_thread.bags.qos import OFFERED, in_words, profiles
 from magnetosuture_thread.bags.reserve import Reserve
 from magnetosuture_thread.bags.storage import Connection, Definition
@@ -63,7 +63,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(folder, f"cannot be written: {error.strerror}") from None
         try:
-            self._writer = McapWriter(self._stream)
+            self._writer = McapWriter(self._stream, {NOTES: sealed(self._notes)} if self._notes else {})
             self._reserve = Reserve(folder / ".reserve")
             self._reserve.grow(_SPARE)
         except OSError as error:
@@ -178,9 +178,8 @@ class BagWriter:
 
     def _finish(self) -> None:
         information = self._information()
-        metadata = {NOTES: sealed(self._notes)} if self._notes else {}
         inside = {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)}
-        self._writer.finish({**metadata, "rosbag2": inside})
+        self._writer.finish({"rosbag2": inside})
         text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
         with (self.folder / "metadata.yaml").open("w", encoding="utf-8") as stream:
             stream.write(text)
@@ -221,7 +220,7 @@ class BagWriter:
             "compression_mode": "",
             "relative_file_paths": [self._file_name],
             "files": [file],
-            "custom_data": {f"{NOTES}.{key}": value for key, value in self._notes.items()},
+            "custom_data": as_custom_data(self._notes),
             "ros_distro": "jazzy",
         }
 

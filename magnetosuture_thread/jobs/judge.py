@@ -104,11 +104,11 @@ def opened(
             raise BagError(path, recording.unfit[channel.recorded])
     left = recording.duration - start
     with TemporaryDirectory() as spare:
-        setup = _setup_of(recording.notes, setup_name, Path(spare), say)
+        setup = _setup_of(recording.notes, setup_name, recording.damage is not None, Path(spare), say)
         yield Given(recording, setup, chosen, start, left if duration is None else min(duration, left))
 
 
-def _setup_of(notes: Mapping[str, str], name: str, spare: Path, say: Say) -> Setup:
+def _setup_of(notes: Mapping[str, str], name: str, is_damaged: bool, spare: Path, say: Say) -> Setup:
     """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default."""
     named, text = notes.get("setup", ""), notes.get(SCENARIO_NOTE, "")
     if name:
@@ -120,7 +120,8 @@ def _setup_of(notes: Mapping[str, str], name: str, spare: Path, say: Say) -> Set
         path.write_text(text, encoding="utf-8")
         return read_setup(str(path))
     if not named:
-        say(f"the bag names no set-up; taking {DEFAULT_SETUP}")
+        lost = ", or has lost its name" if is_damaged else ""
+        say(f"the bag names no set-up{lost}; taking {DEFAULT_SETUP}, which may not be its own: --setup names another")
     return read_setup(named or DEFAULT_SETUP)
 
 

@@ -132,7 +132,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
     for name, words in (
         ("missing", "does not exist; expected an mcap file"),
         ("text.mcap", "is no mcap file"),
-        ("folder", "holds no .mcap file"),
+        ("folder", "holds no .mcap or .db3 file"),
         ("hollow", "holds no messages"),
     ):
         with pytest.raises(BagError) as caught:

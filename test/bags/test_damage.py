@@ -288,3 +288,29 @@ def test_what_is_lost_is_never_before_the_bag(whole: Whole, tmp_path: Path):
     assert bag.damage is not None
     assert bag.damage.messages is None
     assert "cut off" in str(bag.damage)
+
+
+def test_a_cut_leaves_the_notes_at_the_head(whole: Whole, tmp_path: Path):
+    """What says that a bag is simulated must not be the first that goes."""
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole.data[: whole.chunks[1][0]])
+    assert Bag(path).notes == whole.notes != {}
+
+
+def test_notes_that_a_file_has_lost_are_in_metadata_yaml(whole: Whole, tmp_path: Path):
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    file, told = folder / whole.path.name, folder / "metadata.yaml"
+    begin = whole.data.index(b"magnetosuture_thread") + len(b"magnetosuture_thread")
+    data = bytearray(whole.data)
+    data[begin : whole.chunks[0][0]] = bytes(whole.chunks[0][0] - begin)
+    file.write_bytes(data)
+    text = (whole.path.parent / "metadata.yaml").read_text()
+    told.write_text(text)
+    bag = Bag(folder)
+    assert bag.damage is not None
+    assert bag.notes == whole.notes
+    told.write_text(text.replace("simulated: ", "simulated: not "))
+    assert Bag(folder).notes == {}  # not what our writer wrote
+    told.write_text(text.replace("custom_data:", "custom_data: 5 #"))
+    assert Bag(folder).notes == {}

@@ -75,12 +75,13 @@ class McapWriter:
 
     Args:
         stream: of the file, without a buffer.
+        words: about the file, by the name of their record; they stand at its head, where a cut leaves them.
 
     Raises:
         OSError: the disk is full, or fails.
     """
 
-    def __init__(self, stream: BinaryIO) -> None:
+    def __init__(self, stream: BinaryIO, words: Mapping[str, Mapping[str, str]]) -> None:
         self._stream = stream
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -90,6 +91,8 @@ class McapWriter:
         self._packer = zstandard.ZstdCompressor()
         self._state = _State(0, 0, 0, Counter(), None, 0, OpenChunk())
         self._state = self._appended(MAGIC + as_bytes(Header("ros2", "magnetosuture_thread")))
+        self._told: list[MetadataIndex] = []
+        self._tell(words)
 
     @property
     def counts(self) -> Counter[int]:
@@ -181,21 +184,17 @@ class McapWriter:
             waiting=OpenChunk(),
         )
 
-    def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        """Write words about the file and the summary, and close the file; all messages must be flushed before.
+    def finish(self, words: Mapping[str, Mapping[str, str]]) -> None:
+        """Write more words about the file and the summary, and close the file; all messages must be flushed before.
 
         Raises:
             OSError: it cannot be done. The file ends with the last whole chunk.
         """
         chunks = self._state
-        told: list[MetadataIndex] = []
         try:
-            for name, words in metadata.items():
-                record = as_bytes(Metadata(name, dict(words)))
-                told.append(MetadataIndex(self._state.size, len(record), name))
-                self._state = self._appended(record)
+            self._tell(words)
             self._state = self._appended(as_bytes(DataEnd(self._state.crc)))
-            self._state = self._appended(self._summary(told))
+            self._state = self._appended(self._summary())
             os.fsync(self._stream.fileno())
         except OSError:
             self._state = chunks
@@ -206,6 +205,14 @@ class McapWriter:
     def abandon(self) -> None:
         """Close the file as it is, without a summary: it ends with the last whole chunk."""
         self._stream.close()
+
+    def _tell(self, words: Mapping[str, Mapping[str, str]]) -> None:
+        """Write words about the file, a record for each name."""
+        for name, entries in words.items():
+            record = as_bytes(Metadata(name, dict(entries)))
+            told = MetadataIndex(self._state.size, len(record), name)
+            self._state = self._appended(record)
+            self._told.append(told)
 
     def _appended(self, data: bytes) -> _State:
         """Write all of it or nothing, and return what is on the disk then."""
@@ -223,7 +230,7 @@ class McapWriter:
         self._stream.seek(self._state.size)
         self._stream.truncate()
 
-    def _summary(self, metadata: list[MetadataIndex]) -> bytes:
+    def _summary(self) -> bytes:
         """Return all that follows the data."""
         data, at = b"", self._state.size
         offsets = RecordBuilder()
@@ -235,7 +242,7 @@ class McapWriter:
             message_count=self.counts.total(),
             message_end_time=self.end,
             message_start_time=self.start or 0,
-            metadata_count=len(metadata),
+            metadata_count=len(self._told),
             schema_count=len(self._schemas),
         )
         for opcode, group in (
@@ -243,7 +250,7 @@ class McapWriter:
             (Opcode.CHANNEL, as_bytes(*self._channels.values())),
             (Opcode.STATISTICS, as_bytes(statistics)),
             (Opcode.CHUNK_INDEX, b"".join(self._index[: self.chunks])),
-            (Opcode.METADATA_INDEX, as_bytes(*metadata)),
+            (Opcode.METADATA_INDEX, as_bytes(*self._told)),
         ):
             if group:
                 SummaryOffset(opcode, at + len(data), len(group)).write(offsets)
