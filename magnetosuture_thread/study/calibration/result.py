@@ -15,6 +15,7 @@ from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.study.calibration.passage import Passage
 from magnetosuture_thread.study.calibration.replays import across, errors, mean_error
 
+WORSE = 1.05  # times the error before, from which on a person should know
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
 
 
@@ -84,7 +85,8 @@ class Score:
         truth_before: against the truth, with what the set-up says.
         truth_after: calibrated.
         truth_held_out: calibrated by the other bags.
-        across_after: mean distance across the thread, which is what was made least.
+        across_before: mean distance across the thread, with what the set-up says.
+        across_after: calibrated; this is what was made least.
     """
 
     name: str
@@ -95,7 +97,22 @@ class Score:
     truth_before: float = math.nan
     truth_after: float = math.nan
     truth_held_out: float = math.nan
+    across_before: float = math.nan
     across_after: float = math.nan
+
+    @property
+    def warning(self) -> str:
+        """What a person should know of a bag whose nodes are farther off than before, in words; else empty."""
+        if not self.after > WORSE * self.before:
+            return ""
+        better = self.across_after <= self.across_before
+        end = "what is left lies along it, where noise moves what is seen" if better else "do not use"
+        return (
+            f"{self.name}: the nodes are {self.after:.3g} % of the length off after the fit, {self.before:.3g} % "
+            "before; "
+            f"across the thread, which is what was fitted, {self.across_after:.3g} % after, {self.across_before:.3g} % "
+            f"before: {end}"
+        )
 
 
 @dataclass(frozen=True)
@@ -158,7 +175,7 @@ class Calibration:
                 lines.append(f"{estimate.name} cannot be identified in this data: {estimate.reason}")
         if self.attachment is not None and self.attachment.reason:
             lines.append(f"the attachment cannot be told: {self.attachment.reason}")
-        return lines
+        return lines + [score.warning for score in self.scores if score.warning]
 
     @property
     def error(self) -> float:
@@ -203,7 +220,9 @@ def score_of(passage: Passage, before: Points, after: Points, length: float, hel
     def mean(vertices: Points | None, targets: Points) -> float:
         return math.nan if vertices is None else mean_error(errors(vertices, targets, length))
 
-    apart = np.abs(across(after, passage, length))[passage.known]
+    def apart(vertices: Points) -> float:
+        return 100.0 * float(np.abs(across(vertices, passage, length))[passage.known].mean())
+
     return Score(
         passage.name,
         len(passage.frames),
@@ -213,7 +232,8 @@ def score_of(passage: Passage, before: Points, after: Points, length: float, hel
         mean(before, passage.truths),
         mean(after, passage.truths),
         mean(held_out, passage.truths),
-        100.0 * float(apart.mean()),
+        apart(before),
+        apart(after),
     )
 
 

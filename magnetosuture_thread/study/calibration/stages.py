@@ -39,7 +39,7 @@ class Stages:
     def end(self, line: str) -> None:
         """Say what a stage came to."""
         best = self._best
-        self._say(f"{line}; best error {best.error:.3g} % of the length after {best.replays} replays")
+        self._say(f"{line}; least distance of the nodes {best.error:.3g} % of the length after {best.replays} replays")
 
     def done(self) -> None:
         """Say that all is done."""

@@ -162,3 +162,14 @@ def test_tables_and_lines_say_what_is_there():
     assert lines[-1] == "simulated: a/bag"
     assert math.isclose(values["bags"][0]["held_out"], 0.5)
     assert values["bags"][1]["held_out"] is None
+
+
+def test_nodes_that_are_farther_off_after_the_fit_are_a_warning():
+    assert Score("a", 100, 0.2, 0.2, across_before=0.1, across_after=0.05).warning == ""
+    assert Score("a", 100, math.nan, math.nan).warning == ""
+    words = Score("a", 100, 0.15, 0.21, across_before=0.1, across_after=0.05).warning
+    assert words.startswith("a: the nodes are 0.21 % of the length off after the fit, 0.15 % before")
+    assert (
+        "across the thread, which is what was fitted, 0.05 % after, 0.1 % before: what is left lies along it" in words
+    )
+    assert Score("a", 100, 0.15, 0.21, across_before=0.1, across_after=0.2).warning.endswith("do not use")
