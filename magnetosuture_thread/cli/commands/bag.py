@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -16,6 +17,7 @@ from magnetosuture_thread.cli.command import DONE, Subparsers, command
 from magnetosuture_thread.cli.terminal import make_console, printable, progress, sayer, write_json
 
 DAMAGED = 1
+LONGEST_NOTE = 200  # characters of a note that are shown; one may hold a whole scenario
 
 DESCRIPTION = """\
 Look through a bag, or make a whole one of what is intact in it. BAG is an mcap or sqlite3 file of any
@@ -112,7 +114,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         if topic["unreadable_stamps"]:
             lines.append(f"{name}: {topic['unreadable_stamps']} stamps cannot be read")
     lines += ["; ".join(f"{key} {value}" for key, value in file.items()) for file in found["files"]]
-    lines += [f"{key}: {' '.join(value.split())[:80]}" for key, value in found["notes"].items()]
+    lines += [f"{key}: {shorten(value, LONGEST_NOTE, placeholder=' ...')}" for key, value in found["notes"].items()]
     if found["unchecked"]:
         lines.append(found["unchecked"])
     lines += [
