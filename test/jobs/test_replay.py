@@ -9,7 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -147,36 +148,49 @@ def test_a_window_of_a_bag_of_poses_is_played_without_a_tracker(pose_bag: Path, 
     agree(tmp_path / "out", tmp_path / "offline", predictions=31)
 
 
-def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag: Path, tmp_path: Path):
-    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(pose_bag)]
-    process = subprocess.Popen(
-        [*command, "--output", "out", "--loop"],
-        cwd=tmp_path,
+@contextmanager
+def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """Give a process that is ended by Ctrl-C if the test fails: one that goes on disturbs all others."""
+    with subprocess.Popen(
+        command,
+        cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # A test run in a shell's background inherits an ignored SIGINT; a user's terminal does not.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    assert process.stdout is not None
-    lines = iter(process.stdout)
-    said = next(line for line in lines if "to pause: " in line)
-    found = re.search(r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) std_srvs/srv/SetBool", said)
-    assert found is not None
-    with Watch(int(found[1]), found[2]) as watch:
-        watch.pause(True)
-        stood = watch.newest()
-        watch.spin(0.5)
-        assert watch.newest() == stood
-        watch.pause(False)
-        watch.spin_until(lambda: watch.newest() > stood)
-        assert any("playing on until Ctrl-C" in line for line in lines)
-        assert not (tmp_path / "out").exists()
-        watch.spin_until(lambda: watch.predicted[-1] < max(watch.predicted))
-        again = len(watch.predicted)
-        watch.spin_until(lambda: len(watch.predicted) > again + 10)
-        assert sorted(watch.predicted[again:]) == watch.predicted[again:]
-    process.send_signal(signal.SIGINT)
-    shown, errors = process.communicate(timeout=30)
+    ) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                process.communicate(timeout=30)
+
+
+def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag: Path, tmp_path: Path):
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(pose_bag)]
+    with started([*command, "--output", "out", "--loop"], tmp_path) as process:
+        assert process.stdout is not None
+        lines = iter(process.stdout)
+        said = next(line for line in lines if "to pause: " in line)
+        found = re.search(r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) std_srvs/srv/SetBool", said)
+        assert found is not None
+        with Watch(int(found[1]), found[2]) as watch:
+            watch.pause(True)
+            stood = watch.newest()
+            watch.spin(0.5)
+            assert watch.newest() == stood
+            watch.pause(False)
+            watch.spin_until(lambda: watch.newest() > stood)
+            assert any("playing on until Ctrl-C" in line for line in lines)
+            assert not (tmp_path / "out").exists()
+            watch.spin_until(lambda: bool(watch.predicted) and watch.predicted[-1] < max(watch.predicted))
+            again = len(watch.predicted)
+            watch.spin_until(lambda: len(watch.predicted) > again + 10)
+            assert sorted(watch.predicted[again:]) == watch.predicted[again:]
+        process.send_signal(signal.SIGINT)
+        shown, errors = process.communicate(timeout=30)
     assert (process.returncode, errors) == (0, "")
     assert "results: out" in shown
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -347,23 +361,15 @@ def test_a_bag_in_which_nothing_is_seen_fails_and_leaves_nothing(short_bag: Path
 def test_an_interrupted_replay_ends_its_nodes_and_leaves_nothing(tmp_path: Path, end: signal.Signals):
     example = Path(__file__).parents[2] / "examples" / "post_wrap"
     command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(example), "--output", "out"]
-    process = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # A test run in a shell's background inherits an ignored SIGINT; a user's terminal does not.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.startswith("playing"):
-            break
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    assert len(children) == 3
-    process.send_signal(end)
-    _, errors = process.communicate(timeout=30)
+    with started(command, tmp_path) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("playing"):
+                break
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        assert len(children) == 3
+        process.send_signal(end)
+        _, errors = process.communicate(timeout=30)
     assert process.returncode == 1
     assert "interrupted" in errors
     assert "Traceback" not in errors
