@@ -72,3 +72,28 @@ def of_material(
     if len(attachment_offset):
         values["attachment_offset"] = list(attachment_offset)
     return values
+
+
+def told_obstacles(message: Any) -> dict[str, Any]:
+    """Return `of_obstacles` for an ObstacleSet, whoever decoded it: rclpy's and the bags' have the same fields."""
+    discs = [(disc.x, disc.y, disc.radius) for disc in message.discs]
+    polygons = [[_ring(outline) for outline in (polygon.outline, *polygon.holes)] for polygon in message.polygons]
+    return of_obstacles(discs, polygons, [float(radius) for radius in message.corner_radius])
+
+
+def told_material(message: Any) -> dict[str, Any]:
+    """Return `of_material` for a ThreadMaterial, whoever decoded it."""
+    return of_material(
+        name=message.name,
+        diameter=message.diameter,
+        elastic_modulus=message.elastic_modulus,
+        viscosity=message.viscosity,
+        drag_anisotropy=message.drag_anisotropy,
+        rest_curvature=[float(curvature) for curvature in message.rest_curvature],
+        attachment=message.attachment,
+        attachment_offset=[float(part) for part in message.attachment_offset],
+    )
+
+
+def _ring(outline: Any) -> Ring:
+    return [(corner.x, corner.y) for corner in outline.corners]

@@ -11,7 +11,6 @@ from geometry_msgs.msg import Vector3
 from magnetosuture_msgs.msg import (
     BarrierMargin,
     ObstacleSet,
-    Outline,
     PredictedThread,
     SafetyMargins,
     ThreadMaterial,
@@ -121,24 +120,9 @@ def obstacle_values(message: ObstacleSet) -> dict[str, Any]:
         InvalidInputError: wrong frame.
     """
     require_dish_frame(message.header.frame_id, OBSTACLE_SET.name)
-    discs = [(disc.x, disc.y, disc.radius) for disc in message.discs]
-    polygons = [[_ring(outline) for outline in (polygon.outline, *polygon.holes)] for polygon in message.polygons]
-    return changes.of_obstacles(discs, polygons, message.corner_radius)
-
-
-def _ring(outline: Outline) -> list[tuple[float, float]]:
-    return [(corner.x, corner.y) for corner in outline.corners]
+    return changes.told_obstacles(message)
 
 
 def material_values(message: ThreadMaterial) -> dict[str, Any]:
     """Return the settings, by name, that a material changes."""
-    return changes.of_material(
-        name=message.name,
-        diameter=message.diameter,
-        elastic_modulus=message.elastic_modulus,
-        viscosity=message.viscosity,
-        drag_anisotropy=message.drag_anisotropy,
-        rest_curvature=message.rest_curvature,
-        attachment=message.attachment,
-        attachment_offset=message.attachment_offset,
-    )
+    return changes.told_material(message)
