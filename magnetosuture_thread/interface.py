@@ -41,6 +41,8 @@ CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo")
 NEEDLE_POSE = Channel("needle/measured_cp", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRACKER_STATE = Channel("needle/tracker_state", "magnetosuture_msgs/msg/TrackerState")
 TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped")
+OPERATOR_COMMAND = Channel("operator/servo_cv", "geometry_msgs/msg/TwistStamped")  # a wish, for thread_model to filter
+STEERING_STATE = Channel("operator/steering_state", "magnetosuture_msgs/msg/SteeringState")
 NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
 NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
 SEEN_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
@@ -56,6 +58,9 @@ DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
 # Services of the coil bridge, of std_srvs: SetBool, Trigger and Trigger.
 ARM, EMERGENCY_STOP, RESET = "coils/arm", "coils/emergency_stop", "coils/reset"
+
+# Services of std_srvs/SetBool that let time stand still: of a replayed bag, of the simulated rig.
+PAUSE_REPLAY, PAUSE_RIG = "replay/pause", "rig/pause"
 
 # What only a simulation knows; never an input of the graph.
 TRUE_NEEDLE = Channel("truth/needle", "geometry_msgs/msg/PoseStamped")

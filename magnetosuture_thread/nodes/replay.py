@@ -16,13 +16,12 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS
+from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, PAUSE_REPLAY
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.coil_messages import command_stamp
 from magnetosuture_thread.nodes.replay_losses import Losses
 from magnetosuture_thread.nodes.replay_time import Timeline
 
-PAUSE = "replay/pause"  # service, std_srvs/SetBool
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
 STILL_PERIOD = 0.1  # s of real time between two messages on /clock while it stands still
 START_TIMEOUT = 180.0  # s for all nodes to be there
@@ -101,7 +100,7 @@ class LiveReplay:
         self._node = rclpy.create_node("replay", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._node.create_service(SetBool, PAUSE, self._on_pause)
+        self._node.create_service(SetBool, PAUSE_REPLAY, self._on_pause)
         self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
         self._inputs = {
             topic.channel.recorded: self._node.create_publisher(topic.message, topic.name, _lossless(topic.qos))
