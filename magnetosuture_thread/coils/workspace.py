@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import NeedleMechanics
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.arc import needle_axis
+from magnetosuture_thread.geometry.arc import needle_points
 from magnetosuture_thread.geometry.half_planes import ROUNDING, nearest_within
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings, SurroundingsData, find_near
 from magnetosuture_thread.geometry.polyline import Points
@@ -83,15 +83,11 @@ class Workspace:
     ) -> None:
         self._radius, self._keep, self._rate, self._needle = radius, clearance, rate, needle
         spacing = min(COARSEST, max(FINEST, 0.5 * clearance))
-        pieces = 2 * math.ceil(0.5 * needle.length / spacing - 1e-9)  # even, so that the middle is among the points
-        body, _ = needle_axis(np.zeros(2), 0.0, needle.length, needle.curvature, np.linspace(0.0, 1.0, pieces + 1))
-        lever = 0.5 * needle.chord
-        apart = (body - lever * needle.chord_direction(np.array([1.0, 0.0]))) / lever
-        turning = np.column_stack([-apart[:, 1], apart[:, 0]])
+        body = needle_points(needle.length, needle.curvature, spacing)
         # Both turn with the heading, and by one product.
-        self._shape = np.vstack([body, turning])
+        self._shape = np.vstack([body.points, body.turning])
         # No point of the body moves faster than this many times the tip velocity.
-        self._fastest_point = math.hypot(1.0, float(np.hypot(*turning.T).max()))
+        self._fastest_point = math.hypot(1.0, float(np.hypot(*body.turning.T).max()))
         # Two searches: the quick one knows what is near only, the other reaches through all of the dish.
         reach = min(4.0 * radius, clearance + self._fastest_point * fastest / rate)
         self._near = Surroundings(obstacles, reach).data
