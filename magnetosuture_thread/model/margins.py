@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.barriers.rows import BarrierKind
+from magnetosuture_thread.model.friction import UNKNOWN, Friction
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Margins:
         clearance: the same margin as a distance [m].
         least: of each kind present.
         touching: nodes that touch an obstacle, rising.
+        friction: between obstacles.
     """
 
     kind: NDArray[np.uint8]
@@ -52,14 +54,16 @@ class Margins:
     clearance: NDArray[np.float64]
     least: tuple[LeastBarrier, ...]
     touching: tuple[int, ...]
+    friction: Friction = UNKNOWN
 
     @classmethod
-    def of(cls, barriers: Sequence[BarrierRows], contact_tolerance: float) -> Margins:
+    def of(cls, barriers: Sequence[BarrierRows], contact_tolerance: float, friction: Friction = UNKNOWN) -> Margins:
         """Put the barriers of all kinds together.
 
         Args:
             barriers: the rows of each kind, in SI units.
             contact_tolerance: a node this close to an obstacle touches it [m].
+            friction: between obstacles.
         """
         count = sum(len(rows.value) for rows in barriers)
         whole = cls(
@@ -70,6 +74,7 @@ class Margins:
             np.empty(count),
             tuple(_least(rows) for rows in barriers if len(rows.value)),
             _touching(barriers, contact_tolerance),
+            friction,
         )
         begin = 0
         for rows in barriers:

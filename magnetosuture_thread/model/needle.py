@@ -2,39 +2,53 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.geometry.arc import NeedlePoints, needle_points
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Solver
 
 UNIT = 1e-3  # m; what the filter's program counts in, so that its residuals are scaled
-RECOVERING = 1e-7  # compliance of a row that has to push the needle out
+SPACING = 5e-4  # m; of the points that stand for the needle's body at the most
+LEAVING = 0.1  # of the speed asked for, at which a needle that is too near leaves while it moves
+YIELDING = 1e-3  # compliance of a row that asks to leave: it gives way where two ask for the opposite
+_POINT = NeedlePoints(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(2))
 
 
 @dataclass(frozen=True)
 class NeedleFilter:
     """Changes the commanded velocity of the needle as little as its obstacle barriers ask for.
 
-        minimise over u_0   1/2 |u_0 - v_0|^2
-        subject to          n' u_0 >= -alpha h_obs,needle,O    for every obstacle O that is near
+        minimise over u   1/2 |u - v|^2
+        subject to        n' J_p u >= -alpha max(h, 0)       for every point p of the needle, and
+                          h = sd_O(p) - rho                  every obstacle O that is near it
 
-    From outside of the safe set, h < 0, the same row leads back into it, at the rate alpha.
+    A needle without a length is the point where the thread begins, and J = 1. Else u is the velocity of its
+    tip: along the needle's chord it is driven, across it turns about the chord's middle, and J_p u is what
+    that moves the point p by. All rows are hard. Rest is always allowed, and nothing but a command ever moves
+    the needle: where it is too near already, h < 0, it may leave or slide along but go no deeper, and while
+    it is told to move it leaves, at up to a tenth of the speed.
 
     Source: [Forghani2025], h_obs,needle,O and the controller's part in u_0. Deviation: connectivity does
     not act on the needle, so its part of the program stands alone and is solved alone; h is the signed
-    distance, see `ObstacleAvoidance`.
+    distance, see `ObstacleAvoidance`; max(h, 0) for h, as the source's row would push a needle that nobody
+    asked to move; the body.
 
     Attributes:
         surroundings: the obstacles [m]; a needle farther from them than their reach goes where it is told.
-        distance: rho, least distance of the needle's tail from a surface [m].
+        distance: rho, least distance of the needle's axis from a surface [m].
         gain: alpha [1/s].
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
+        length: of the needle along its body; 0 for a point [m].
+        curvature: of its arc, positive to the left of its heading [1/m].
     """
 
     surroundings: Surroundings
@@ -42,25 +56,59 @@ class NeedleFilter:
     gain: float
     solver: Solver
     tolerance: float = 1e-6
+    length: float = 0.0
+    curvature: float = 0.0
 
-    def safe_velocity(self, position: Points, commanded: Points) -> NDArray[np.float64]:
-        """Return the velocity to go with, shape (d,) [m/s].
+    @cached_property
+    def _needle(self) -> NeedlePoints:
+        return needle_points(self.length, self.curvature, SPACING) if self.length > 0.0 else _POINT
+
+    def safe_velocity(self, tail: Points, heading: Points, commanded: Points) -> NDArray[np.float64]:
+        """Return the velocity to go with, shape (2,) [m/s]; of the tip, or of a needle that is a point.
 
         Args:
-            position: of the needle's tail, shape (d,) [m].
-            commanded: v_0, shape (d,) [m/s].
+            tail: the needle's tail, shape (2,) [m].
+            heading: unit vector along the needle at its tail, shape (2,).
+            commanded: v, shape (2,) [m/s].
 
         Raises:
-            InvalidInputError: a position or a velocity is not finite.
+            InvalidInputError: a position, a heading or a velocity is not finite.
             SolverError: the solution's residual is above the tolerance.
         """
-        for name, value in (("needle position", position), ("needle velocity", commanded)):
+        for name, value in (("needle position", tail), ("needle heading", heading), ("needle velocity", commanded)):
             if not np.all(np.isfinite(value)):
                 raise InvalidInputError(name, np.asarray(value).tolist(), "finite coordinates")
-        dimension, near = self.surroundings.dimension, self.surroundings.near(position[None, :])
+        points, turning, chord = self._needle.turned(heading)
+        near = self.surroundings.near(tail + points)
         margin = (near.distance - self.distance) / UNIT
-        gradient = np.zeros((len(near), SPAN, dimension))
-        gradient[:, 0] = near.outward
+        across = np.array([-chord[1], chord[0]])
+        rows = near.outward
+        if self.length > 0.0:
+            along = np.einsum("ij,j->i", near.outward, chord)
+            aside = np.einsum("ij,ij->i", near.outward, turning[near.node])
+            rows = along[:, None] * chord + aside[:, None] * across
+        lower = -self.gain * np.maximum(margin, 0.0)
+        speed = math.hypot(*(np.asarray(commanded) / UNIT).tolist())
+        beyond = np.flatnonzero(margin < 0.0)
+        leaving = np.minimum(-self.gain * margin[beyond], LEAVING * speed)
+        return self._solved(
+            np.asarray(commanded, dtype=np.float64),
+            np.vstack([rows, rows[beyond]]),
+            np.concatenate([lower, leaving]),
+            np.concatenate([np.zeros(len(rows)), np.full(len(beyond), YIELDING)]),
+        )
+
+    def _solved(
+        self,
+        commanded: Points,
+        rows: NDArray[np.float64],
+        lower: NDArray[np.float64],
+        compliance: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return the solution of the program over u, of which each row asks  row . u >= lower."""
+        dimension, count = len(commanded), len(lower)
+        gradient = np.zeros((count, SPAN, dimension))
+        gradient[:, 0] = rows
         linear = np.zeros((SPAN, dimension))  # the smallest chain; its other nodes are known
         linear[0] = -commanded / UNIT
         program = ChainProgram(
@@ -68,13 +116,13 @@ class NeedleFilter:
             couplings=np.zeros((SPAN, SPAN)),
             linear=linear,
             known=np.arange(SPAN) > 0,
-            first=np.zeros(len(near), dtype=np.int64),
+            first=np.zeros(count, dtype=np.int64),
             gradient=gradient,
-            lower=-self.gain * margin,
-            upper=np.full(len(near), np.inf),
-            compliance=np.where(margin < 0.0, RECOVERING, 0.0),
+            lower=lower,
+            upper=np.full(count, np.inf),
+            compliance=compliance,
         )
-        solution = self.solver.solve(program, -linear, np.zeros(len(near)))
+        solution = self.solver.solve(program, -linear, np.zeros(count))
         if not solution.residuals.largest <= self.tolerance:
             raise SolverError(solution.solver, solution.status, solution.residuals.largest, self.tolerance)
         return np.asarray(UNIT * solution.velocities[0])

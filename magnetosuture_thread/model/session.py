@@ -4,21 +4,41 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.friction import FrictionLaw
+from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import FARTHEST, NeedlePose, Prediction
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.model.steering import Steered, at_rest, steered
 from magnetosuture_thread.model.thread import Thread
 
 EARLY = 30  # poses that may wait for the centreline of their frame
 REPLAYED = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
 WAITING = "waiting for the thread to be seen"
 _OBSTACLES = (Disc((0.0, 0.0), 1e-3), Polygon(((0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3))))  # one of each kind
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What the margins of a prediction take besides it.
+
+    Attributes:
+        law: of friction.
+        contact_tolerance: a node this close to an obstacle touches it [m].
+        speeds: of each node, shape (n + 1,) [m/s].
+    """
+
+    law: FrictionLaw
+    contact_tolerance: float
+    speeds: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -29,11 +49,21 @@ class Outcome:
         stamp: of the pose [ns].
         prediction: of the thread; None where there is none.
         problem: why there is none; None while the thread is waited for.
+        proof: for its margins; None where there is no prediction.
     """
 
     stamp: int
     prediction: Prediction | None = None
     problem: InvalidInputError | SolverError | None = None
+    proof: Proof | None = field(default=None, repr=False, compare=False)
+
+    @cached_property
+    def margins(self) -> Margins | None:
+        """All margins, worked out when first asked for; None where they prove nothing, as the step did not converge."""
+        if self.prediction is None or self.proof is None or not self.prediction.converged:
+            return None
+        friction = self.proof.law.judge(self.prediction.margins, self.proof.speeds)
+        return Margins.of(self.prediction.margins, self.proof.contact_tolerance, friction)
 
     @property
     def waiting(self) -> bool:
@@ -65,6 +95,9 @@ class ThreadSession:
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=EARLY)
         self._last: int | None = None
+        self._needle, self._motion = settings.needle_filter(), settings.node_motion()
+        self._proven: tuple[Outcome, NeedlePose] | None = None
+        self._needle.safe_velocity(np.zeros(2), np.array([1.0, 0.0]), np.zeros(2))  # compiled now
 
     @property
     def thread(self) -> Thread:
@@ -82,11 +115,12 @@ class ThreadSession:
         """
         if settings == self.settings:
             return lambda: None
-        predictor = settings.predictor()
+        predictor, needle, motion = settings.predictor(), settings.needle_filter(), settings.node_motion()
 
         def put_in_force() -> None:
             predictor.follow_on(self._predictor)
-            self.settings, self._predictor = settings, predictor
+            motion.follow_on(self._motion)
+            self.settings, self._predictor, self._needle, self._motion = settings, predictor, needle, motion
 
         return put_in_force
 
@@ -131,7 +165,7 @@ class ThreadSession:
         """
         if self._last is not None and stamp < self._last - REPLAYED:
             self._predictor.reset()
-            self._last = None
+            self._last = self._proven = None
             self._early.clear()
             if self._seen is not None and self._seen[0] > stamp:
                 self._seen = None  # of the time before it was set back
@@ -147,7 +181,35 @@ class ThreadSession:
         except (InvalidInputError, SolverError) as error:
             return Outcome(stamp, problem=error)
         self._last = stamp
-        return Outcome(stamp, prediction)
+        settings, speeds = self.settings, self._motion.take(prediction.vertices, prediction.interval)
+        proof = Proof(settings.friction_law(), settings.contact_tolerance, speeds)
+        outcome = Outcome(stamp, prediction, proof=proof)
+        if prediction.converged:
+            self._proven = outcome, pose
+        return outcome
+
+    def on_asked(self, stamp: int, velocity: NDArray[np.float64]) -> Steered:
+        """Filter the velocity that an operator asks of the needle, by the thread as last predicted.
+
+        Where the needle is goes by its last pose that gave a prediction. Without one that is new enough nobody knows
+        what the needle would do to the thread, and it is told to rest.
+
+        Args:
+            stamp: when it was asked for [ns].
+            velocity: of the needle's tip, shape (2,) [m/s].
+
+        Raises:
+            InvalidInputError: the velocity is not finite, or beyond 1 m/s.
+            SolverError: the filter's program has no solution.
+        """
+        if self._proven is None:
+            return at_rest(velocity, "no predicted thread yet")
+        outcome, pose = self._proven
+        age = (stamp - outcome.stamp) * 1e-9
+        if not abs(age) <= self.settings.steering_timeout:
+            return at_rest(velocity, f"the last predicted thread is {age:.2f} s old")
+        assert outcome.margins is not None
+        return steered(self._needle, outcome.margins.friction, pose.tail, pose.heading, velocity)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":

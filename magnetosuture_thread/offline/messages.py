@@ -58,7 +58,7 @@ def path_message(stamp: int, points: Points) -> Any:
 
 def tracker_state(stamp: int, track: Track) -> Any:
     """Return what the tracker makes of a frame; how long it took is no property of the frame, and told as 0."""
-    found = track.state is State.TRACKED
+    found, view = track.state is State.TRACKED, track.view
     return make(
         TRACKER_STATE.type_name,
         header=header(stamp),
@@ -67,6 +67,9 @@ def tracker_state(stamp: int, track: Track) -> Any:
         confidence=float(track.confidence) if found else 0.0,
         curvature=float(track.curvature) if found else 0.0,
         processing_time=0.0,
+        dish_centre=np.array(view.centre_px if view else (), dtype=np.float64),
+        metres_per_pixel=view.metres_per_pixel if view else 0.0,
+        camera_rotation=view.rotation if view else 0.0,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magnetosuture_thread.interface import DISH_FRAME
+from magnetosuture_thread.model.friction import FrictionState
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import Prediction
 
@@ -60,9 +61,12 @@ def packed_margins(stamp: int, margins: Margins | None, reason: str = "") -> byt
     time = divmod(stamp, 10**9)
     if margins is None:
         words = _text(reason)
-        return _BEGIN + _no_margins_form(words[0]).pack(*time, *_DISH, False, *words, *[0] * 6, _UNKNOWN, 0)
+        return _BEGIN + _no_margins_form(words[0]).pack(
+            *time, *_DISH, False, *words, *[0] * 6, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
+        )
     count = len(margins.kind)
-    form = _margins_form(count, len(margins.least), len(margins.touching))
+    friction = margins.friction
+    form = _margins_form(count, len(margins.least), len(margins.touching), len(friction.nodes))
     return _BEGIN + form.pack(
         *time,
         *_DISH,
@@ -87,6 +91,10 @@ def packed_margins(stamp: int, margins: Margins | None, reason: str = "") -> byt
         _TOUCHING if margins.touching else _FREE,
         len(margins.touching),
         *margins.touching,
+        friction.state,
+        len(friction.nodes),
+        *friction.nodes,
+        friction.slowdown,
     )
 
 
@@ -117,16 +125,31 @@ def _prediction_form(
 
 
 @lru_cache(_KEPT)
-def _margins_form(barriers: int, least: int, touching: int) -> struct.Struct:
-    """Return the format of a SafetyMargins with so many barriers, least ones, and nodes that touch."""
+def _margins_form(barriers: int, least: int, touching: int, squeezed: int) -> struct.Struct:
+    """Return the format of a SafetyMargins with so many barriers, least ones, nodes that touch, and under friction."""
     arrays = [code for kind in "BIidd" for code in _array_codes(barriers, kind)]
-    return _form(*_HEADER, "?", *_text_codes(_NO_REASON[0]), *arrays, "I", *"BIidd" * least, "B", "I", *"I" * touching)
+    return _form(
+        *_HEADER,
+        "?",
+        *_text_codes(_NO_REASON[0]),
+        *arrays,
+        "I",
+        *"BIidd" * least,
+        *_nodes(touching),
+        *_nodes(squeezed),
+        "d",
+    )
 
 
 @lru_cache(_KEPT)
 def _no_margins_form(reason: int) -> struct.Struct:
     """Return the format of a SafetyMargins without any, but a reason of this length."""
-    return _form(*_HEADER, "?", *_text_codes(reason), *"IIIIII", "B", "I")
+    return _form(*_HEADER, "?", *_text_codes(reason), *"IIIIII", *_nodes(0), *_nodes(0), "d")
+
+
+def _nodes(count: int) -> tuple[str, ...]:
+    """Return the codes of a state and the nodes that it is about."""
+    return "B", "I", *"I" * count
 
 
 def _text_codes(length: int) -> tuple[str, ...]:

@@ -116,10 +116,7 @@ def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:
             waiting[outcome.stamp] = sight
         else:
             waiting.pop(outcome.stamp, None)
-        margins, prediction = None, outcome.prediction
-        if prediction is not None and prediction.converged:
-            margins = Margins.of(prediction.margins, session.settings.contact_tolerance)
-        return Step(sight, outcome, margins, taken, session.settings)
+        return Step(sight, outcome, outcome.margins, taken, session.settings)
 
     for sight in given:
         if isinstance(given, Sights):

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.geometry.arc import needle_points
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
 from magnetosuture_thread.model.needle import NeedleFilter
 from magnetosuture_thread.model.program import Residuals, Solver
 from magnetosuture_thread.model.solvers import BandedSolver, OsqpSolver
 
 DISC = Disc((0.0, 0.0), 2e-3)
+EAST = np.array([1.0, 0.0])
 CORNER = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.005, 0.01), (0.005, 0.005), (0.0, 0.005)))  # an L
 
 
@@ -20,7 +22,7 @@ def filtered(
 ) -> np.ndarray:
     """Return the safe velocity."""
     needle = NeedleFilter(Surroundings(obstacles, 5e-3), 2e-4, 20.0, solver or BandedSolver())
-    return needle.safe_velocity(np.array(position), np.array(commanded))
+    return needle.safe_velocity(np.array(position), EAST, np.array(commanded))
 
 
 def test_far_from_obstacles_the_needle_goes_where_it_is_told():
@@ -44,12 +46,41 @@ def test_in_a_concave_corner_it_stops():
 
 @pytest.mark.parametrize("position", [[1.5e-3, 0.0], [2.1e-3, 0.0], [0.0, -1e-3]])
 def test_from_outside_of_the_safe_set_it_comes_back(position: list[float]):
-    """A needle inside of the obstacle, or too near to it, recovers whatever it is told."""
+    """A needle inside of the obstacle, or too near to it, leaves at a tenth of the speed, whatever way it is told."""
     where = np.array(position)
     inwards = -5e-3 * where / np.linalg.norm(where)
-    for _ in range(200):
+    assert np.linalg.norm(filtered((DISC,), position, inwards.tolist())) == pytest.approx(5e-4, rel=0.02)
+    for _ in range(400):
         where = where + 0.01 * filtered((DISC,), where.tolist(), inwards.tolist())
     assert np.linalg.norm(where) == pytest.approx(2.2e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("position", [[1.5e-3, 0.0], [2.1e-3, 0.0], [2.2e-3, 0.0], [2.5e-3, 0.0]])
+def test_nobody_but_a_command_moves_the_needle(position: list[float]):
+    np.testing.assert_array_equal(filtered((DISC,), position, [0.0, 0.0]), [0.0, 0.0])
+
+
+@pytest.mark.parametrize("curvature", [0.0, 150.0, -150.0])
+def test_no_point_of_a_needle_enters(curvature: float):
+    """Driven and turned at random for long, next to a disc and in the corner of an L."""
+    random = np.random.default_rng(5)
+    surroundings = Surroundings((Disc((0.0, 9.5e-3), 1e-3), CORNER), 5e-3)
+    needle = NeedleFilter(surroundings, 2e-4, 20.0, BandedSolver(), length=4e-3, curvature=curvature)
+    body = needle_points(4e-3, curvature, 2.5e-4)
+    tail, angle, least = np.array([-2e-3, 7e-3]), 0.0, np.inf
+    asked = np.zeros(2)
+    for k in range(3000):
+        if k % 40 == 0:
+            asked = random.uniform(-8e-3, 8e-3, 2) + (np.array([2e-3, 7e-3]) - tail)
+        heading = np.array([np.cos(angle), np.sin(angle)])
+        velocity = needle.safe_velocity(tail, heading, asked)
+        points, turning, chord = body.turned(heading)
+        across = np.array([-chord[1], chord[0]])
+        turned = (velocity @ across) / (0.5 * np.linalg.norm(points[-1]))
+        tail = tail + 2e-3 * ((velocity @ chord) * chord + (velocity @ across) * turning[0])
+        angle += 2e-3 * turned
+        least = min(least, float(surroundings.near(tail + body.turned(heading)[0]).distance.min(initial=1.0)))
+    assert 0.0 < least < 3e-4  # it came near, and kept off
 
 
 def test_driven_at_an_obstacle_for_long_it_never_enters():
@@ -75,4 +106,4 @@ def test_bad_input_and_bad_solutions_are_refused():
             return super().solve(*arguments)._replace(residuals=Residuals(1.0, 0.0, 0.0))
 
     with pytest.raises(SolverError):
-        NeedleFilter(Surroundings((DISC,), 5e-3), 0.0, 20.0, Lying()).safe_velocity(np.zeros(2), np.zeros(2))
+        NeedleFilter(Surroundings((DISC,), 5e-3), 0.0, 20.0, Lying()).safe_velocity(np.zeros(2), EAST, np.zeros(2))

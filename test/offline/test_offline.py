@@ -31,6 +31,7 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.replay_offline import replay_offline
+from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState
 from magnetosuture_thread.offline.messages import header, make, path_message, pose_message
 from magnetosuture_thread.offline.packing import packed_margins, packed_prediction
 from magnetosuture_thread.offline.predictions import predictions, sights
@@ -297,12 +298,16 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
         assert (message.material, message.header.stamp.nanosec, message.step_time) == (material, 34, 0.0)
         assert np.array_equal([[p.x, p.y] for p in message.vertices], prediction.vertices)
         assert np.array_equal(message.stretch, prediction.stretch)
-    for given in (margins, replace(margins, touching=(3, 4)), None):
+    squeezed = Friction(FrictionState.PULLED, (2, 5, 6), 0.729)
+    for given in (margins, replace(margins, touching=(3, 4)), replace(margins, friction=squeezed), None):
         data = packed_margins(7, given, "" if given else "for a reason")
         message = store.deserialize_cdr(data, MARGINS.type_name)
         assert bytes(store.serialize_cdr(message, MARGINS.type_name)) == data
         assert message.valid == (given is not None)
         assert message.contact_state == (0 if given is None else 2 if given.touching else 1)
+        friction = given.friction if given else UNKNOWN
+        assert (message.friction_state, tuple(message.friction_nodes)) == (friction.state, friction.nodes)
+        assert message.slowdown == friction.slowdown
         if given is not None:
             assert np.array_equal(message.clearance, given.clearance)
             assert [entry.obstacle for entry in message.least] == [entry.obstacle for entry in given.least]

@@ -1,0 +1,110 @@
+"""Friction: between which obstacles a thread is squeezed, and what slows the needle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
+from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, ObstacleAvoidance
+from magnetosuture_thread.model.friction import (
+    UNKNOWN,
+    Friction,
+    FrictionLaw,
+    FrictionState,
+    NodeMotion,
+    friction_colour,
+)
+
+LAW = FrictionLaw(threshold=1e-3, beta=0.9, resting_speed=2e-4)
+NODES = np.column_stack([np.arange(0.0, -8e-3, -1e-3), np.zeros(8)])  # 0 is the needle
+
+
+def barriers(*discs: tuple[float, float, float]) -> list[BarrierRows]:
+    """Return the barriers of the nodes among discs x, y, radius."""
+    around = Surroundings([Disc((x, y), radius) for x, y, radius in discs], 5e-3)
+    return [Connectivity(1e-3).rows(NODES), ObstacleAvoidance(around, 0.0).rows(NODES)]
+
+
+# Two discs 0.9 mm above and below the nodes 3 and 4, and no other node.
+GATE = ((-3.5e-3, 1.9e-3, 1e-3), (-3.5e-3, -1.9e-3, 1e-3))
+
+
+def test_a_node_close_to_one_obstacle_is_free():
+    assert LAW.judge(barriers(GATE[0]), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
+    assert LAW.judge(barriers(), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
+
+
+def test_nodes_close_to_two_obstacles_slow_the_needle_while_pulled():
+    assert LAW.judge(barriers(*GATE), np.full(8, 1e-3)) == Friction(FrictionState.PULLED, (3, 4), 0.9**2)
+    third = (-3.5e-3, 1.85e-3, 1e-3)
+    assert LAW.judge(barriers(*GATE, third), np.full(8, 1e-3)).nodes == (3, 4)
+
+
+def test_who_moves_elsewhere_pulls_nothing():
+    speeds = np.full(8, 1e-3)
+    speeds[[3, 4]] = 2e-4
+    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.RESTING, (3, 4), 1.0)
+    speeds[4] = 2.1e-4  # one is enough
+    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.PULLED, (3, 4), 0.9**2)
+
+
+def test_the_threshold_is_of_the_clearance():
+    """At 0.96 mm from the discs; the threshold is not within."""
+    near = float(np.hypot(0.5e-3, 1.9e-3) - 1e-3)
+    for threshold, count in ((0.999 * near, 0), (1.001 * near, 2)):
+        assert len(FrictionLaw(threshold, 0.9, 0.0).judge(barriers(*GATE), np.ones(8)).nodes) == count
+
+
+def test_the_needle_itself_is_no_friction_of_the_thread():
+    at_needle = ((0.0, 1.9e-3, 1e-3), (0.0, -1.9e-3, 1e-3))
+    assert LAW.judge(barriers(*at_needle), np.ones(8)).state is FrictionState.FREE
+
+
+def test_speeds_are_averaged():
+    motion, still = NodeMotion(0.2), np.zeros((3, 2))
+    np.testing.assert_array_equal(motion.take(still, 0.0), np.zeros(3))
+    moved, interval = still.copy(), 0.1
+    expected = 0.0
+    for k in range(1, 6):
+        moved = still + np.array([1e-4 * k, 0.0])
+        expected += (1.0 - np.exp(-0.5)) * (1e-3 - expected)
+        np.testing.assert_allclose(motion.take(moved, interval), np.full(3, expected), rtol=1e-12)
+    back = NodeMotion(0.2)
+    back.follow_on(motion)
+    np.testing.assert_allclose(back.take(moved, interval), np.full(3, expected * np.exp(-0.5)), rtol=1e-12)
+
+
+def test_trembling_is_no_motion():
+    """A pose that is off by 0.02 mm, back and forth at 30 Hz, which is 1.2 mm/s from each to the next."""
+    motion, thread = NodeMotion(0.2), np.zeros((3, 2))
+    speeds = [motion.take(thread + np.array([(-1.0) ** k * 2e-5, 0.0]), 1.0 / 30.0).max() for k in range(60)]
+    assert max(speeds) < 2e-4
+
+
+def test_without_averaging_or_with_other_nodes_it_begins_anew():
+    motion = NodeMotion(0.0)
+    motion.take(np.zeros((3, 2)), 0.0)
+    np.testing.assert_allclose(motion.take(np.full((3, 2), 3e-4), 0.1), np.full(3, np.hypot(3e-3, 3e-3)))
+    np.testing.assert_array_equal(motion.take(np.ones((5, 2)), 0.1), np.zeros(5))
+
+
+def test_colours_tell_the_state():
+    def of(state: FrictionState, count: int = 0) -> tuple[float, float, float]:
+        return friction_colour(Friction(state, tuple(range(count)), 1.0))
+
+    free, blue = of(FrictionState.FREE), of(FrictionState.RESTING, 3)
+    assert free[1] == max(free)
+    assert blue[2] == max(blue)
+    shades = [of(FrictionState.PULLED, count) for count in (1, 5, 10, 20, 40)]
+    assert all(red > green > blue for red, green, blue in shades)
+    assert [green for _, green, _ in shades] == sorted((green for _, green, _ in shades), reverse=True)
+    assert len(set(shades)) == 4  # no deeper beyond twenty
+    assert len(set(friction_colour(UNKNOWN))) == 1
+
+
+@pytest.mark.parametrize("beta", [0.5, 0.9, 1.0])
+def test_each_node_counts_as_one_factor(beta: float):
+    slowed = FrictionLaw(2e-3, beta, 0.0).judge(barriers(*GATE), np.ones(8))
+    assert len(slowed.nodes) > 2
+    assert slowed.slowdown == pytest.approx(beta ** len(slowed.nodes))
