@@ -172,7 +172,13 @@ def _run(
 
             recorder = Recorder(domain, taken, simulated_clock=pace is not None, receive=receive)
             try:
-                perhaps = (topics.NEEDLE_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, *topics.SETTINGS)
+                perhaps = (
+                    topics.NEEDLE_COMMAND,
+                    topics.OPERATOR_COMMAND,
+                    topics.TIP_SETPOINT,
+                    topics.FAULT_REQUEST,
+                    *topics.SETTINGS,
+                )
                 _wait(recorder, nodes.check, {topic.name for topic in perhaps})
                 if boards:
                     _arm(CoilClient)

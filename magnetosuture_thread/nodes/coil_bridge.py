@@ -14,7 +14,7 @@ from magnetosuture_thread.coils.drivers import make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.station import CoilStation
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes import coil_messages, messages, topics
+from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.coil_report import CoilReport
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import run
@@ -101,7 +101,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if self.station.bridge is None:
             return
         try:
-            velocity, stamp = coil_messages.command_velocity(message), messages.seconds(message.header.stamp)
+            velocity = messages.plane_velocity(message, topics.NEEDLE_COMMAND.name)
+            stamp = messages.seconds(message.header.stamp)
             self.station.bridge.gate.accept(velocity, stamp, number, *self._times())
         except UNUSABLE as error:
             self._report.refuse(error)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TwistStamped, Vector3
 from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents
 from rclpy.serialization import deserialize_message
 
@@ -12,29 +10,13 @@ from magnetosuture_thread.coils.bridge import Outcome
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import Condition
 from magnetosuture_thread.coils.station import CoilStation
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes.messages import header, require_dish_frame
+from magnetosuture_thread.nodes.messages import header, vector
 
 _STATES = {
     Condition.INACTIVE: CoilBridgeState.STATE_INACTIVE,
     Condition.ACTIVE: CoilBridgeState.STATE_ACTIVE,
     Condition.FAULT: CoilBridgeState.STATE_FAULT,
 }
-
-
-def command_velocity(message: TwistStamped) -> np.ndarray:
-    """Return a velocity command in the dish plane, shape (2,) [m/s].
-
-    Raises:
-        InvalidInputError: wrong frame, or a motion that the needle cannot make: out of the plane, or a turn
-            apart from that which the tip's velocity amounts to.
-    """
-    require_dish_frame(message.header.frame_id, "needle/servo_cv")
-    linear, angular = message.twist.linear, message.twist.angular
-    others = [linear.z, angular.x, angular.y, angular.z]
-    if any(value != 0.0 for value in others):
-        raise InvalidInputError("needle/servo_cv.twist", f"linear.z, angular = {others}", "zeros: x and y alone count")
-    return np.array([linear.x, linear.y])
 
 
 def currents_message(stamp: Time, command: Time | None, outcome: Outcome) -> CoilCurrents:
@@ -77,16 +59,12 @@ def state_message(stamp: Time, station: CoilStation, driver: DriverState, refuse
         message.reasons = [latch.latched or "unconfigured"]
         return message
     message.reasons = list(outcome.reasons)
-    message.commanded = _vector(outcome.commanded)
-    message.applied = _vector(outcome.applied)
-    message.reached = _vector(outcome.allocation.velocity)
+    message.commanded = vector(outcome.commanded)
+    message.applied = vector(outcome.applied)
+    message.reached = vector(outcome.allocation.velocity)
     message.saturated = outcome.allocation.saturated
     message.current = outcome.allocation.currents.tolist()
     return message
-
-
-def _vector(velocity: np.ndarray) -> Vector3:
-    return Vector3(x=float(velocity[0]), y=float(velocity[1]))
 
 
 def command_stamp(data: bytes) -> int | None:

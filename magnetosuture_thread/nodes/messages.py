@@ -38,6 +38,13 @@ def stamp_of(nanoseconds: int) -> Time:
     return Time(sec=nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
 
 
+def checked_nanoseconds(stamp: Time, field: str) -> int:
+    """Return a stamp in nanoseconds, or refuse one with a second's or more beside its seconds."""
+    if stamp.nanosec >= 1_000_000_000:
+        raise InvalidInputError(f"{field}.header.stamp.nanosec", stamp.nanosec, "less than a second's")
+    return nanoseconds(stamp)
+
+
 def seconds(stamp: Time) -> float:
     """Return a stamp in seconds."""
     return nanoseconds(stamp) * 1e-9
@@ -92,6 +99,10 @@ def tracker_state(stamp: Time, track: Track, processing_time: float) -> TrackerS
     }
     message = TrackerState(header=header(stamp), state=numbers[track.state], reason=track.reason)
     message.processing_time = processing_time
+    if track.view is not None:
+        message.dish_centre = [float(pixels) for pixels in track.view.centre_px]
+        message.metres_per_pixel = float(track.view.metres_per_pixel)
+        message.camera_rotation = float(track.view.rotation)
     if track.state is State.TRACKED:
         message.confidence = float(track.confidence)
         message.curvature = float(track.curvature)
@@ -111,8 +122,7 @@ def needle_pose(message: PoseWithCovarianceStamped) -> NeedlePose:
     """
     require_dish_frame(message.header.frame_id, "needle/measured_cp")
     stamp = message.header.stamp
-    if stamp.nanosec >= 1_000_000_000:  # the prediction could not be stamped by it
-        raise InvalidInputError("needle/measured_cp.header.stamp.nanosec", stamp.nanosec, "less than a second's")
+    checked_nanoseconds(stamp, "needle/measured_cp")  # the prediction could not be stamped by another
     position, q = message.pose.pose.position, message.pose.pose.orientation
     heading = heading_of(q.x, q.y, q.z, q.w, "needle/measured_cp.pose.orientation")
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
@@ -152,10 +162,30 @@ def path_points(message: Path) -> np.ndarray:
     return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
 
 
+def plane_velocity(message: TwistStamped, field: str) -> np.ndarray:
+    """Return a velocity in the dish plane, shape (2,) [m/s].
+
+    Raises:
+        InvalidInputError: wrong frame, or a motion that the needle cannot make: out of the plane, or a turn
+            apart from that which the tip's velocity amounts to.
+    """
+    require_dish_frame(message.header.frame_id, field)
+    linear, angular = message.twist.linear, message.twist.angular
+    others = [linear.z, angular.x, angular.y, angular.z]
+    if any(value != 0.0 for value in others):
+        raise InvalidInputError(f"{field}.twist", f"linear.z, angular = {others}", "zeros: x and y alone count")
+    return np.array([linear.x, linear.y])
+
+
+def vector(velocity: np.ndarray) -> Vector3:
+    """Return a velocity of shape (2,) [m/s] as a vector."""
+    return Vector3(x=float(velocity[0]), y=float(velocity[1]))
+
+
 def twist_message(stamp: Time, velocity: np.ndarray) -> TwistStamped:
     """Return a velocity of shape (2,) [m/s] as a stamped twist."""
     message = TwistStamped(header=header(stamp))
-    message.twist.linear = Vector3(x=float(velocity[0]), y=float(velocity[1]))
+    message.twist.linear = vector(velocity)
     return message
 
 

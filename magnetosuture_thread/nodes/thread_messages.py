@@ -13,6 +13,7 @@ from magnetosuture_msgs.msg import (
     ObstacleSet,
     PredictedThread,
     SafetyMargins,
+    SteeringState,
     ThreadMaterial,
 )
 from rclpy.serialization import deserialize_message
@@ -23,12 +24,12 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, triangulate
 from magnetosuture_thread.interface import OBSTACLE_SET
 from magnetosuture_thread.model import changes
+from magnetosuture_thread.model.friction import Friction, friction_colour
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import Prediction
-from magnetosuture_thread.nodes.messages import flat_pose, header, point_list, require_dish_frame
+from magnetosuture_thread.model.steering import Steered
+from magnetosuture_thread.nodes.messages import flat_pose, header, point_list, require_dish_frame, vector
 from magnetosuture_thread.nodes.topics import Topic
-
-FULL_COLOUR_CLEARANCE = 1e-3  # m; markers turn from green to red over this
 
 
 def decoded(topic: Topic, data: bytes) -> Any:
@@ -70,27 +71,54 @@ def margins_message(stamp: Time, margins: Margins) -> SafetyMargins:
     if margins.touching:
         message.contact_state = SafetyMargins.CONTACT_TOUCHING
         message.contact_nodes = list(margins.touching)
+    friction = margins.friction
+    message.friction_state, message.slowdown = int(friction.state), friction.slowdown
+    message.friction_nodes = list(friction.nodes)
     return message
 
 
 def invalid_margins(stamp: Time, reason: str) -> SafetyMargins:
     """Return a margins message that says that there are none, and why."""
-    return SafetyMargins(header=header(stamp), valid=False, reason=reason, contact_state=SafetyMargins.CONTACT_UNKNOWN)
+    return SafetyMargins(
+        header=header(stamp),
+        valid=False,
+        reason=reason,
+        contact_state=SafetyMargins.CONTACT_UNKNOWN,
+        friction_state=SafetyMargins.FRICTION_UNKNOWN,
+        slowdown=1.0,
+    )
 
 
-def thread_markers(stamp: Time, prediction: Prediction, diameter: float) -> MarkerArray:
-    """Return the predicted thread as a line, each node coloured by its clearance of obstacles."""
-    clearance = np.full(len(prediction.vertices), np.inf)
-    for rows in prediction.margins:
-        if rows.kind == BarrierMargin.KIND_OBSTACLE:
-            np.minimum.at(clearance, rows.nodes[:, -1], rows.clearance)
+def thread_markers(stamp: Time, prediction: Prediction, friction: Friction, diameter: float) -> MarkerArray:
+    """Return the predicted thread as a line in the colour of its friction, and the nodes under friction as balls.
+
+    Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback": green where free, orange, darker
+    with every node, where pulled under friction, blue where it rests. Deviation: grey where nobody knows.
+    """
     line = Marker(header=header(stamp), ns="thread", id=0, type=Marker.LINE_STRIP, action=Marker.ADD)
     line.pose = flat_pose(np.zeros(2), 0.0)
     line.scale.x = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
     line.points = point_list(prediction.vertices)
-    safe = np.clip(clearance / FULL_COLOUR_CLEARANCE, 0.0, 1.0)
-    line.colors = [ColorRGBA(r=float(1.0 - s), g=float(0.75 * s), b=0.1, a=1.0) for s in safe]
-    return MarkerArray(markers=[line])
+    red, green, blue = friction_colour(friction)
+    line.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+    balls = Marker(header=header(stamp), ns="thread", id=1, type=Marker.SPHERE_LIST, action=Marker.ADD)
+    balls.pose = flat_pose(np.zeros(2), 0.0)
+    balls.scale = Vector3(x=2.0 * line.scale.x, y=2.0 * line.scale.x, z=2.0 * line.scale.x)
+    balls.color = line.color
+    balls.points = point_list(prediction.vertices[list(friction.nodes)])
+    return MarkerArray(markers=[line, balls])
+
+
+def steering_state(stamp: Time, what: Steered) -> SteeringState:
+    """Return what became of a velocity that was asked for; `stamp` is that of the asking."""
+    return SteeringState(
+        header=header(stamp),
+        asked=vector(what.asked),
+        passed=vector(what.passed),
+        slowdown=what.slowdown,
+        held_off=what.held_off,
+        reason=what.reason,
+    )
 
 
 def obstacle_markers(stamp: Time, obstacles: Sequence[Obstacle]) -> MarkerArray:

@@ -1,4 +1,4 @@
-"""The thread model node: needle poses in, predicted thread and safety margins out."""
+"""The thread model node: needle poses in, predicted thread and safety margins out; an operator's wishes filtered."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.model.friction import UNKNOWN
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import STARTED, Prediction
 from magnetosuture_thread.model.program import SOLVED
@@ -21,6 +22,7 @@ from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
+from magnetosuture_thread.nodes.thread_steering import ThreadSteering
 
 
 class ThreadModelNode(Node):
@@ -38,6 +40,7 @@ class ThreadModelNode(Node):
         self._markers = topics.THREAD_MARKERS.publisher(self)
         topics.SEEN_THREAD.subscribe(self, self.on_seen_thread, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
+        self._steering = ThreadSteering(self, self._session, self._health)
         self._health.warn("no needle pose yet")
         self.get_logger().info(
             f"ready: {settings.segments} segments of {settings.material}, "
@@ -81,7 +84,7 @@ class ThreadModelNode(Node):
         """Publish what came of a pose."""
         stamp = messages.stamp_of(outcome.stamp)
         if outcome.prediction is not None:
-            self._publish(stamp, outcome.prediction, step_time)
+            self._publish(stamp, outcome.prediction, outcome.margins, step_time)
         elif isinstance(outcome.problem, InvalidInputError):
             self._health.refuse(outcome.problem)
         elif outcome.problem is not None:
@@ -91,15 +94,16 @@ class ThreadModelNode(Node):
             self._health.warn(WAITING)
             self._margins.publish(thread_messages.invalid_margins(stamp, WAITING))
 
-    def _publish(self, stamp: Time, prediction: Prediction, step_time: float) -> None:
+    def _publish(self, stamp: Time, prediction: Prediction, margins: Margins | None, step_time: float) -> None:
         settings = self._session.settings
         self._predicted.publish(thread_messages.prediction_message(stamp, prediction, settings.material, step_time))
-        if prediction.converged:
-            margins = thread_messages.margins_message(stamp, Margins.of(prediction.margins, settings.contact_tolerance))
+        if margins is None:
+            self._margins.publish(thread_messages.invalid_margins(stamp, prediction.status))
         else:
-            margins = thread_messages.invalid_margins(stamp, prediction.status)
-        self._margins.publish(margins)
-        self._markers.publish(thread_messages.thread_markers(stamp, prediction, self._session.thread.diameter))
+            self._margins.publish(thread_messages.margins_message(stamp, margins))
+        friction = margins.friction if margins else UNKNOWN
+        diameter = self._session.thread.diameter
+        self._markers.publish(thread_messages.thread_markers(stamp, prediction, friction, diameter))
         figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
         if prediction.status in (SOLVED, STARTED):
             self._health.ok("predicting", **figures)

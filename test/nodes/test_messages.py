@@ -15,7 +15,7 @@ from magnetosuture_msgs.msg import BarrierMargin, Disc, ObstacleSet, Outline, Po
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.model.barriers import BarrierKind
-from magnetosuture_thread.nodes import coil_messages, messages, thread_messages, topics
+from magnetosuture_thread.nodes import messages, thread_messages, topics
 from magnetosuture_thread.resources import share
 from magnetosuture_thread.study.replayed import KINDS
 
@@ -109,9 +109,8 @@ def test_paths_and_velocities_go_there_and_back():
     points = np.random.default_rng(0).normal(size=(5, 2))
     np.testing.assert_array_equal(messages.path_points(messages.PathMaker().message(STAMP, points)), points)
     assert messages.path_points(messages.PathMaker().message(STAMP, np.empty((0, 2)))).shape == (0, 2)
-    np.testing.assert_array_equal(
-        coil_messages.command_velocity(messages.twist_message(STAMP, np.array([1.0, -2.0]))), [1.0, -2.0]
-    )
+    twist = messages.twist_message(STAMP, np.array([1.0, -2.0]))
+    np.testing.assert_array_equal(messages.plane_velocity(twist, "needle/servo_cv"), [1.0, -2.0])
 
 
 @pytest.mark.parametrize("topic", [*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS], ids=lambda topic: topic.name)
@@ -121,7 +120,15 @@ def test_every_topic_has_a_type_that_bags_know(topic: topics.Topic):
 
 def test_the_bags_and_the_graph_have_the_same_own_messages():
     """The same bytes mean the same in both: a type that was rebuilt in one place only would differ."""
-    for topic in (topics.PREDICTED_THREAD, topics.MARGINS, topics.CURRENTS, topics.BRIDGE_STATE, *topics.SETTINGS):
+    for topic in (
+        topics.PREDICTED_THREAD,
+        topics.MARGINS,
+        topics.CURRENTS,
+        topics.BRIDGE_STATE,
+        topics.STEERING_STATE,
+        topics.TRACKER_STATE,
+        *topics.SETTINGS,
+    ):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())
 

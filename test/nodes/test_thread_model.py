@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
 from nav_msgs.msg import Path
 from rclpy.serialization import serialize_message
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.model import choices
 from magnetosuture_thread.model.formulations import rod
@@ -67,7 +67,73 @@ def test_the_thread_starts_where_it_is_seen_and_follows(graph):
         BarrierMargin.KIND_COMPRESSION,
     ]
     assert markers[-1].markers[0].type == Marker.LINE_STRIP
-    assert len(markers[-1].markers[0].points) == len(markers[-1].markers[0].colors) == 26
+    assert len(markers[-1].markers[0].points) == 26
+    assert markers[-1].markers[0].color.g == max(colour_of(markers[-1])[:3])
+    assert margins[-1].friction_state == SafetyMargins.FRICTION_FREE
+    assert margins[-1].slowdown == 1.0
+
+
+def colour_of(message: MarkerArray) -> tuple[float, float, float]:
+    """Return the thread's colour."""
+    colour = message.markers[0].color
+    return colour.r, colour.g, colour.b
+
+
+def test_friction_is_told_shown_and_slows_what_an_operator_asks(graph):
+    """A gate of two discs around the thread, 6 mm behind the needle, which is drawn on and then rests."""
+    gate = [-0.006, 0.0018, 0.001, -0.006, -0.0018, 0.001]
+    graph.add(
+        ThreadModelNode,
+        initial_shape="straight",
+        disc_obstacles=gate,
+        friction_threshold=1.2e-3,
+        friction_averaging=0.0,
+    )
+    margins, markers = graph.listen(topics.MARGINS), graph.listen(topics.THREAD_MARKERS)
+    commands, states = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.STEERING_STATE)
+    for k, x in enumerate((0.0, 1e-4, 2e-4, 2e-4)):
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, x))
+        graph.wait(lambda k=k: len(margins) == k + 1 and len(markers) == k + 1, "margins and markers")
+        if k < 2:
+            continue
+        asked = messages.twist_message(stamp(1.0 + k / 30.0 + 0.01), np.array([3e-3, 1e-3]))
+        graph.publish(topics.OPERATOR_COMMAND, asked)
+        graph.wait(lambda k=k: len(commands) == k - 1 and len(states) == k - 1, "a filtered command")
+        assert commands[-1].header.stamp == states[-1].header.stamp == asked.header.stamp
+        assert commands[-1].header.frame_id == "dish"
+    pulled, resting = margins[-2:]
+    assert pulled.friction_state == SafetyMargins.FRICTION_PULLED
+    assert list(pulled.friction_nodes) == list(resting.friction_nodes)
+    count = len(pulled.friction_nodes)
+    assert count >= 2
+    assert pulled.slowdown == pytest.approx(0.9**count)
+    assert (resting.friction_state, resting.slowdown) == (SafetyMargins.FRICTION_RESTING, 1.0)
+    red, green, blue = colour_of(markers[-2])
+    assert red > green > blue
+    assert colour_of(markers[-1])[2] == max(colour_of(markers[-1]))
+    assert len(markers[-2].markers[1].points) == count
+    assert commands[0].twist.linear.x == pytest.approx(pulled.slowdown * 3e-3)
+    assert commands[1].twist.linear.x == pytest.approx(3e-3)
+    assert states[0].slowdown == pulled.slowdown
+    assert not states[0].held_off
+
+
+def test_an_operator_who_falls_silent_is_followed_by_silence(graph):
+    graph.add(ThreadModelNode, initial_shape="straight")
+    commands, states = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.STEERING_STATE)
+    graph.publish(topics.OPERATOR_COMMAND, messages.twist_message(stamp(1.0), np.array([1e-3, 0.0])))
+    graph.wait(lambda: bool(commands and states), "an answer")
+    assert commands[0].twist.linear.x == 0.0
+    assert states[0].reason == "no predicted thread yet"
+    assert states[0].asked.x == 1e-3
+    for k in range(20):
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, k * 1e-4))
+    health = graph.listen(topics.DIAGNOSTICS)
+    for wrong in ([np.nan, 0.0], [5.0, 0.0]):
+        graph.publish(topics.OPERATOR_COMMAND, messages.twist_message(stamp(1.6), np.array(wrong)))
+        told = f"needle velocity: got {wrong}"
+        graph.wait(lambda told=told: any(told in v.value for m in health for v in m.status[0].values), "the refusal")
+    assert len(commands) == len(states) == 1
 
 
 def test_the_order_of_pose_and_centreline_does_not_matter(graph):
