@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import cv2
@@ -15,9 +16,10 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import needle_axis, require_needle
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import LOOKS, Lighting, Scene
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
@@ -54,7 +56,15 @@ class RigSettings(Configuration):
     polygon_obstacles: tuple[float, ...] = quantity(
         (), "x and y of each corner of all polygons", unit="m", minimum=-0.5, maximum=0.5, multiple=2
     )
-    polygon_sizes: tuple[int, ...] = quantity((), "number of corners of each polygon", minimum=3, maximum=10000)
+    polygon_sizes: tuple[int, ...] = quantity(
+        (),
+        "number of corners of each outline; negative for a hole in the polygon before it, which is seen but not felt",
+        minimum=-10000,
+        maximum=10000,
+    )
+    obstacle_looks: tuple[str, ...] = quantity(
+        (), f"of what each obstacle seems to be made, discs first: {', '.join(LOOKS)}; none given: silicone"
+    )
 
     coil_angles: tuple[float, ...] = quantity(
         (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi),
@@ -131,10 +141,10 @@ class RigSettings(Configuration):
         """Refuse what does not fit together."""
         if len(self.needle_start) != 3:
             raise ConfigurationError(f"{self.GROUP}.needle_start", list(self.needle_start), "x, y and heading")
-        if sum(self.polygon_sizes) * 2 != len(self.polygon_obstacles):
-            raise ConfigurationError(
-                f"{self.GROUP}.polygon_sizes", list(self.polygon_sizes), "corners of all polygon_obstacles in sum"
-            )
+        count = len(self.obstacles())
+        if self.obstacle_looks and (len(self.obstacle_looks) != count or not set(self.obstacle_looks) <= set(LOOKS)):
+            expectation = f"one of {', '.join(LOOKS)} for each of {count} obstacles, or none"
+            raise ConfigurationError(f"{self.GROUP}.obstacle_looks", list(self.obstacle_looks), expectation)
         if len(self.coil_angles) < 1:
             raise ConfigurationError(f"{self.GROUP}.coil_angles", [], "at least one coil's angle [rad]")
         ports = len(self.power_stage_ports)
@@ -151,14 +161,14 @@ class RigSettings(Configuration):
         at = np.linspace(0.0, 1.0, 100)
         x, y, heading = self.needle_start
         needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
-        things = {"a needle": needle, "a thread": self._thread_at_start(at)}
+        things = {"a needle": needle, "a thread": self.thread_at_start(at)}
         for name, points in things.items():
             inside = np.linalg.norm(points, axis=1).max() < 0.5 * self.dish_diameter
             if not inside or any(_touches(points, obstacle) for obstacle in self.obstacles()):
                 start = f"{list(self.needle_start)}, thread curvature {self.thread_start_curvature:g}"
                 raise ConfigurationError(f"{self.GROUP}.needle_start", start, f"{name} in the dish, off the obstacles")
 
-    def _thread_at_start(self, at: NDArray[np.float64]) -> Points:
+    def thread_at_start(self, at: NDArray[np.float64]) -> Points:
         """Return points along the thread as it lies at the start, `at` from 0 to 1, shape (m, 2) [m]."""
         x, y, heading = self.needle_start
         tail = np.array([x, y])
@@ -166,10 +176,12 @@ class RigSettings(Configuration):
 
     def obstacles(self) -> tuple[Disc | Polygon, ...]:
         """Return discs, then polygons."""
-        discs = [Disc((x, y), radius) for x, y, radius in np.reshape(self.disc_obstacles, (-1, 3)).tolist()]
-        corners = np.reshape(self.polygon_obstacles, (-1, 2))
-        pieces = np.split(corners, np.cumsum(self.polygon_sizes)[:-1]) if self.polygon_sizes else []
-        return (*discs, *(Polygon(tuple(map(tuple, piece.tolist()))) for piece in pieces))
+        return self._obstacles
+
+    @cached_property
+    def _obstacles(self) -> tuple[Disc | Polygon, ...]:
+        discs = discs_from(self.disc_obstacles)
+        return (*discs, *polygons_from(self.GROUP, self.polygon_obstacles, self.polygon_sizes))
 
     def view(self) -> DishView:
         """Return where the dish is in the image: a little off the middle, as in a real rig."""
@@ -185,6 +197,7 @@ class RigSettings(Configuration):
             needle_curvature=self.needle_curvature,
             thread_diameter=self.thread_diameter,
             obstacles=self.obstacles(),
+            looks=tuple(LOOKS[name] for name in self.obstacle_looks),
         )
         lighting = Lighting(gain=self.light_gain, noise=self.noise)
         return DishCamera(scene, self.view(), (self.camera_width, self.camera_height), self.seed, lighting)
@@ -218,7 +231,7 @@ class RigSettings(Configuration):
         """Return needle and thread at their start, in the field of the coils."""
         x, y, heading = self.needle_start
         tail = np.array([x, y])
-        behind = self._thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1))
+        behind = self.thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1))
         obstacles = self.obstacles()
         return RigDynamics(
             needle=NeedleBody(

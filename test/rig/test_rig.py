@@ -133,7 +133,13 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"needle_curvature": 500.0}, "a half circle"),
         ({"faults": ("sun 1 2",)}, "KIND START DURATION"),
         ({"faults": (3,)}, "a list of texts"),
-        ({"polygon_sizes": (3,)}, "corners of all"),
+        ({"polygon_sizes": (3,)}, "corners of each outline, 0 in all"),
+        (
+            {"polygon_obstacles": (0.005, -0.01, 0.007, -0.01, 0.006, -0.008), "polygon_sizes": (-3,)},
+            "before its holes",
+        ),
+        ({"obstacle_looks": ("tissue",)}, "for each of 0 obstacles"),
+        ({"disc_obstacles": (0.01, 0.01, 0.001), "obstacle_looks": ("gold",)}, "one of silicone, tissue, hernia"),
         ({"thread_attachment": "sewn"}, "pinned, glued"),
         ({"viscosity": 0.0}, "from 0.0001"),
         ({"power_stage": "battery"}, "topic, roboclaw"),
@@ -162,3 +168,61 @@ def test_obstacles_are_drawn_and_felt():
     assert plain is not None
     inside = made.camera.view.to_pixels(np.array([-0.005, 0.007])).round().astype(int)
     assert frame.image[inside[1], inside[0], 0] < plain[inside[1], inside[0], 0] - 15
+
+
+def square(half: float) -> tuple[float, ...]:
+    """Return the corners of a square around (0.013, 0)."""
+    return tuple(np.ravel([(0.013 + half * x, half * y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]).tolist())
+
+
+def test_a_hole_is_seen_and_nothing_gets_into_it():
+    obstacles = {"polygon_obstacles": square(0.002) + square(0.0012), "polygon_sizes": (4, -4)}
+    made = rig(**obstacles)
+    for time in np.arange(0.0, 3.0, 0.1):
+        made.apply(EASTWARDS, float(time))
+    frame = made.look(3.0)
+    tip = frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)])
+    assert tip[0] == pytest.approx(0.011, abs=3e-4)
+    solid = rig(polygon_obstacles=square(0.002), polygon_sizes=(4,)).look(0.0).image
+    plain, ring = rig().look(0.0).image, rig(**obstacles).look(0.0).image
+    assert plain is not None
+    assert solid is not None
+    assert ring is not None
+    u, v = made.camera.view.to_pixels(np.array([0.013, 0.0])).round().astype(int)
+    in_hole = [float(image[v - 3 : v + 4, u - 3 : u + 4, 0].mean()) for image in (plain, solid, ring)]
+    assert in_hole[1] < in_hole[0] - 15.0
+    assert abs(in_hole[2] - in_hole[0]) < 12.0  # but for a shadow
+    u, v = made.camera.view.to_pixels(np.array([0.0146, 0.0])).round().astype(int)
+    assert ring[v, u, 0] < plain[v, u, 0] - 15
+
+
+def test_a_needle_does_not_start_in_a_hole():
+    corners = square(0.012)
+    with pytest.raises(ConfigurationError, match="off the obstacles"):
+        rig(
+            needle_start=(0.012, 0.0, 0.0),
+            needle_length=0.002,
+            thread_length=0.002,
+            dish_diameter=0.06,
+            polygon_obstacles=corners + square(0.01),
+            polygon_sizes=(4, -4),
+        )
+
+
+def test_tissue_is_pink_and_a_hernia_darker_and_redder_but_neither_is_dark_to_the_tracker():
+    """The tracker measures on green, and takes what has less than 0.55 of the floor's for a needle's steel."""
+    kinds = ("silicone", "tissue", "hernia")
+    made = {look: rig(disc_obstacles=(0.0, 0.009, 0.002), obstacle_looks=(look,)) for look in kinds}
+    u, v = made["tissue"].camera.view.to_pixels(np.array([0.0002, 0.0087])).round().astype(int)
+    seen = {}
+    for look, one in made.items():
+        image = one.look(0.0).image
+        assert image is not None
+        seen[look] = image[v - 4 : v + 5, u - 4 : u + 5].reshape(-1, 3).mean(axis=0)
+    plain = rig().look(0.0).image
+    assert plain is not None
+    floor = plain[v - 4 : v + 5, u - 4 : u + 5].reshape(-1, 3).mean(axis=0)
+    redness = {look: bgr[2] / bgr[1] for look, bgr in seen.items()}
+    assert redness["hernia"] > redness["tissue"] + 0.05 > floor[2] / floor[1] + 0.15
+    assert seen["hernia"].sum() < seen["tissue"].sum() - 40.0
+    assert min(bgr[1] for bgr in seen.values()) > 0.65 * floor[1]

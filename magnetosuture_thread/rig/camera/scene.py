@@ -9,6 +9,33 @@ from magnetosuture_thread.geometry.obstacles import Obstacle
 
 
 @dataclass(frozen=True)
+class Look:
+    """How an obstacle looks. A tracker measures on green, so that soft tissue differs from the floor in the others.
+
+    Attributes:
+        bgr: its colour, blue, green, red from 0 to 255.
+        edge_bgr: the colour at its outline, into which the other fades.
+        rounding: how far inwards that reaches, and the edge is rounded [m].
+        relief: how much brighter the rounded edge is towards the lamp, and darker away from it.
+        mottle: depth of its light and dark patches.
+    """
+
+    bgr: tuple[float, float, float]
+    edge_bgr: tuple[float, float, float]
+    rounding: float = 0.0
+    relief: float = 0.0
+    mottle: float = 0.0
+
+
+SILICONE = Look((168.0, 176.0, 205.0), (168.0, 176.0, 205.0))
+LOOKS = {
+    "silicone": SILICONE,
+    "tissue": Look((196.0, 194.0, 242.0), (178.0, 184.0, 236.0), 0.7e-3, 9.0, 8.0),
+    "hernia": Look((164.0, 166.0, 226.0), (150.0, 162.0, 212.0), 0.5e-3, 6.0, 4.0),
+}
+
+
+@dataclass(frozen=True)
 class Scene:
     """The things before the camera, all in the dish frame [m].
 
@@ -19,7 +46,8 @@ class Scene:
         needle_curvature: of its arc, positive to the left of the heading [1/m].
         thread_diameter: diameter of the thread.
         thread_bgr: the thread's colour, blue, green, red from 0 to 255.
-        obstacles: seen from above, of pale silicone.
+        obstacles: seen from above.
+        looks: of each of them; none given: pale silicone.
     """
 
     dish_diameter: float = 0.035
@@ -29,6 +57,7 @@ class Scene:
     thread_diameter: float = 60e-6
     thread_bgr: tuple[float, float, float] = (132.0, 78.0, 100.0)
     obstacles: Sequence[Obstacle] = ()
+    looks: Sequence[Look] = ()
 
 
 @dataclass(frozen=True)

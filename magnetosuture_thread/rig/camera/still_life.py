@@ -12,13 +12,13 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.coverage import box_around, covered
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import SILICONE, Lighting, Look, Scene
 
 Light = NDArray[np.float32]
 
 RIM_DEPTHS = ((0.22e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))  # beyond the radius, width [m]; depth
 DROP_SHADOW_PX = np.array([3.0, 4.0])
-SILICONE_BGR = (168.0, 176.0, 205.0)
+LAMP_PX = (-0.5, -0.86)  # direction towards the lamp, in the image
 GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]
 
 
@@ -64,8 +64,9 @@ class StillLife:
         light += 22.0 * np.exp(-(((away - radius - 0.6e-3) / 0.15e-3) ** 2))
         image = np.repeat(light[:, :, None], 3, axis=2) * np.asarray(lighting.tint_bgr, dtype=np.float32)
         image = image.astype(np.float32)
-        for obstacle in self._scene.obstacles:
-            self._add_obstacle(image, obstacle)
+        looks = self._scene.looks or [SILICONE] * len(self._scene.obstacles)
+        for obstacle, look in zip(self._scene.obstacles, looks, strict=True):
+            self._add_obstacle(image, obstacle, look)
         self._add_glare(image)
         self._add_dust(image)
         return np.asarray(np.clip(image, 0.0, 258.0), dtype=np.float32)
@@ -78,8 +79,8 @@ class StillLife:
         smooth *= np.float32(0.5 * depth) / np.float32(max(float(smooth.std()), 1e-9))
         return np.asarray(cv2.resize(smooth, self._size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)
 
-    def _add_obstacle(self, image: Light, obstacle: Obstacle) -> None:
-        """Add a solid of pale silicone: a soft shadow, a matt top, a highlight."""
+    def _add_obstacle(self, image: Light, obstacle: Obstacle, look: Look) -> None:
+        """Add a solid: a soft shadow, its top, a highlight on a disc."""
         rings = [self._view.to_pixels(ring) for ring in outlines(obstacle)]
         corners = np.vstack(rings)
         box = box_around(corners, self._size, margin=24.0)
@@ -92,14 +93,31 @@ class StillLife:
 
         shade = cv2.GaussianBlur(solid([ring + DROP_SHADOW_PX for ring in rings]), (0, 0), 4.0)
         region *= 1.0 - 0.2 * shade[:, :, None]
-        top = solid(rings)[:, :, None]
-        region += top * (np.asarray(SILICONE_BGR, dtype=np.float32) - region)
+        top = solid(rings)
+        colour = self._surface(top, look) + (self._smear(look.mottle, 9.0)[box][:, :, None] if look.mottle else 0.0)
+        region += top[:, :, None] * (colour - region)
         if isinstance(obstacle, Disc):
             radius = obstacle.radius / self._view.metres_per_pixel
             small = self._view.to_pixels(np.asarray(obstacle.centre)) - 0.35 * radius
             ring = small + 0.25 * radius * circle(128)
             shine = cv2.GaussianBlur(solid([ring]), (0, 0), 0.15 * radius + 0.5)
             region += shine[:, :, None] * 40.0
+
+    def _surface(self, top: Light, look: Look) -> Light:
+        """Return the colour of a solid's top, rounded at its outline, shape (rows, columns, 3) or for all (3,)."""
+        colour = np.asarray(look.bgr, dtype=np.float32)
+        if not look.rounding:
+            return colour
+        reach = np.float32(look.rounding / self._view.metres_per_pixel)
+        inwards = cv2.distanceTransform((top > 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        level = np.minimum(inwards / reach, 1.0)
+        height = cv2.GaussianBlur(np.sqrt(level * (2.0 - level)).astype(np.float32), (0, 0), 0.25 * float(reach) + 0.5)
+        slope = np.stack(
+            [cv2.Sobel(height, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(height, cv2.CV_32F, 0, 1, scale=0.125)]
+        )
+        lit = -np.float32(look.relief) * reach * np.tensordot(np.asarray(LAMP_PX, np.float32), slope, axes=1)
+        edge = np.asarray(look.edge_bgr, dtype=np.float32)
+        return np.asarray(edge + height[:, :, None] * (colour - edge) + lit[:, :, None], dtype=np.float32)
 
     def _add_glare(self, image: Light) -> None:
         """Add two arcs of the lamp's reflection along the wall, and small hot spots."""

@@ -9,6 +9,7 @@ from magnetosuture_thread.vision.needle.strip import TAPER, Strip
 from magnetosuture_thread.vision.sampling import middle
 
 WIDTH_SLACK_PX, WIDTH_SLACK = 0.7, 0.2  # that the width may differ from row to row
+THREAD_PX = 12.0  # from the tail on, beside which a thread that turns back sharply makes the body look wider
 DARKNESS_SLACK = 0.16  # of the body's darkness, that it may differ by from row to row
 EVEN_SHARE = 0.93  # of the body's rows must have its width and darkness
 AS_DARK, DARK_ROWS = 0.8, 0.06  # of the body's darkness, beside the body; and in how many rows at most
@@ -38,6 +39,7 @@ def what_covers(strip: Strip, tail: float, tip: float, body: float) -> str:
     if rows.sum() < 0.5 * length or along[0] > tail - 7.0 or along[-1] < tip + 4.0:
         return "an end out of place"
     even = np.abs(strip.width[rows] - body) < WIDTH_SLACK_PX + WIDTH_SLACK * body
+    even |= (along[rows] < tail + min(THREAD_PX, 0.35 * length)) & (strip.width[rows] > body)
     # Steel is equally dark all along, at the darkest place across it: beside the gleam.
     darkest = strip.dark[np.ix_(rows, core)].max(axis=1) / strip.depth
     steel = np.abs(cv2.blur(darkest, (1, 5)).ravel() - 1.0) < DARKNESS_SLACK

@@ -1,0 +1,60 @@
+"""A short needle among tissue, with its thread at any angle: what the hernia scenario shows to the camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.geometry.arc import needle_axis
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.vision.look import State
+from magnetosuture_thread.vision.tracker import VisionTracker
+
+PLACES = {  # tail [m] and heading [rad]
+    "free": (0.004, -0.012, 2.0),
+    "in the penetration path": (0.0, -0.005, 0.5 * np.pi),
+    "on the left": (-0.00685, 0.0045, 0.5 * np.pi + 0.1),
+    "above": (-0.001, 0.01185, -0.05),
+    "on the right": (0.0068, 0.006, -0.5 * np.pi - 0.05),
+}
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    return read_setup("hernia_ring")
+
+
+@pytest.fixture(scope="module")
+def camera(setup: Setup) -> DishCamera:
+    return setup.rig.camera()
+
+
+def assert_measured(setup: Setup, camera: DishCamera, tail: np.ndarray, heading: float, thread: np.ndarray) -> None:
+    """Assert that one frame gives the needle's pose to 2 pixels and 3 degrees."""
+    seen = VisionTracker(setup.vision).look(camera.render(tail, heading, thread))
+    assert seen.state is State.TRACKED, seen.reason
+    assert np.linalg.norm(seen.tail - tail) < 2.0 * camera.view.metres_per_pixel
+    turned = np.arctan2(seen.heading[1], seen.heading[0]) - heading
+    assert abs((turned + np.pi) % (2.0 * np.pi) - np.pi) < np.radians(3.0)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_the_needle_is_measured_between_tissue_and_ring(setup: Setup, camera: DishCamera, place: str):
+    x, y, heading = PLACES[place]
+    tail = np.array([x, y])
+    behind, _ = needle_axis(tail, heading + np.pi, 0.004, 0.0, np.linspace(0.0, 1.0, 20))
+    assert_measured(setup, camera, tail, heading, behind)
+
+
+@pytest.mark.parametrize("angle", [35.0, 45.0, 60.0, 90.0])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
+    setup: Setup, camera: DishCamera, angle: float, side: float
+):
+    """As when the needle was turned sharply, and has not pulled its thread straight yet."""
+    x, y, heading = PLACES["free"]
+    tail = np.array([x, y])
+    away = heading + side * np.radians(angle)
+    back, _ = needle_axis(tail, away, 0.02, 0.0, np.linspace(0.0, 1.0, 50))
+    assert_measured(setup, camera, tail, heading, back)
