@@ -14,11 +14,20 @@ def files(pattern: str) -> list[str]:
 
 setup(
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "study/report/page.html", "study/report/page.css", "study/report/page.js"]},
+    package_data={
+        PACKAGE: [
+            "py.typed",
+            "study/report/page.html",
+            "study/report/page.css",
+            "study/report/page.js",
+            "console/page/*",
+        ]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", files("config/*.yaml")),
+        (f"share/{PACKAGE}/config/viewers", files("config/viewers/*")),
         (f"share/{PACKAGE}/launch", files("launch/*.launch.py")),
     ],
     zip_safe=True,

@@ -1,0 +1,276 @@
+// The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
+// data-friction (free, pulled, resting, unknown, invalid, old, none), data-colour of the predicted thread,
+// data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels.
+
+import { GREY, MIDDLING, SEEN, VELOCITY, nodeLook, onGround, threadLook } from "./colours.js";
+import { Placement, needleArc } from "./geometry.js";
+
+const STALE = 0.5; // [s] a needle that is older is drawn grey
+const ARROW = 0.3; // of the dish's diameter, at the greatest speed
+const STEPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05];
+
+export class Dish {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d", { alpha: false });
+    this.image = null;
+    this.placement = null; // in pixels of the page
+    this.dark = matchMedia("(prefers-color-scheme: dark)");
+  }
+
+  // The needle from tail to tip in pixels of the page, null while there is none.
+  needlePoints(graph) {
+    if (!graph?.needle || !this.placement) return null;
+    return needleArc(graph.needle, graph.needle_length, graph.needle_curvature).map((point) => this.placement.at(point));
+  }
+
+  draw(graph, { since, leash, maxSpeed }) {
+    const { canvas, context } = this;
+    const ratio = devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width || !height) return;
+    const [wide, high] = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
+    this.placement = new Placement(width, height, graph?.dish_diameter ?? 0.035);
+    this.ratio = ratio;
+    const shown = Boolean(this.image && graph?.tracker?.view);
+    const bright = shown || !this.dark.matches;
+    this.paper = this.dark.matches ? "#12181d" : "#dfe5ea";
+    this.ink = bright ? "#1d2833" : "#e6ecf1";
+    this.velocity = onGround(VELOCITY, !bright);
+    this.halo = bright ? "rgba(255,255,255,0.9)" : "rgba(10,15,20,0.9)";
+    this.#plain();
+    context.fillStyle = this.paper;
+    context.fillRect(0, 0, width, height);
+    if (shown) this.#drawImage(graph.tracker.view);
+    else this.#drawFloor(graph);
+    const look = threadLook(graph?.predicted, graph?.margins, since);
+    if (graph) {
+      this.#drawObstacles(graph.obstacles ?? []);
+      this.#line(graph.seen ?? [], 12, SEEN);
+      this.#drawPredicted(graph, look);
+      this.#drawNeedle(graph, since);
+      this.#drawVelocities(graph, since, maxSpeed);
+    }
+    if (leash) this.#drawLeash(leash);
+    this.#drawScaleBar(width, height);
+    Object.assign(canvas.dataset, {
+      friction: look.state, colour: look.colour, image: shown ? "yes" : "no",
+      scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
+    });
+  }
+
+  #plain() {
+    this.context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    this.context.globalAlpha = 1;
+    this.context.setLineDash([]);
+    this.context.lineJoin = this.context.lineCap = "round";
+  }
+
+  #drawImage(view) {
+    const { context, ratio } = this;
+    context.setTransform(...this.placement.image(view).map((entry) => entry * ratio));
+    context.drawImage(this.image, -0.5, -0.5); // a pixel's place is its middle
+    this.#plain();
+    if (!this.dark.matches) return;
+    context.fillStyle = "rgba(10, 15, 20, 0.22)";
+    context.fillRect(0, 0, this.canvas.width, this.canvas.height);
+  }
+
+  #drawFloor(graph) {
+    const { context, placement } = this;
+    const radius = (placement.scale * (graph?.dish_diameter ?? 0.035)) / 2;
+    context.beginPath();
+    context.arc(...placement.centre, radius, 0, 2 * Math.PI);
+    context.fillStyle = this.dark.matches ? "#232d36" : "#f7fafc";
+    context.fill();
+    context.strokeStyle = this.dark.matches ? "#5b6b78" : "#8fa2b2";
+    context.lineWidth = 2;
+    context.stroke();
+  }
+
+  #drawObstacles(obstacles) {
+    const { context, placement } = this;
+    context.fillStyle = "rgba(120, 112, 98, 0.38)";
+    context.strokeStyle = "rgba(88, 78, 62, 0.95)";
+    context.lineWidth = 1.5;
+    for (const obstacle of obstacles) {
+      context.beginPath();
+      if (obstacle.disc) {
+        const [x, y, r] = obstacle.disc;
+        context.arc(...placement.at([x, y]), placement.scale * r, 0, 2 * Math.PI);
+        context.fill();
+        context.stroke();
+      } else {
+        this.#drawTriangles(obstacle.triangles ?? []);
+      }
+    }
+  }
+
+  // Triangles, three corners each: filled together, the sides that no other triangle shares drawn as the outline.
+  #drawTriangles(corners) {
+    const { context, placement } = this;
+    const points = corners.map((corner) => placement.at(corner));
+    const sides = new Map();
+    for (let at = 0; at + 2 < points.length; at += 3) {
+      const [a, b, c] = points.slice(at, at + 3);
+      const turned = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) < 0;
+      const way = turned ? [a, c, b] : [a, b, c];
+      way.forEach((point, corner) => (corner ? context.lineTo(...point) : context.moveTo(...point)));
+      context.closePath();
+      way.forEach((from, corner) => {
+        const to = way[(corner + 1) % 3];
+        const key = [from, to].map((point) => point.map((entry) => entry.toFixed(2)).join()).sort().join(" ");
+        sides.set(key, sides.has(key) ? null : [from, to]);
+      });
+    }
+    context.fill("nonzero");
+    context.beginPath();
+    for (const side of sides.values()) {
+      if (!side) continue;
+      context.moveTo(...side[0]);
+      context.lineTo(...side[1]);
+    }
+    context.stroke();
+  }
+
+  #trace(points) {
+    this.context.beginPath();
+    points.forEach((point, at) => {
+      const [x, y] = this.placement.at(point);
+      if (at) this.context.lineTo(x, y);
+      else this.context.moveTo(x, y);
+    });
+  }
+
+  #line(points, width, colour) {
+    if (points.length < 2) return;
+    this.#trace(points);
+    this.context.lineWidth = width;
+    this.context.strokeStyle = colour;
+    this.context.stroke();
+  }
+
+  #drawPredicted({ predicted, margins }, look) {
+    const vertices = predicted?.vertices ?? [];
+    const { context } = this;
+    const valid = look.colour !== GREY;
+    this.#line(vertices, 4.6, this.halo);
+    if (!valid) context.setLineDash([7, 6]);
+    this.#line(vertices, 2.6, look.colour);
+    context.setLineDash([]);
+    const friction = new Set(valid ? margins?.friction.nodes : []);
+    vertices.forEach((vertex, node) => {
+      const { colour, radius } = nodeLook(margins?.clearance?.[node], valid);
+      const [x, y] = this.placement.at(vertex);
+      context.beginPath();
+      context.arc(x, y, radius, 0, 2 * Math.PI);
+      context.fillStyle = colour;
+      context.fill();
+      if (!friction.has(node)) return;
+      context.beginPath(); // a ring around a node in friction
+      context.arc(x, y, radius + 2.6, 0, 2 * Math.PI);
+      context.strokeStyle = this.ink;
+      context.lineWidth = 1.3;
+      context.stroke();
+    });
+  }
+
+  #drawNeedle(graph, since) {
+    if (!graph.needle) return;
+    const { context } = this;
+    const arc = needleArc(graph.needle, graph.needle_length, graph.needle_curvature);
+    const old = graph.needle.age + since > STALE;
+    const colour = old ? GREY : this.ink;
+    this.#line(arc, 8, this.halo);
+    if (old) context.setLineDash([4, 7]);
+    this.#line(arc, 4.5, colour);
+    context.setLineDash([]);
+    const [tip, before] = [this.placement.at(arc[arc.length - 1]), this.placement.at(arc[arc.length - 2])];
+    this.#head(tip, Math.atan2(tip[1] - before[1], tip[0] - before[0]), 11, colour);
+    context.beginPath();
+    context.arc(...this.placement.at(arc[0]), 4, 0, 2 * Math.PI);
+    context.fillStyle = this.halo;
+    context.fill();
+    context.lineWidth = 2;
+    context.strokeStyle = colour;
+    context.stroke();
+  }
+
+  // A triangle whose point lies ahead of a place.
+  #head([x, y], angle, size, colour) {
+    const { context } = this;
+    const [cos, sin] = [Math.cos(angle) * size, Math.sin(angle) * size];
+    context.beginPath();
+    context.moveTo(x + 0.6 * cos, y + 0.6 * sin);
+    context.lineTo(x - 0.4 * cos - 0.5 * sin, y - 0.4 * sin + 0.5 * cos);
+    context.lineTo(x - 0.4 * cos + 0.5 * sin, y - 0.4 * sin - 0.5 * cos);
+    context.closePath();
+    context.fillStyle = colour;
+    context.fill();
+  }
+
+  #drawVelocities(graph, since, maxSpeed) {
+    const { steering } = graph;
+    const points = this.needlePoints(graph);
+    if (!points || !steering || steering.age + since > STALE) return;
+    const tip = points[points.length - 1];
+    const scale = (ARROW * graph.dish_diameter * this.placement.scale) / maxSpeed;
+    this.#arrow(tip, steering.asked, scale, 2, [6, 4]);
+    this.#arrow(tip, steering.passed, scale, 4.5, []);
+  }
+
+  #arrow(from, velocity, scale, width, dash) {
+    const [right, down] = [velocity[0] * scale, -velocity[1] * scale];
+    const size = Math.hypot(right, down);
+    if (size < 3) return;
+    const { context } = this;
+    const to = [from[0] + right, from[1] + down];
+    for (const [wide, colour] of [[width + 3, this.halo], [width, this.velocity]]) {
+      context.setLineDash(colour === this.velocity ? dash : []);
+      context.beginPath();
+      context.moveTo(...from);
+      context.lineTo(...to);
+      context.lineWidth = wide;
+      context.strokeStyle = colour;
+      context.stroke();
+    }
+    context.setLineDash([]);
+    this.#head(to, Math.atan2(down, right), 8 + width, this.velocity);
+  }
+
+  #drawLeash({ from, to }) {
+    const { context } = this;
+    context.setLineDash([2, 5]);
+    context.beginPath();
+    context.moveTo(...from);
+    context.lineTo(...to);
+    context.lineWidth = 3;
+    context.strokeStyle = MIDDLING;
+    context.stroke();
+    context.setLineDash([]);
+    context.beginPath();
+    context.arc(...to, 9, 0, 2 * Math.PI);
+    context.stroke();
+  }
+
+  #drawScaleBar(width, height) {
+    const { context, placement } = this;
+    const step = STEPS.findLast((entry) => entry * placement.scale <= 130) ?? STEPS[0];
+    const size = step * placement.scale;
+    const [x, y] = [width - 18 - size, height - 16];
+    context.fillStyle = this.paper;
+    context.globalAlpha = 0.86;
+    context.fillRect(x - 9, y - 24, size + 18, 33);
+    context.globalAlpha = 1;
+    const ink = this.dark.matches ? "#e6ecf1" : "#1d2833";
+    context.strokeStyle = context.fillStyle = ink;
+    context.lineWidth = 2;
+    context.beginPath();
+    for (const [u, v] of [[x, y - 5], [x, y], [x + size, y], [x + size, y - 5]]) context.lineTo(u, v);
+    context.stroke();
+    context.font = '12px system-ui, "DejaVu Sans", sans-serif';
+    context.textAlign = "center";
+    context.fillText(`${step * 1e3} mm`, x + size / 2, y - 8);
+  }
+}

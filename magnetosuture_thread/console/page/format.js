@@ -1,0 +1,15 @@
+// Figures and words for a person. SI units in, millimetres and amperes out.
+
+export const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
+export const millimetres = (value, digits = 2) => (isNumber(value) ? `${(value * 1e3).toFixed(digits)} mm` : "none");
+export const speedText = (value) => (isNumber(value) ? `${(value * 1e3).toFixed(1)} mm/s` : "none");
+export const seconds = (value) => (isNumber(value) ? `${value.toFixed(value < 9.95 ? 1 : 0)} s` : "never");
+export const length = (vector) => (Array.isArray(vector) ? Math.hypot(vector[0], vector[1]) : null);
+export const capital = (text) => (text ? text[0].toUpperCase() + text.slice(1) : text);
+export const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
+
+// Least clearance over the nodes [m], null where no obstacle is near any.
+export function leastClearance(margins) {
+  const near = (margins?.clearance ?? []).filter(isNumber);
+  return margins?.valid && near.length ? Math.min(...near) : null;
+}

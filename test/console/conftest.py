@@ -1,0 +1,74 @@
+"""A console that is served in a thread, and a browser without a window that looks at it."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, sync_playwright
+
+from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.settings import ConsoleSettings
+from test.console.scene import RecordingGraph, RecordingHost
+
+TOKEN = "a-token-of-the-tests"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+class ServedConsole:
+    """A server in a loop and a thread of its own, over a graph and a host that a test looks at."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.graph, self.host = RecordingGraph(), RecordingHost()
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever)
+        self._thread.start()
+        self.server = ConsoleServer(ConsoleSettings(port=port, token=TOKEN), self.graph, self.host)
+        self.url = ""
+
+    def run(self, coroutine: Any) -> Any:
+        """Run a coroutine in the server's loop."""
+        return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(20.0)
+
+    def tear(self) -> None:
+        """End every connection without a word."""
+
+        async def abort() -> None:
+            for client in list(self.server._clients.values()):
+                transport = client._request.transport
+                assert transport is not None
+                transport.abort()
+
+        self.run(abort())
+
+    def close(self) -> None:
+        """Stop the server and its loop."""
+        self.run(self.server.stop())
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join()
+        self.loop.close()
+
+
+@pytest.fixture
+def served() -> Iterator[ServedConsole]:
+    """Serve the page for one test."""
+    console = ServedConsole()
+    console.url = console.run(console.server.start())
+    yield console
+    console.close()
+
+
+@pytest.fixture(scope="module")  # its loop must be gone before other tests start theirs
+def browser() -> Iterator[Browser]:
+    """Start Chromium without a window."""
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.skip("no chromium is installed; CI installs one")
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield started
+        started.close()

@@ -1,0 +1,234 @@
+"""A graph and a host that the console is tested with: they keep what they are told and show a scene like a hernia's."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
+from magnetosuture_thread.rig.camera.scene import Scene
+
+VIEW = DishView((322.0, 238.0), 8e-5)
+NODES = 40
+BLOCKS = [  # tissue on both sides of the ring
+    [(-0.0135, -0.0045), (-0.0075, -0.0045), (-0.0075, 0.0045), (-0.0135, 0.0045)],
+    [(0.0075, -0.0045), (0.0135, -0.0045), (0.0135, 0.0045), (0.0075, 0.0045)],
+]
+RING = 0.006
+TURN = 2.45  # of the thread around the ring [rad]
+LEAVES = -1.0  # where it comes to the ring [rad]
+
+
+def thread(points: int = NODES, wander: float = 0.0) -> np.ndarray:
+    """Return a thread that lies around the ring and runs on to its free end, from the tail on [m]."""
+    radius = RING + 0.00045
+    angles = np.linspace(LEAVES + TURN, LEAVES, 60)
+    wrapped = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    first, last = wrapped[0], wrapped[-1]
+    ahead = np.array([-math.sin(angles[0]), math.cos(angles[0])])
+    behind = np.array([math.sin(angles[-1]), -math.cos(angles[-1])])
+    out = first + np.linspace(0.0022, 0.0, 12)[:, None] * ahead
+    along = np.linspace(0.0, 0.008, 40)[:, None]
+    free = last + along * behind + 40.0 * along**2 * np.array([-0.4, -0.6])
+    line = np.vstack([out[:-1], wrapped, free[1:]])
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at = np.linspace(0.0, lengths[-1], points)
+    result = np.column_stack([np.interp(at, lengths, line[:, axis]) for axis in range(2)])
+    result[:, 1] += wander * np.sin(np.linspace(0.0, 9.0, points))
+    return result
+
+
+def heading() -> float:
+    """Return the needle's, straight on from the thread [rad]."""
+    line = thread(200)
+    return float(np.arctan2(*(line[0] - line[1])[::-1]))
+
+
+@functools.cache
+def picture() -> bytes:
+    """Return a frame of the scene as the bytes of a JPEG file."""
+    obstacles: list[Obstacle] = [Disc((0.0, 0.0), RING), *(Polygon(tuple(block)) for block in BLOCKS)]
+    camera = DishCamera(Scene(obstacles=obstacles), VIEW, seed=5)
+    return encode_jpeg(camera.render(thread()[0], heading(), thread(200, 4e-5)), 90).tobytes()
+
+
+def clearances(line: np.ndarray) -> list[float]:
+    """Return the distance of each node from the ring and the blocks [m]."""
+    from_ring = np.linalg.norm(line, axis=1) - RING
+    from_blocks = [
+        np.linalg.norm(np.maximum(np.maximum(np.min(block, axis=0) - line, line - np.max(block, axis=0)), 0.0), axis=1)
+        for block in np.array(BLOCKS)
+    ]
+    return np.minimum(from_ring, np.min(from_blocks, axis=0)).tolist()
+
+
+def triangles(block: list[tuple[float, float]]) -> list[list[float]]:
+    """Return a rectangle as the corners of two triangles."""
+    return [list(block[corner]) for corner in (0, 1, 2, 0, 2, 3)]
+
+
+def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[str, Any]:
+    """Return the state of a graph that is armed and tracked, as `Graph.state` has it."""
+    line = thread(nodes)
+    factor = 0.9**count if friction == "pulled" else 1.0
+    return {
+        "time": time.monotonic(),
+        "dish_diameter": 0.035,
+        "needle_length": 0.007,
+        "needle_curvature": 0.0,
+        "needle": {"tail": line[0].tolist(), "heading": heading(), "age": 0.02},
+        "tracker": {
+            "state": "tracked",
+            "reason": "",
+            "confidence": 0.97,
+            "view": {"centre": list(VIEW.centre_px), "scale": VIEW.metres_per_pixel, "rotation": VIEW.rotation},
+        },
+        "seen": thread(120, 4e-5).tolist(),
+        "predicted": {
+            "vertices": line.tolist(),
+            "residual": 1e-9,
+            "step_time": 2.1e-4,
+            "status": "solved",
+            "age": 0.02,
+        },
+        "margins": {
+            "valid": True,
+            "reason": "",
+            "clearance": clearances(line),
+            "least": {"connectivity": 4.1e-6, "compression": 1.2e-4, "obstacle": min(clearances(line))},
+            "contact": [],
+            "friction": {"state": friction, "nodes": list(range(13, 13 + count)), "slowdown": factor},
+        },
+        "obstacles": [{"disc": [0.0, 0.0, RING]}, *({"triangles": triangles(block)} for block in BLOCKS)],
+        "steering": {
+            "asked": [0.0, 0.0],
+            "passed": [0.0, 0.0],
+            "slowdown": factor,
+            "held_off": False,
+            "reason": "",
+            "age": 0.01,
+        },
+        "bridge": {
+            "state": "active",
+            "armed": True,
+            "emergency_stopped": False,
+            "reasons": [],
+            "commanded": [0.0, 0.0],
+            "applied": [0.0, 0.0],
+            "reached": [0.0, 0.0],
+            "saturated": False,
+            "driver": "simulated",
+            "driver_ready": True,
+            "driver_warnings": [],
+            "current": [0.0] * 4,
+            "measured_current": [0.0] * 4,
+            "refused": 0,
+            "age": 0.01,
+        },
+        "nodes": {
+            "vision_tracker": {"level": "ok", "message": "needle tracked", "values": {}, "age": 0.4},
+            "thread_model": {"level": "ok", "message": "predicting", "values": {}, "age": 0.3},
+            "coil_bridge": {"level": "ok", "message": "armed", "values": {}, "age": 0.5},
+        },
+    }
+
+
+class RecordingGraph:
+    """Keeps what it is told, and shows a state that a test may change."""
+
+    def __init__(self) -> None:
+        self.shown = state()
+        self.picture: tuple[int, bytes] | None = None
+        self.commands: list[tuple[float, tuple[float, float]]] = []  # when, and what
+        self.actions: list[str] = []
+        self.refusal = ""
+
+    @property
+    def velocities(self) -> list[tuple[float, float]]:
+        """The commands without their times."""
+        return [velocity for _, velocity in self.commands]
+
+    @property
+    def last(self) -> tuple[float, float] | None:
+        """The last command, None before the first."""
+        return self.commands[-1][1] if self.commands else None
+
+    def steer(self, velocity: tuple[float, float]) -> None:
+        """Keep a command."""
+        self.commands.append((time.monotonic(), velocity))
+        if self.shown["steering"]:
+            factor = self.shown["steering"]["slowdown"]
+            self.shown["steering"].update(asked=list(velocity), passed=[entry * factor for entry in velocity])
+
+    async def act(self, action: str) -> str:
+        """Keep what is asked of the bridge, and be what it then is."""
+        self.actions.append(action)
+        await asyncio.sleep(0)
+        if self.refusal:
+            return self.refusal
+        bridge = self.shown["bridge"]
+        changes: dict[str, dict[str, Any]] = {
+            "arm": {"armed": True},
+            "disarm": {"armed": False},
+            "stop": {"armed": False, "emergency_stopped": True, "state": "fault", "reasons": ["emergency stop"]},
+            "reset": {"emergency_stopped": False, "state": "active", "reasons": ["disarmed"]},
+        }
+        bridge.update(changes[action])
+        return ""
+
+    def state(self) -> dict[str, Any]:
+        """Return what is shown now."""
+        return {**self.shown, "time": time.monotonic()}
+
+    def frame(self) -> tuple[int, bytes] | None:
+        """Return the picture that is shown."""
+        return self.picture
+
+
+class RecordingHost:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, object]] = []
+        self.shown: dict[str, Any] = {
+            "mode": "simulated",
+            "scenario": "hernia_ring",
+            "scenarios": ["hernia_ring", "petri_35mm_polyamide"],
+            "can_pause": True,
+            "paused": False,
+            "can_record": True,
+            "recording": "",
+            "busy": "",
+            "simulated": True,
+        }
+
+    def state(self) -> dict[str, Any]:
+        """Return what is shown now."""
+        return dict(self.shown)
+
+    async def choose(self, scenario: str) -> str:
+        """Keep the scenario; refuse one that is not there."""
+        self.asked.append(("choose", scenario))
+        if scenario not in self.shown["scenarios"]:
+            return f"no scenario {scenario}"
+        self.shown["scenario"] = scenario
+        return ""
+
+    async def pause(self, still: bool) -> str:
+        """Keep that time stands still, or goes on."""
+        self.asked.append(("pause", still))
+        self.shown["paused"] = still
+        return ""
+
+    async def record(self, on: bool) -> str:
+        """Keep that something is recorded, or not any more."""
+        self.asked.append(("record", on))
+        self.shown["recording"] = "output/console/take_1" if on else ""
+        return ""

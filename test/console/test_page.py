@@ -1,0 +1,444 @@
+"""The operator's page in a real browser: what it does with keys and mouse, what it shows, and what it lets go of."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, ViewportSize, expect
+
+from magnetosuture_thread.geometry.arc import needle_axis
+from test.console.conftest import ServedConsole
+from test.console.scene import picture, state, thread
+
+SLOWEST = 15.0  # [s]
+REST = (0.0, 0.0)
+LAPTOP: ViewportSize = {"width": 1366, "height": 768}
+
+
+def until(page: Page, condition: Callable[[], Any]) -> Any:
+    """Wait until a condition holds, the browser going on meanwhile, and return what it gave."""
+    end = time.monotonic() + SLOWEST
+    while not (result := condition()):
+        assert time.monotonic() < end, "the condition has not come true"
+        page.wait_for_timeout(10)
+    return result
+
+
+class Operator:
+    """Somebody before the page."""
+
+    def __init__(self, page: Page, served: ServedConsole, token: bool = True) -> None:
+        self.page, self.served = page, served
+        self.complaints: list[str] = []
+        page.on("console", lambda message: self._hear(message.type, message.text))
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("requestfailed", lambda request: self.complaints.append(f"{request.url} failed"))
+        page.on("response", lambda response: self._hear("error" if response.status >= 400 else "", response.url))
+        page.goto(served.url if token else served.url.split("#")[0])
+        self.until(lambda: self.stats("states") > 1)
+
+    def _hear(self, kind: str, text: str) -> None:
+        if kind in ("error", "warning"):
+            self.complaints.append(text)
+
+    def until(self, condition: Callable[[], Any]) -> Any:
+        """Wait until a condition holds."""
+        return until(self.page, condition)
+
+    def stats(self, name: str) -> int:
+        """Return one of the page's counts."""
+        return int(self.page.evaluate(f"window.console_stats.{name}"))
+
+    def take(self) -> None:
+        """Take steering."""
+        self.page.click("#take")
+        expect(self.page.locator("#steers")).to_have_text("you steer")
+
+    def last(self, velocity: tuple[float, float]) -> None:
+        """Wait until this is the last command."""
+        self.until(lambda: self.served.graph.last == pytest.approx(velocity, abs=1e-9))
+
+    def nothing_more(self) -> None:
+        """See that no command goes out while several states come."""
+        before, seen = len(self.served.graph.commands), self.stats("states")
+        self.until(lambda: self.stats("states") > seen + 5)
+        assert len(self.served.graph.commands) == before
+
+    def more_commands(self, count: int) -> None:
+        """Wait until so many commands more have gone out."""
+        before = len(self.served.graph.commands)
+        self.until(lambda: len(self.served.graph.commands) > before + count)
+
+    def drawn(self, friction: str) -> str:
+        """Wait until a state of friction is drawn, and return its colour."""
+        expect(self.page.locator("#dish")).to_have_attribute("data-friction", friction)
+        return str(self.page.get_attribute("#dish", "data-colour"))
+
+    def colours_at(self, point: tuple[float, float], radius: int = 3) -> set[str]:
+        """Return the colours that the dish's canvas has around a point in the dish [m]."""
+        found = self.page.evaluate(
+            """([x, y, radius]) => {
+                const canvas = document.getElementById("dish");
+                const [u, v] = canvas.dataset.centre.split(",").map(Number);
+                const scale = Number(canvas.dataset.scale);
+                const size = 2 * radius + 1;
+                const copy = new OffscreenCanvas(size, size).getContext("2d", {willReadFrequently: true});
+                copy.drawImage(canvas, radius - Math.round(u + scale * x), radius - Math.round(v - scale * y));
+                const data = copy.getImageData(0, 0, size, size).data;
+                const colours = [];
+                for (let at = 0; at < data.length; at += 4)
+                    colours.push("#" + [0, 1, 2].map((c) => data[at + c].toString(16).padStart(2, "0")).join(""));
+                return colours;
+            }""",
+            [*point, radius],
+        )
+        return set(found)
+
+    def cut_off(self) -> list[str]:
+        """Return what is not wholly on the screen, or does not hold its text."""
+        found = self.page.evaluate(
+            """() => {
+                const words = "button, h2, .chip, figcaption";
+                const outside = ({left, top, right, bottom}) =>
+                    left < 0 || top < 0 || right > innerWidth || bottom > innerHeight;
+                const all = [...document.querySelectorAll(words + ", select, input, canvas, dd, #headline")];
+                return all.filter((element) => outside(element.getBoundingClientRect())
+                    || element.matches(words) && element.scrollWidth > element.clientWidth + 1
+                ).map((element) => element.id || element.textContent);
+            }"""
+        )
+        return [str(entry) for entry in found]
+
+
+@pytest.fixture
+def operator(browser: Browser, served: ServedConsole) -> Iterator[Operator]:
+    """Open the page on a laptop's screen; it must have nothing to complain of at the end."""
+    context = browser.new_context(viewport=LAPTOP)
+    opened = Operator(context.new_page(), served)
+    yield opened
+    assert opened.complaints == []
+    assert opened.stats("errors") == 0
+    context.close()
+
+
+def between(first: int, second: int) -> tuple[float, float]:
+    """Return the place in the middle between two nodes of the thread [m]."""
+    x, y = (thread()[first] + thread()[second]) / 2.0
+    return float(x), float(y)
+
+
+def test_the_page_loads_and_draws_every_state(operator: Operator):
+    operator.served.graph.picture = (1, picture())
+    expect(operator.page.locator("#dish")).to_have_attribute("data-image", "yes")
+    expect(operator.page.locator("#simulated")).to_be_visible()
+    expect(operator.page.locator("#headline")).to_have_text("The needle rests: nobody steers")
+    drawn, states = operator.stats("drawn"), operator.stats("states")
+    operator.until(lambda: operator.stats("drawn") > drawn + 5)
+    assert operator.stats("states") > states
+    assert operator.stats("frames") == 1
+
+
+KEYS = [
+    (["ArrowRight"], (1.0, 0.0)),
+    (["ArrowUp"], (0.0, 1.0)),
+    (["ArrowLeft", "ArrowDown"], (-math.sqrt(0.5), -math.sqrt(0.5))),
+    (["a", "w"], (-math.sqrt(0.5), math.sqrt(0.5))),
+    (["ArrowLeft", "ArrowRight", "s"], (0.0, -1.0)),
+]
+
+
+def test_keys_steer_while_they_are_held(operator: Operator):
+    operator.take()
+    for keys, direction in KEYS:
+        for key in keys:
+            operator.page.keyboard.down(key)
+        operator.last((0.003 * direction[0], 0.003 * direction[1]))
+        operator.more_commands(5)
+        for key in keys:
+            operator.page.keyboard.up(key)
+        operator.last(REST)
+
+
+def test_the_slider_sets_the_speed_and_takes_its_own_arrow_keys(operator: Operator):
+    operator.take()
+    operator.page.focus("#speed")
+    for _ in range(10):
+        operator.page.keyboard.press("ArrowRight")
+    expect(operator.page.locator("#speed-now")).to_have_text("4.0 mm/s")
+    assert operator.served.graph.commands == []
+    operator.page.locator("#dish").focus()
+    operator.page.keyboard.down("ArrowUp")
+    operator.last((0.0, 0.004))
+
+
+def test_a_gamepads_stick_steers_once_it_has_been_let_go(operator: Operator):
+    operator.take()
+    pad = "navigator.getGamepads = () => [{{connected: true, axes: [{}, {}]}}]"
+    operator.page.evaluate(pad.format(0.0, -1.0))
+    operator.nothing_more()  # it was pushed already when it came
+    operator.page.evaluate(pad.format(0.1, 0.1))
+    operator.nothing_more()  # a worn stick
+    operator.page.evaluate(pad.format(0.0, -1.0))
+    operator.last((0.0, 0.003))
+    operator.page.evaluate(pad.format(0.575, 0.0))
+    operator.last((0.0015, 0.0))
+    operator.page.evaluate("window.dispatchEvent(new Event('gamepaddisconnected'))")
+    operator.last(REST)
+    operator.nothing_more()
+
+
+def test_the_mouse_leads_the_needle_on_a_leash(operator: Operator):
+    operator.take()
+    needle = operator.served.graph.shown["needle"]
+    tip = needle_axis(thread()[0], needle["heading"], 0.007, 0.0, np.array([1.0]))[0][0]
+    box = operator.page.locator("#dish").bounding_box()
+    assert box is not None
+    scale = float(operator.page.get_attribute("#dish", "data-scale") or 0)
+    u, v = (float(entry) for entry in (operator.page.get_attribute("#dish", "data-centre") or "").split(","))
+    x, y = box["x"] + u + scale * float(tip[0]), box["y"] + v - scale * float(tip[1])
+    mouse = operator.page.mouse
+    mouse.move(x + 150, y + 200)
+    mouse.down()
+    mouse.move(x + 160, y + 200)
+    mouse.up()
+    assert operator.served.graph.commands == []  # not from the needle
+    mouse.move(x, y)
+    mouse.down()
+    mouse.move(x, y + 45)
+    operator.until(lambda: operator.served.graph.last and operator.served.graph.last[1] < 0.0)
+    mouse.move(x, y + 300)
+    operator.until(lambda: operator.served.graph.last == pytest.approx((0.0, -0.003), abs=3e-5))
+    mouse.move(box["x"] + box["width"] + 60, y)  # out of the dish
+    operator.last(REST)
+    mouse.move(x, y + 60)
+    mouse.up()
+    assert operator.served.graph.last == REST
+
+
+def test_a_key_that_is_held_as_focus_goes_has_to_be_pressed_anew(operator: Operator):
+    operator.take()
+    for lost in ("blur", "offline", "pagehide"):
+        operator.page.keyboard.down("ArrowRight")
+        operator.last((0.003, 0.0))
+        operator.page.evaluate(f"window.dispatchEvent(new Event('{lost}'))")
+        operator.last(REST)
+        operator.page.keyboard.down("ArrowRight")  # the browser repeats the key
+        operator.nothing_more()
+        operator.page.keyboard.up("ArrowRight")
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+    operator.page.context.set_offline(True)
+    operator.last(REST)
+    operator.page.context.set_offline(False)
+
+
+def test_a_hidden_tab_stops_the_needle_and_may_be_relieved(operator: Operator):
+    operator.take()
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+    hide = "Object.defineProperty(document, '{}', {{value: {}, configurable: true}})"
+    operator.page.evaluate(hide.format("hidden", "true"))
+    operator.page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    operator.last(REST)
+    assert operator.served.graph.velocities.count(REST) == 1
+    operator.until(lambda: operator.served.server._steering.available)
+
+
+def test_space_stops_everything_wherever_the_focus_is(operator: Operator):
+    operator.take()
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+    operator.page.focus("#take")
+    operator.page.keyboard.press("Space")
+    operator.until(lambda: operator.served.graph.actions == ["stop"])
+    assert operator.served.graph.last == REST
+    expect(operator.page.locator("#headline")).to_have_text("Emergency stop is pressed")
+    expect(operator.page.locator("#coils")).to_have_text("emergency stop")
+    expect(operator.page.locator("#steers")).to_have_text("you steer")  # the button in focus was not pressed
+    count = len(operator.served.graph.commands)
+    operator.page.click("#reset")
+    operator.page.click("#arm")
+    expect(operator.page.locator("#coils")).to_have_text("armed")
+    assert operator.served.graph.actions == ["stop", "reset", "arm"]
+    assert len(operator.served.graph.commands) == count
+    operator.page.keyboard.up("ArrowRight")
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+
+
+def test_a_torn_connection_stops_the_needle_and_steering_is_not_resumed(operator: Operator):
+    operator.take()
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+    operator.served.tear()
+    operator.last(REST)
+    expect(operator.page.locator("#link")).to_contain_text("Connected as page 2")
+    expect(operator.page.locator("#steers")).to_have_text("nobody steers")
+    operator.take()
+    operator.nothing_more()
+    operator.page.keyboard.up("ArrowRight")
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+
+
+def test_a_server_that_is_gone_is_said(operator: Operator):
+    operator.take()
+    operator.served.run(operator.served.server.stop())
+    expect(operator.page.locator("#headline")).to_contain_text("Not connected")
+    expect(operator.page.locator("#take")).to_be_disabled()
+    operator.page.keyboard.press("Space")
+    expect(operator.page.locator("#notice")).to_contain_text("the emergency stop did not go out")
+    expect(operator.page.locator("#dish")).to_have_attribute("data-friction", "old")
+    operator.complaints.clear()  # the browser says of each try that nobody is there
+
+
+def test_colours_tell_the_friction(operator: Operator):
+    graph = operator.served.graph
+    operator.page.emulate_media(color_scheme="light")
+    at = between(36, 37)
+    assert operator.drawn("free") == "#12a150"
+    assert "#12a150" in operator.colours_at(at)
+    seen = []
+    for count in (1, 4, 8):
+        graph.shown = state("pulled", count)
+        expect(operator.page.locator("#friction")).to_contain_text(f"pulled: {count} node")
+        expect(operator.page.locator("#friction")).to_contain_text(f"{0.9**count:.2f}")
+        seen.append(operator.drawn("pulled"))
+        operator.until(lambda: seen[-1] in operator.colours_at(at))
+    greens = [int(colour[3:5], 16) for colour in seen]
+    assert greens == sorted(greens, reverse=True)  # deeper with every node
+    assert len(set(seen)) == 3
+    graph.shown = state("resting", 3)
+    assert operator.drawn("resting") == "#2f6bff"
+    assert "#2f6bff" in operator.colours_at(at)
+    graph.shown["margins"].update(valid=False, reason="no program was solved")
+    assert operator.drawn("invalid") == "#7d8790"
+    expect(operator.page.locator("#margins")).to_contain_text("no program was solved")
+    graph.shown = state("free")
+    graph.shown["predicted"]["age"] = 2.0
+    assert operator.drawn("old") == "#7d8790"
+
+
+def test_nodes_are_coloured_by_their_clearance(operator: Operator):
+    clearance = operator.served.graph.shown["margins"]["clearance"]
+    clearance[30:33] = [1e-4, 6e-4, 2e-3]
+    points = [between(node, node) for node in (30, 31, 32)]
+    operator.until(lambda: "#d1122f" in operator.colours_at(points[0], 1))
+    assert "#f08c00" in operator.colours_at(points[1], 1)
+    assert "#12a150" in operator.colours_at(points[2], 1)
+
+
+def test_a_second_page_watches_and_takes_over_when_it_is_handed_back(browser: Browser, operator: Operator):
+    operator.take()
+    context = browser.new_context(viewport=LAPTOP)
+    other = Operator(context.new_page(), operator.served)
+    expect(other.page.locator("#steers")).to_have_text("page 1 steers")
+    expect(other.page.locator("#take")).to_be_disabled()
+    expect(other.page.locator("#stop")).to_be_enabled()
+    other.page.keyboard.down("ArrowRight")
+    seen = other.stats("states")
+    other.until(lambda: other.stats("states") > seen + 5)
+    assert operator.served.graph.commands == []
+    other.page.keyboard.up("ArrowRight")
+    operator.page.click("#take")
+    other.take()
+    expect(operator.page.locator("#steers")).to_have_text("page 2 steers")
+    assert other.complaints == []
+    context.close()
+    expect(operator.page.locator("#steers")).to_have_text("nobody steers")
+
+
+def test_without_the_token_every_control_is_off(browser: Browser, served: ServedConsole):
+    context = browser.new_context(viewport=LAPTOP)
+    watcher = Operator(context.new_page(), served, token=False)
+    expect(watcher.page.locator("#how")).to_contain_text("only watches")
+    for control in ("stop", "arm", "disarm", "reset", "take", "pause", "record", "scenario"):
+        expect(watcher.page.locator(f"#{control}")).to_be_disabled()
+    watcher.page.keyboard.press("Space")
+    expect(watcher.page.locator("#notice")).to_contain_text("only watches")
+    assert served.graph.actions == []
+    assert watcher.complaints == []
+    context.close()
+
+
+def test_scenario_pause_and_record_reach_the_host(operator: Operator):
+    expect(operator.page.locator("#pause")).to_be_disabled()
+    operator.take()
+    operator.page.select_option("#scenario", "petri_35mm_polyamide")
+    operator.until(lambda: operator.served.host.shown["scenario"] == "petri_35mm_polyamide")
+    operator.page.click("#pause")
+    expect(operator.page.locator("#headline")).to_have_text("Paused: time stands still")
+    operator.page.click("#pause")
+    operator.page.click("#record")
+    expect(operator.page.locator("#recording")).to_contain_text("output/console/take_1")
+    operator.page.click("#record")
+    operator.until(lambda: len(operator.served.host.asked) == 5)
+    assert operator.served.host.asked == [
+        ("choose", "petri_35mm_polyamide"), ("pause", True), ("pause", False), ("record", True), ("record", False),
+    ]  # fmt: skip
+
+
+WHY = [
+    ("bridge", {"armed": False, "reasons": ["disarmed"]}, "Disarmed: press Arm"),
+    ("bridge", {"state": "inactive"}, "Coil bridge is inactive"),
+    ("bridge", {"state": "fault", "armed": False, "reasons": ["coil 2 is stuck"]}, "Fault: coil 2 is stuck"),
+    ("bridge", {"driver_ready": False}, "Driver simulated is not ready"),
+    ("bridge", {"age": 4.0}, "Coil bridge silent for 4"),
+    ("tracker", {"state": "lost", "reason": "no needle in sight"}, "Needle lost: no needle in sight"),
+    ("needle", {"age": 2.0}, "No needle pose for 2"),
+    ("steering", {"asked": [0.003, 0.0], "reason": "no prediction"}, "The needle rests: no prediction"),
+    ("steering", {"asked": [0.003, 0.0], "held_off": True}, "Held off: an obstacle is in the way"),
+    ("bridge", {"applied": [0.003, 0.0], "reached": [0.0021, 0.0]}, "Moving at 2.1 mm/s"),
+]
+
+
+def test_the_page_says_why_the_needle_rests(operator: Operator):
+    headline = operator.page.locator("#headline")
+    for part, changes, said in WHY:
+        operator.served.graph.shown = state()
+        operator.served.graph.shown[part].update(changes)
+        expect(headline).to_contain_text(said)
+
+
+def test_what_is_silent_and_what_was_never_heard_is_said(operator: Operator):
+    shown = operator.served.graph.shown
+    shown["nodes"]["thread_model"]["age"] = 9.0
+    row = operator.page.locator("#nodes li", has_text="thread model")
+    expect(row).to_contain_text("silent")
+    expect(row).to_contain_text("nothing for 9")
+    expect(row).to_have_class("stale")
+    for part in ("needle", "tracker", "predicted", "margins", "steering", "bridge"):
+        shown[part] = None
+    shown.update(seen=[], obstacles=[], nodes={})
+    expect(operator.page.locator("#headline")).to_have_text("Nothing heard from the coil bridge yet")
+    expect(operator.page.locator("#friction")).to_have_text("nothing predicted yet")
+    expect(operator.page.locator("#seeing")).to_contain_text("No camera image yet")
+
+
+def test_nothing_is_cut_off(operator: Operator):
+    operator.served.graph.shown = state("pulled", 12)
+    for width, height in ((1366, 768), (1024, 700)):
+        operator.page.set_viewport_size({"width": width, "height": height})
+        operator.drawn("pulled")
+        expect(operator.page.locator("#friction")).to_contain_text("12 nodes")
+        assert operator.cut_off() == []
+        dish = operator.page.locator("#dish").bounding_box()
+        assert dish is not None
+        assert min(dish["width"], dish["height"]) > 0.55 * height
+
+
+def test_light_and_dark_follow_the_system(operator: Operator):
+    def lightness() -> float:
+        colour = str(operator.page.evaluate("getComputedStyle(document.body).backgroundColor"))
+        return sum(int(part) for part in colour[4:-1].split(",")) / 765.0
+
+    operator.page.emulate_media(color_scheme="light")
+    operator.until(lambda: lightness() > 0.85)
+    operator.page.emulate_media(color_scheme="dark")
+    operator.until(lambda: lightness() < 0.15)
+    operator.until(lambda: "#232d36" in operator.colours_at((0.0, 0.014), 1))  # the plain dish is drawn dark too

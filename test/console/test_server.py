@@ -1,0 +1,556 @@
+"""The server, with a client that is no browser and may lie."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import aiohttp
+import pytest
+
+from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.errors import ConfigurationError
+from test.console.scene import RecordingGraph, RecordingHost, picture
+
+TOKEN = "a-token-of-the-tests"
+SLOWEST = 10.0  # [s]
+REST = (0.0, 0.0)
+
+
+async def until(condition: Callable[[], Any]) -> Any:
+    """Wait until a condition holds, and return what it gave."""
+    end = time.monotonic() + SLOWEST
+    while not (result := condition()):
+        assert time.monotonic() < end, "the condition has not come true"
+        await asyncio.sleep(0.002)
+    return result
+
+
+class Page:
+    """A connected client, and what it was told."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket  # an aiohttp.ClientWebSocketResponse
+        self.told: list[dict[str, Any]] = []
+        self.frames: list[bytes] = []
+        self.number = 0
+        self.answers = True
+        self.reading = asyncio.create_task(self._read())
+
+    async def _read(self) -> None:
+        async for message in self.socket:
+            what = "state"
+            if message.type is aiohttp.WSMsgType.BINARY:
+                self.frames.append(message.data)
+                what = "frame"
+            else:
+                self.told.append(json.loads(message.data))
+                if self.told[-1]["type"] != "state":
+                    continue
+            if self.answers:
+                with contextlib.suppress(ConnectionError):
+                    await self.say(type="got", what=what)
+
+    async def say(self, **word: Any) -> None:
+        """Send a message."""
+        await self.socket.send_str(json.dumps(word))
+
+    async def hold(self, x: float, y: float, speed: float = 0.003, sent: float | None = None) -> None:
+        """Say that a direction is held, now."""
+        await self.say(type="hold", direction=[x, y], speed=speed, sent=time.monotonic() if sent is None else sent)
+
+    def tear(self) -> None:
+        """End the TCP connection without a word."""
+        self.socket._conn.transport.abort()
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        """Return what was told of a kind."""
+        return [message for message in self.told if message["type"] == kind]
+
+    async def pictures(self, count: int) -> None:
+        """Wait until so many frames have come."""
+        await until(lambda: len(self.frames) >= count)
+
+    @property
+    def lease(self) -> dict[str, Any]:
+        """Who steers, as last told."""
+        states = self.of("state")
+        return states[-1]["lease"] if states else {}
+
+    async def take(self) -> None:
+        """Take steering, and see that everybody is told."""
+        await self.say(type="take")
+        await until(lambda: self.lease.get("holder") == self.number)
+
+
+class Console:
+    """A server for one test, its graph and its host."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.graph, self.host = RecordingGraph(), RecordingHost()
+        self.settings = ConsoleSettings(**{"port": 0, "token": TOKEN, **settings})
+        self.server = ConsoleServer(self.settings, self.graph, self.host)
+        self.url = ""
+        self.session: aiohttp.ClientSession
+        self.sockets: list[Any] = []
+
+    async def connect(self, **options: Any) -> Any:
+        """Connect without a word."""
+        self.sockets.append(await self.session.ws_connect(self.url + "socket", **options))
+        return self.sockets[-1]
+
+    async def page(self, token: str = TOKEN, **options: Any) -> Page:
+        """Connect a page and greet."""
+        page = Page(await self.connect(**options))
+        await page.say(type="hello", token=token)
+        page.number = (await until(lambda: page.of("welcome")))[0]["you"]
+        return page
+
+
+@contextlib.asynccontextmanager
+async def console(**settings: Any) -> AsyncIterator[Console]:
+    """Serve for one test."""
+    served = Console(**settings)
+    served.url = (await served.server.start()).split("#")[0]
+    async with aiohttp.ClientSession() as served.session:
+        yield served
+        await served.server.stop()
+        await asyncio.gather(*(socket.close() for socket in served.sockets))
+
+
+def run(test: Callable[[Console], Awaitable[None]], **settings: Any) -> None:
+    """Run a test against a server of its own."""
+
+    async def served() -> None:
+        async with console(**settings) as here:
+            await test(here)
+
+    asyncio.run(served())
+
+
+def test_the_page_is_served_whole_and_lets_nothing_else_in():
+    async def test(here: Console) -> None:
+        async with here.session.get(here.url) as response:
+            assert response.status == 200
+            policy = response.headers["Content-Security-Policy"]
+            assert "default-src 'none'" in policy
+            assert "unsafe" not in policy
+            assert response.headers["X-Content-Type-Options"] == "nosniff"
+            text = await response.text()
+        assert "http" not in text
+        assert TOKEN not in text
+        for name in ("main.js", "style.css", "icon.svg"):
+            async with here.session.get(here.url + name) as response:
+                assert response.status == 200
+        for name in ("server.py", "..%2fserver.py", "page/main.js", "%2e%2e/settings.py"):
+            async with here.session.get(here.url + name) as response:
+                assert response.status == 404
+        async with here.session.post(here.url) as response:
+            assert response.status == 405
+
+    run(test)
+
+
+@pytest.mark.parametrize("path", ["", "main.js", "socket"])
+def test_another_host_name_is_refused(path: str):
+    async def test(here: Console) -> None:
+        async with here.session.get(here.url + path, headers={"Host": "evil.example"}) as response:
+            assert response.status == 403
+
+    run(test)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1"])
+def test_a_page_of_another_site_cannot_connect(origin: str):
+    async def test(here: Console) -> None:
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await here.session.ws_connect(here.url + "socket", origin=origin)
+        assert refused.value.status == 403
+        await here.page(origin=here.url.rstrip("/"))
+
+    run(test)
+
+
+def test_a_random_token_is_made_where_none_is_configured():
+    async def start() -> str:
+        server = ConsoleServer(ConsoleSettings(port=0), RecordingGraph(), RecordingHost())
+        url = await server.start()
+        await server.stop()
+        return url.split("#token=")[1]
+
+    tokens = {asyncio.run(start()) for _ in range(3)}
+    assert len(tokens) == 3
+    assert all(len(token) >= 20 for token in tokens)
+
+
+def test_a_port_that_is_taken_is_said():
+    async def test(here: Console) -> None:
+        port = int(here.url.rstrip("/").rsplit(":", 1)[1])
+        other = ConsoleServer(ConsoleSettings(port=port), here.graph, here.host)
+        with pytest.raises(ConfigurationError, match=rf"console\.port: got {port}"):
+            await other.start()
+
+    run(test)
+
+
+@pytest.mark.parametrize("token", ["", "wrong", TOKEN + "x"])
+def test_without_the_token_one_watches_and_nothing_else(token: str):
+    async def test(here: Console) -> None:
+        page = await here.page(token)
+        assert page.of("welcome")[0]["commands"] is False
+        await page.say(type="take")
+        await page.hold(1, 0)
+        for word in (
+            {"type": "act", "action": "stop"},
+            {"type": "act", "action": "arm"},
+            {"type": "choose", "scenario": "hernia_ring"},
+            {"type": "pause", "still": True},
+            {"type": "record", "on": True},
+            {"type": "hello", "token": TOKEN},
+        ):
+            await page.say(**word)
+        await until(lambda: len(page.of("error")) == 8 and page.lease)
+        assert page.lease["holder"] is None
+        assert page.of("state")[-1]["graph"]["needle"]
+        assert (here.graph.commands, here.graph.actions, here.host.asked) == ([], [], [])
+
+    run(test)
+
+
+def test_who_says_nothing_first_or_something_else_is_cut_off():
+    async def test(here: Console) -> None:
+        socket = await here.connect()
+        await socket.send_str('{"type": "take"}')
+        assert (await socket.receive(timeout=SLOWEST)).type is aiohttp.WSMsgType.CLOSE
+
+    run(test)
+
+
+def test_a_key_becomes_commands_until_it_is_released():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(0, 1)
+        await until(lambda: len(here.graph.commands) >= 4)
+        await page.hold(1, 0, speed=99.0)
+        await until(lambda: here.graph.last == (here.settings.max_speed, 0.0))
+        await page.say(type="release")
+        await until(lambda: here.graph.last == REST)
+        assert here.graph.velocities[0] == (0.0, 0.003)
+        assert here.graph.velocities.count(REST) == 1
+        count = len(here.graph.commands)
+        states = len(page.told)
+        await until(lambda: len(page.told) > states + 3)
+        assert len(here.graph.commands) == count
+
+    run(test)
+
+
+def test_the_first_command_does_not_wait_for_a_period():
+    """At 10 Hz of commands ten keys in a row would take a second; each is passed on as it comes."""
+
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        angles = [0.1 * number for number in range(10)]
+        for angle in angles:
+            await page.hold(math.cos(angle), math.sin(angle))
+        await until(lambda: len(here.graph.commands) >= 10)
+        turned = [math.atan2(y, x) for x, y in here.graph.velocities[:10]]
+        assert turned == pytest.approx(angles)
+
+    run(test, rate=10.0, hold_timeout=1.0)
+
+
+def test_silence_stops_the_needle_though_the_connection_stands():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == REST)
+        first, last = here.graph.commands[0][0], here.graph.commands[-1][0]
+        assert last - first >= here.settings.hold_timeout - 0.02
+        assert page.lease["holder"] == page.number
+        assert here.graph.velocities.count(REST) == 1
+
+    run(test)
+
+
+def test_a_connection_that_is_torn_stops_the_needle_before_any_timeout():
+    async def test(here: Console) -> None:
+        page, watcher = await here.page(), await here.page()
+        await page.take()
+        await page.hold(1, 0)
+        await until(lambda: len(here.graph.commands) > 1)
+        page.tear()
+        await until(lambda: here.graph.last == REST)
+        assert here.graph.commands[-1][0] - here.graph.commands[0][0] < 30.0
+        await until(lambda: watcher.lease["holder"] is None)
+
+    run(test, hold_timeout=1.0)
+
+
+def test_words_that_the_network_held_up_move_nothing_and_a_page_that_stays_late_has_to_connect_again():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(1, 0, sent=100.0)
+        await page.hold(0, 1, sent=99.0)
+        await until(lambda: here.graph.last == REST)
+        assert "late" in page.of("error")[0]["text"]
+        assert (0.0, 0.003) not in here.graph.velocities
+        while not page.socket.closed:
+            with contextlib.suppress(ConnectionError):
+                await page.hold(0, 1, sent=99.0)
+            await asyncio.sleep(0.02)
+        assert (0.0, 0.003) not in here.graph.velocities
+        await until(lambda: not here.server._clients)
+
+    run(test)
+
+
+def test_one_steers_and_the_other_watches_until_it_is_handed_back():
+    async def test(here: Console) -> None:
+        first, second = await here.page(), await here.page()
+        await first.take()
+        await second.say(type="take")
+        refusal = (await until(lambda: second.of("done")))[0]["refusal"]
+        assert f"page {first.number} steers" in refusal
+        await second.hold(0, -1)
+        await until(lambda: second.of("error"))
+        for word in ({"type": "act", "action": "arm"}, {"type": "pause", "still": True}):
+            await second.say(**word)
+        await until(lambda: len(second.of("error")) == 3)
+        assert (here.graph.commands, here.graph.actions, here.host.asked) == ([], [], [])
+        await first.hold(1, 0)
+        await first.say(type="hand_back")
+        await until(lambda: second.lease["holder"] is None)
+        assert here.graph.last == REST
+        await second.take()
+        assert first.lease["pages"] == 2
+        await until(lambda: first.lease["holder"] == second.number)
+
+    run(test)
+
+
+def test_a_hidden_page_steers_nothing_and_may_be_relieved():
+    async def test(here: Console) -> None:
+        first, second = await here.page(), await here.page()
+        await first.take()
+        await first.hold(1, 0)
+        await first.say(type="visible", seen=False)
+        await first.hold(1, 0)
+        await until(lambda: first.of("error"))
+        assert here.graph.velocities[-1] == REST
+        await until(lambda: second.lease["available"])
+        await second.take()
+        await first.say(type="visible", seen=True)
+        await first.hold(1, 0)
+        await until(lambda: len(first.of("error")) == 2)
+        assert here.graph.velocities.count(REST) == 1
+
+    run(test, hold_timeout=1.0)
+
+
+def test_an_emergency_stop_of_anybody_rests_the_needle_until_the_key_is_let_go():
+    async def test(here: Console) -> None:
+        first, second = await here.page(), await here.page()
+        await first.take()
+        await first.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+        await second.say(type="act", action="stop")
+        await until(lambda: here.graph.actions == ["stop"])
+        assert here.graph.last == REST
+        count = len(here.graph.commands)
+        await first.hold(1, 0)
+        await first.say(type="act", action="reset")
+        await until(lambda: here.graph.actions == ["stop", "reset"])
+        await first.hold(1, 0)
+        await first.say(type="act", action="arm")
+        await until(lambda: here.graph.actions == ["stop", "reset", "arm"])
+        assert len(here.graph.commands) == count
+        await first.say(type="release")
+        await first.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+
+    run(test, hold_timeout=1.0)
+
+
+def test_a_refusal_is_told():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        here.graph.refusal = "arm: got emergency stop, expected a reset before"
+        await page.say(type="act", action="arm")
+        await page.say(type="choose", scenario="nowhere")
+        await until(lambda: len(page.of("done")) == 3)
+        refusals = {entry["what"]: entry["refusal"] for entry in page.of("done")}
+        assert refusals == {"take": "", "arm": here.graph.refusal, "choose": "no scenario nowhere"}
+
+    run(test)
+
+
+def test_the_host_is_told_what_the_one_who_steers_asks_for():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.say(type="choose", scenario="petri_35mm_polyamide")
+        await page.say(type="pause", still=True)
+        await page.say(type="record", on=True)
+        await until(lambda: len(here.host.asked) == 3)
+        assert here.host.asked == [("choose", "petri_35mm_polyamide"), ("pause", True), ("record", True)]
+        await until(lambda: page.of("state")[-1]["host"]["recording"] != "")
+
+    run(test)
+
+
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        "", "nonsense", "[" * 3000, '{"type": "hold", "direction": [NaN, 0], "speed": 1, "sent": 1}',
+        '{"type": "hold", "direction": [1e999, 0], "speed": 1, "sent": 1}', '{"type": "hold", "direction": "left"}',
+        json.dumps({"type": "release", "ballast": "x" * 5000}), b"\x00\x01\x02",
+    ],
+)  # fmt: skip
+def test_a_hostile_message_is_refused_and_counts_as_a_release(hostile: str | bytes):
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+        await (page.socket.send_bytes if isinstance(hostile, bytes) else page.socket.send_str)(hostile)
+        await until(lambda: page.of("error"))
+        assert here.graph.last == REST
+        await page.hold(0, 1)
+        await until(lambda: here.graph.last == (0.0, 0.003))
+
+    run(test, hold_timeout=1.0)
+
+
+def test_a_huge_message_ends_the_connection_and_the_movement():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+        with contextlib.suppress(ConnectionError):
+            await page.socket.send_str("x" * 10_000_000)
+        await until(lambda: here.graph.last == REST)
+        await until(lambda: page.socket.closed)
+        assert page.socket.close_code == 1009
+
+    run(test, hold_timeout=1.0)
+
+
+def test_a_flood_of_messages_is_refused():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        for _ in range(1500):
+            await page.say(type="release")
+        await until(lambda: any("in a second" in entry["text"] for entry in page.of("error")))
+
+    run(test)
+
+
+def test_a_page_that_says_nothing_of_what_it_got_gets_two_states_and_no_more():
+    async def test(here: Console) -> None:
+        slow = Page(await here.connect())
+        slow.answers = False
+        await slow.say(type="hello", token="")
+        quick = await here.page()
+        for number in range(1, 30):
+            here.graph.picture = (number, picture())
+            await quick.pictures(number)
+        await until(lambda: len(quick.of("state")) > 20)
+        assert len(slow.of("state")) == 2
+        assert len(slow.frames) == 2
+        slow.answers = True
+        await slow.say(type="got", what="frame")
+        await until(lambda: len(slow.frames) == 3)
+        assert int.from_bytes(slow.frames[-1][:8], "big") == 29
+
+    run(test, frame_rate=100.0)
+
+
+def test_a_page_that_stops_reading_does_not_delay_the_others():
+    async def test(here: Console) -> None:
+        stuck = await here.page()
+        stuck.socket._conn.transport.pause_reading()
+        quick = await here.page()
+        await quick.take()
+        for number in range(1, 200):
+            here.graph.picture = (number, picture() * 20)
+            await asyncio.sleep(0)
+        await quick.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+        states = len(quick.of("state"))
+        await until(lambda: len(quick.of("state")) > states + 10)
+        stuck.tear()
+
+    run(test)
+
+
+def test_a_page_that_comes_later_gets_the_frame_that_stands():
+    async def test(here: Console) -> None:
+        here.graph.picture = (7, picture())
+        first = await here.page()
+        await until(lambda: first.frames)
+        second = await here.page()
+        await until(lambda: second.frames)
+        assert second.frames == [(7).to_bytes(8, "big") + picture()]
+
+    run(test)
+
+
+def test_numbers_that_are_not_finite_reach_the_page_as_null():
+    async def test(here: Console) -> None:
+        here.graph.shown["margins"]["least"]["obstacle"] = math.inf
+        here.graph.shown["bridge"]["reached"] = [math.nan, 0.0]
+        page = await here.page()
+        await until(lambda: page.of("state"))
+        shown = page.of("state")[-1]["graph"]
+        assert shown["margins"]["least"]["obstacle"] is None
+        assert shown["bridge"]["reached"] == [None, 0.0]
+
+    run(test)
+
+
+def test_the_end_of_the_server_steers_to_rest_first():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+        stopping = asyncio.create_task(here.server.stop())
+        await asyncio.sleep(0)
+        assert here.graph.last == REST  # before any connection has ended
+        await stopping
+        await until(lambda: page.socket.closed)
+        assert page.socket.close_code == 1001
+
+    run(test, hold_timeout=1.0)
+
+
+def test_what_ends_the_telling_is_raised_at_the_end():
+    class Broken(RecordingGraph):
+        def state(self) -> dict[str, Any]:
+            raise RuntimeError("no state")
+
+    async def test() -> None:
+        server = ConsoleServer(ConsoleSettings(port=0, token=TOKEN), Broken(), RecordingHost())
+        url = (await server.start()).split("#")[0]
+        async with aiohttp.ClientSession() as session:
+            socket = await session.ws_connect(url + "socket")
+            await until(lambda: server._telling is not None and server._telling.done())
+            with pytest.raises(RuntimeError, match="no state"):
+                await server.stop()
+            await socket.close()
+
+    asyncio.run(test())
