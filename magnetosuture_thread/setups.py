@@ -9,6 +9,7 @@ import numpy as np
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import load_setup
+from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.model.settings import ThreadModelSettings
@@ -16,7 +17,14 @@ from magnetosuture_thread.resources import setup_file
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-CLASSES = (VisionTrackerSettings, ThreadModelSettings, CoilBridgeSettings, RigSettings, PathFollowerSettings)
+CLASSES = (
+    VisionTrackerSettings,
+    ThreadModelSettings,
+    CoilBridgeSettings,
+    RigSettings,
+    PathFollowerSettings,
+    ConsoleSettings,
+)
 
 SAME = (
     (("vision_tracker", "thread_length"), ("thread_model", "length")),
@@ -24,6 +32,9 @@ SAME = (
     (("path_follower", "needle_length"), ("vision_tracker", "needle_length")),
     (("path_follower", "needle_curvature"), ("coil_bridge", "needle_curvature")),
     (("coil_bridge", "dish_diameter"), ("vision_tracker", "dish_diameter")),
+    (("console", "dish_diameter"), ("vision_tracker", "dish_diameter")),
+    (("console", "needle_length"), ("vision_tracker", "needle_length")),
+    (("console", "needle_curvature"), ("coil_bridge", "needle_curvature")),
     (("coil_bridge", "disc_obstacles"), ("thread_model", "disc_obstacles")),
     (("coil_bridge", "polygon_obstacles"), ("thread_model", "polygon_obstacles")),
     (("coil_bridge", "polygon_sizes"), ("thread_model", "polygon_sizes")),
@@ -42,6 +53,7 @@ class Setup:
         coils: settings of the coil bridge.
         rig: settings of the simulated rig.
         follower: settings of the path follower.
+        console: settings of the operator's page.
     """
 
     name: str
@@ -51,6 +63,7 @@ class Setup:
     coils: CoilBridgeSettings
     rig: RigSettings
     follower: PathFollowerSettings
+    console: ConsoleSettings
 
 
 def read_setup(name: str) -> Setup:

@@ -78,6 +78,9 @@ def test_in_every_setup_that_ships_the_path_keeps_clear_of_wall_and_obstacles(na
         ("path_follower: {ros__parameters: {waypoints: [0.0, 0.0, 0.0335, 0.001]}}", "within the dish, 0.0175 m"),
         ("path_follower: {ros__parameters: {needle_curvature: 8.0}}", "as coil_bridge.needle_curvature"),
         ("coil_bridge: {ros__parameters: {dish_diameter: 0.05}}", "as vision_tracker.dish_diameter"),
+        ("console: {ros__parameters: {dish_diameter: 0.05}}", "as vision_tracker.dish_diameter"),
+        ("console: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
+        ("console: {ros__parameters: {needle_curvature: 8.0}}", "as coil_bridge.needle_curvature"),
         ("coil_bridge: {ros__parameters: {disc_obstacles: [0.0, 0.0, 0.002]}}", "as thread_model.disc_obstacles"),
         ("thread_model: {ros__parameters: {disc_obstacles: [0.0, 0.0, 0.002]}}", "as thread_model.disc_obstacles"),
         (
