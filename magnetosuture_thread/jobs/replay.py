@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import yaml
 
-from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, GraphError
 from magnetosuture_thread.interface import (
-    CAMERA,
-    CAMERA_INFO,
     CURRENTS,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
-    NODES,
-    SEEN_THREAD,
+    PAUSE_REPLAY,
     TRUE_THREAD,
-    Channel,
 )
 from magnetosuture_thread.jobs.judge import Given, opened, write_results
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
-from magnetosuture_thread.offline.changes import CHANGING
+from magnetosuture_thread.jobs.playing import SHORTEST_LOOP, Playing
 from magnetosuture_thread.offline.predictions import sights
 from magnetosuture_thread.study.currents import CurrentSeries
 from magnetosuture_thread.study.replayed import Collector, Spread, Summary, error_figures, stage_latencies
@@ -36,9 +30,6 @@ from magnetosuture_thread.study.replayed import Collector, Spread, Summary, erro
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.replay import LiveReplay
 
-# A replayed bag never moves a needle, so its bridge may arm itself.
-NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE)
-SHORTEST_LOOP = 1.5  # s; nodes take a jump back of a second and less for messages that come late
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
 
@@ -138,23 +129,6 @@ class _Replay:
     say: Say
     progress: Progress
 
-    @property
-    def channels(self) -> list[Channel]:
-        """Return what is played."""
-        camera = self.given.recording.camera
-        source = (camera, CAMERA_INFO) if self.given.source == "camera" else (NEEDLE_POSE, SEEN_THREAD)
-        counts = self.given.recording.counts
-        return [
-            channel
-            for channel in (*source, NEEDLE_COMMAND, *CHANGING)
-            if channel is not None and counts.get(channel.recorded)
-        ]
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        """Return the nodes of the graph."""
-        return NODES if self.given.source == "camera" else tuple(name for name in NODES if name != "vision_tracker")
-
     def run(self, loop: bool) -> tuple[Summary, str]:
         """Play the bag into the graph, record and judge its outputs; return what went wrong later, as well."""
         # Only here, where it is needed: without ROS the other commands still work.
@@ -165,20 +139,18 @@ class _Replay:
             graph_environment,
             reserved_domain,
         )
-        from magnetosuture_thread.nodes.replay import DEPTH, PAUSE, LiveReplay
+        from magnetosuture_thread.nodes.replay import LiveReplay
         from magnetosuture_thread.nodes.replay_time import Timeline
 
         qos = self.folder / "lossless.yaml"
-        qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
-        known = [*topics.INPUTS, *topics.SETTINGS, *topics.OUTPUTS]
-        played = [topic for topic in known if topic.channel in self.channels]
+        playing = Playing(self.given)
         problem = ""
         with reserved_domain() as domain:
             environment = graph_environment(domain)
-            self.say(f"starting {', '.join(self.nodes)} (ROS domain {domain}, this machine only)")
+            self.say(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
             with (
                 environment_of(environment),
-                NodeProcesses(self.nodes, self._arguments(qos), environment, self.folder / "logs") as nodes,
+                NodeProcesses(playing.nodes, playing.arguments(qos), environment, self.folder / "logs") as nodes,
             ):
                 outputs = BagWriter(self.folder / "bag", self.given.notes)
                 for topic in topics.OUTPUTS:
@@ -186,15 +158,15 @@ class _Replay:
                 live = LiveReplay(
                     domain,
                     Timeline(self.given.begin, self.rate),
-                    played=played,
-                    nodes=len(self.nodes),
+                    played=playing.topics(),
+                    nodes=len(playing.nodes),
                     receive=outputs.write,
                     watch=nodes.check,
                     say=self.say,
                 )
                 try:
                     with outputs:
-                        self._play(live, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE} std_srvs/srv/SetBool")
+                        self._play(live, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE_REPLAY}")
                     self.say("judging what came out")
                     summary = self._judge(live)
                     if loop:
@@ -204,39 +176,24 @@ class _Replay:
         qos.unlink()
         return summary, problem
 
-    def _arguments(self, qos: Path) -> list[str]:
-        files = [part for path in (self.given.setup.path, qos) for part in ("--params-file", str(path.resolve()))]
-        arguments = [*files, "-p", "use_sim_time:=true", *NOTHING_MOVES]
-        for transport, channel in CAMERA.items():
-            if self.given.source == "camera" and channel == self.given.recording.camera:
-                arguments += ["-p", f"vision_tracker:image_transport:={transport}"]
-        return arguments
-
     def _play(self, live: LiveReplay, pause: str) -> None:
         live.wait_for_graph()
         at = f" at {self.rate:g} times the speed" if self.rate != 1.0 else ""
         self.say(f"playing {self.given.duration:.1f} s{at}")
-        self.say(f'to pause: {pause} "{{data: true}}", to go on: false')
+        self.say(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
         length = max(self.given.duration, 1e-9)
-        live.play(self._records(), lambda time: self.progress(min(1.0, time / length)))
+        live.play(Playing(self.given).records(), lambda time: self.progress(min(1.0, time / length)))
 
     def _play_on(self, live: LiveReplay) -> str:
         """Play on for who watches; return what ended it, if it was not a person."""
         self.say("the first pass is recorded and judged; playing on until Ctrl-C")
         try:
-            live.play_on(self._records)
+            live.play_on(Playing(self.given).records)
         except KeyboardInterrupt:
             self.say("ended")
         except GraphError as error:
             return str(error)
         return ""
-
-    def _records(self) -> Iterator[Record]:
-        given = self.given
-        if given.start > 0.0:  # what was said before of obstacles and thread is in force
-            for record in given.recording.records(CHANGING, duration=given.start):
-                yield replace(record, time=given.begin)
-        yield from given.recording.records(self.channels, start=given.start, duration=given.duration)
 
     def _judge(self, live: LiveReplay) -> Summary:
         """Put the outputs side by side; write summary.json and summary.png."""

@@ -117,7 +117,7 @@ class NodeProcesses:
             for name in self._names:
                 self.start(name)
         except BaseException:
-            self._end()
+            self.end()
             raise
         return self
 
@@ -125,7 +125,7 @@ class NodeProcesses:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End the nodes, politely first."""
-        self._end()
+        self.end()
 
     def check(self) -> None:
         """Raise `GraphError`, with its last words, if a node has ended."""
@@ -167,11 +167,13 @@ class NodeProcesses:
         """Return whether a node has ended."""
         return self._processes[label].poll() is not None
 
-    def _end(self) -> None:
-        for process in self._processes.values():
+    def end(self, *labels: str) -> None:
+        """End nodes, politely first, and wait until they have ended; all of them if none is named."""
+        ending = [self._processes.pop(label) for label in labels or tuple(self._processes)]
+        for process in ending:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
-        for process in self._processes.values():
+        for process in ending:
             try:
                 process.wait(GRACE)
             except subprocess.TimeoutExpired:

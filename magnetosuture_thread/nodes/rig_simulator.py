@@ -21,6 +21,7 @@ from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.rig_currents import RigCurrents
 from magnetosuture_thread.nodes.rig_frames import FramePublisher
+from magnetosuture_thread.nodes.rig_time import RigTime
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Frame, Rig
@@ -39,14 +40,14 @@ class RigSimulatorNode(Node):
         self._settings = settings = declare(self, RigSettings)
         # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
         simulated = bool(self.get_parameter("use_sim_time").value)
-        self._pace = settings.pace if simulated else 1.0
+        pace = settings.pace if simulated else 1.0
         self.get_logger().info("loading the rig's kernels; the first start on a machine compiles them")
         self.rig = Rig(settings)
         self.rig.warm_up()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health = Health(self)
-        self._epoch = EPOCH if simulated else self.get_clock().now().nanoseconds
-        self._started = self._steady.now().nanoseconds
+        epoch = EPOCH if simulated else self.get_clock().now().nanoseconds
+        self.time = RigTime(self, epoch, pace, simulated=simulated)
         self._phase: float | None = None
         self._last_index = -1
         self._frames = self._skipped = 0
@@ -55,8 +56,8 @@ class RigSimulatorNode(Node):
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
         if simulated:
             self._clocks = topics.CLOCK.publisher(self)
-            self.create_timer(CLOCK_PERIOD / self._pace, self.on_clock, clock=self._steady)
-        self.create_timer(1.0 / (settings.frame_rate * self._pace), self.on_frame, clock=self._steady)
+            self.create_timer(CLOCK_PERIOD / pace, self.on_clock, clock=self._steady)
+        self.create_timer(1.0 / (settings.frame_rate * pace), self.on_frame, clock=self._steady)
         self.currents = RigCurrents(self, settings, self._steady, self._apply)
         self.get_logger().info("ready: everything here is simulated")
 
@@ -69,11 +70,14 @@ class RigSimulatorNode(Node):
 
     def on_clock(self) -> None:
         """Say what time it is in the simulation."""
-        self._clocks.publish(ClockMessage(clock=Time(nanoseconds=self._stamp(self._elapsed())).to_msg()))
+        self._clocks.publish(ClockMessage(clock=Time(nanoseconds=self.time.stamp(self.time.elapsed())).to_msg()))
 
     def on_frame(self) -> None:
         """Take the frame that is due; one that nobody had time for is left out."""
-        elapsed = self._elapsed()
+        if self.time.paused:
+            self._health.ok("paused")
+            return
+        elapsed = self.time.elapsed()
         if self._phase is None:
             self._phase = elapsed
         index = math.floor((elapsed - self._phase) * self._settings.frame_rate + EARLY)
@@ -96,7 +100,7 @@ class RigSimulatorNode(Node):
 
     def _apply(self, currents: NDArray[np.float64]) -> None:
         try:
-            self.rig.apply(currents, self._elapsed())
+            self.rig.apply(currents, self.time.elapsed())
         except InvalidInputError as error:
             self._health.refuse(error)
         except MagnetosutureError as error:
@@ -108,7 +112,7 @@ class RigSimulatorNode(Node):
         except MagnetosutureError as error:
             self._fail(error)
             return
-        stamp = self._stamp(frame.time)  # currents may have moved the rig on since the frame was due
+        stamp = self.time.stamp(frame.time)  # currents may have moved the rig on since the frame was due
         if frame.lateness:
             self._late.append((elapsed + frame.lateness, stamp, frame))
         else:
@@ -120,13 +124,6 @@ class RigSimulatorNode(Node):
         """Switch the coils off where the simulation does not find its next state, and say so."""
         self.rig.switch_off()
         self._health.error(str(error))
-
-    def _elapsed(self) -> float:
-        """Return the rig's own time since the node's start [s]."""
-        return (self._steady.now().nanoseconds - self._started) * 1e-9 * self._pace
-
-    def _stamp(self, elapsed: float) -> int:
-        return self._epoch + round(elapsed * 1e9)
 
 
 def main(arguments: list[str] | None = None) -> int:

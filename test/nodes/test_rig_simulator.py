@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import time
+
 import cv2
 import numpy as np
 import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 from std_msgs.msg import String
+from std_srvs.srv import SetBool
 
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 
@@ -154,11 +158,67 @@ def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
 
 def test_a_simulated_clock_runs_at_its_pace(graph):
     node = graph.add(RigSimulatorNode, use_sim_time=True, pace=3.0, **SMALL)
+    real, elapsed = time.perf_counter(), node.time.elapsed()
     clocks, needles = graph.listen(topics.CLOCK), graph.listen(topics.TRUE_NEEDLE)
     graph.wait(lambda: len(clocks) > 20 and len(needles) > 5, "clocks and frames")
     simulated = (nanoseconds(clocks[-1].clock) - nanoseconds(clocks[0].clock)) * 1e-9
     assert simulated > 0.0
     assert nanoseconds(clocks[-1].clock) < 1000e9  # it began near zero
     assert abs(nanoseconds(needles[-1].header.stamp) - nanoseconds(clocks[-1].clock)) < 1e9
-    real = (node._steady.now().nanoseconds - node._started) * 1e-9
-    assert (nanoseconds(clocks[-1].clock) - 1e9) * 1e-9 == pytest.approx(3.0 * real, rel=0.3)
+    assert nanoseconds(clocks[-1].clock) <= node.time.stamp(node.time.elapsed())
+    assert node.time.elapsed() - elapsed == pytest.approx(3.0 * (time.perf_counter() - real), rel=0.3)
+
+
+def test_a_paused_rig_stands_still_and_goes_on_from_there_with_stamps_of_now(graph):
+    needles = graph.listen_later(topics.TRUE_NEEDLE)
+    node = graph.add(RigSimulatorNode, **SMALL)
+    console = graph.probe.create_client(SetBool, PAUSE_RIG)
+
+    def pulled(distance: float) -> bool:
+        graph.publish(topics.RIG_CURRENTS, currents(graph, 5, 0, -2, 0))
+        return bool(needles and needles[-1].pose.position.x > 0.003 + distance)
+
+    def pause(still: bool) -> None:
+        answer = console.call_async(SetBool.Request(data=still))
+        graph.wait(answer.done, "an answer")
+        assert answer.result().success
+
+    graph.wait(console.service_is_ready, "the service")
+    graph.wait(lambda: pulled(2e-4), "the needle to move")
+    pause(True)
+    elapsed, taken = node.time.elapsed(), node.rig.time
+    graph.wait(lambda: len(needles) == later(graph, needles), "no more frames")
+    paused_at, where = graph.probe.get_clock().now().nanoseconds, needles[-1].pose.position.x
+    graph.publish(topics.RIG_CURRENTS, currents(graph, 5, 0, -2, 0))
+    graph.wait(lambda: graph.probe.get_clock().now().nanoseconds - paused_at > 3e8, "a while")
+    count = len(needles)
+    assert (node.time.elapsed(), node.rig.time) == (elapsed, pytest.approx(taken, abs=0.1))
+    pause(False)
+    graph.wait(lambda: len(needles) > count, "frames again")
+    first = needles[count]
+    assert first.pose.position.x == pytest.approx(where, abs=5e-4)
+    assert nanoseconds(first.header.stamp) > paused_at + 2e8
+    assert nanoseconds(first.header.stamp) <= graph.probe.get_clock().now().nanoseconds
+    graph.wait(lambda: pulled(8e-4), "the needle to move on")
+
+
+def later(graph, needles) -> int:
+    """Return how many there are once three frames more could have come."""
+    until = graph.probe.get_clock().now().nanoseconds + 1e8
+    graph.wait(lambda: graph.probe.get_clock().now().nanoseconds > until, "three frames' time")
+    return len(needles)
+
+
+def test_a_paused_simulated_clock_stands_still(graph):
+    node = graph.add(RigSimulatorNode, use_sim_time=True, **SMALL)
+    clocks = graph.listen(topics.CLOCK)
+    graph.wait(lambda: len(clocks) > 5, "/clock")
+    node.time.pause(True)
+    still = node.time.stamp(node.time.elapsed())
+    graph.wait(lambda: nanoseconds(clocks[-1].clock) == still, "the clock to stand still")
+    count = len(clocks)
+    graph.wait(lambda: len(clocks) > count + 20, "more of it")
+    assert {nanoseconds(message.clock) for message in clocks[count:]} == {still}
+    node.time.pause(False)
+    graph.wait(lambda: nanoseconds(clocks[-1].clock) > still, "the clock to go on")
+    assert nanoseconds(clocks[-1].clock) < still + 60e9

@@ -1,0 +1,116 @@
+"""Who serves the operator's page on a replayed bag."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.jobs.console_hosts import RecordingHost
+from magnetosuture_thread.jobs.playing import Playing
+from magnetosuture_thread.jobs.simulate import Say
+from magnetosuture_thread.nodes.console_graph import ConsoleGraph
+from magnetosuture_thread.nodes.processes import NodeProcesses
+from magnetosuture_thread.nodes.replay import LiveReplay
+from magnetosuture_thread.nodes.replay_time import Timeline
+
+ONLY_WATCHED = "this is a replay: nothing steers it or switches it on"
+
+
+class ReplayHost(RecordingHost):
+    """A bag that is played through the nodes over and over; nothing moves by it.
+
+    Args:
+        graph: that is looked at.
+        playing: the bag.
+        domain: the graph's ROS domain.
+        environment: for the nodes.
+        logs: folder for what each node prints.
+        say: called with a line for a person.
+    """
+
+    mode = "replay"
+
+    def __init__(
+        self,
+        graph: ConsoleGraph,
+        playing: Playing,
+        domain: int,
+        environment: Mapping[str, str],
+        logs: Path,
+        say: Say,
+    ) -> None:
+        super().__init__(graph, playing.given.setup, Path(), say)
+        self._playing, self._domain = playing, domain
+        self._environment, self._logs = dict(environment), logs
+        self._nodes: NodeProcesses | None = None
+        self._asked = threading.Event()
+        self._problem: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="replay")
+        self.busy = f"starting the nodes for {playing.given.recording.path}"
+        graph.held = ONLY_WATCHED
+
+    def state(self) -> dict[str, Any]:
+        """Return what runs and what is possible now."""
+        recording = self._playing.given.recording
+        simulated = bool(recording.notes.get("simulated", ""))
+        return {**super().state(), "scenario": str(recording.path), "can_record": False, "simulated": simulated}
+
+    def start(self) -> None:
+        """Start the nodes, and play the bag once they are there."""
+        arguments = self._playing.arguments(self._logs / "lossless.yaml")
+        self._nodes = NodeProcesses(self._playing.nodes, arguments, self._environment, self._logs).__enter__()
+        self._thread.start()
+
+    async def record(self, on: bool) -> str:
+        """Refuse: what the nodes make of a bag is recorded by another command."""
+        return "what comes of a bag is recorded by `magnetosuture replay BAG --output DIR`"
+
+    async def watch(self) -> None:
+        """Raise `GraphError` if a node has ended, or the bag cannot be played on."""
+        if self._problem is not None:
+            raise self._problem
+
+    async def close(self) -> None:
+        """End the replay and its nodes."""
+        self._asked.set()
+        if self._thread.is_alive():
+            await asyncio.to_thread(self._thread.join)
+        if self._nodes is not None:
+            await asyncio.to_thread(self._nodes.end)
+
+    def _run(self) -> None:
+        """Play until somebody asks this to end; in a thread, as a replay waits for the graph in its own way."""
+        playing = self._playing
+        live = LiveReplay(
+            self._domain,
+            Timeline(playing.given.begin, 1.0),
+            played=playing.topics(),
+            nodes=len(playing.nodes),
+            receive=lambda topic, time, data: None,
+            watch=self._check,
+            say=self.say,
+        )
+        try:
+            live.wait_for_graph()
+            self.busy = ""
+            live.play_on(playing.records)
+        except _AskedToEndError:
+            pass
+        except MagnetosutureError as error:
+            self._problem = error
+        finally:
+            live.close()
+
+    def _check(self) -> None:
+        if self._asked.is_set():
+            raise _AskedToEndError
+        if self._nodes is not None:
+            self._nodes.check()
+
+
+class _AskedToEndError(Exception):
+    """The replay is to end."""

@@ -1,0 +1,69 @@
+"""The console node: the operator's page, served on the graph of its ROS domain."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+
+import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.nodes.console_graph import ConsoleGraph
+from magnetosuture_thread.nodes.console_host import NAME, GraphHost
+from magnetosuture_thread.nodes.diagnostics import PERIOD, Health
+from magnetosuture_thread.nodes.parameters import declare
+
+
+async def serve(node: Node, settings: ConsoleSettings) -> None:
+    """Serve the page until this process is asked to end; the needle is told to rest first."""
+    loop, asked = asyncio.get_running_loop(), asyncio.Event()
+    for which in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(which, asked.set)
+    graph = ConsoleGraph(node, settings)
+    server = ConsoleServer(settings, graph, GraphHost(graph))
+    url = await server.start()
+    print(f"the operator's page: {url}", flush=True)
+    health = Health(node)
+    health.ok(f"serving on {settings.address}")
+    try:
+        while not asked.is_set():
+            graph.now()  # of which the report is stamped
+            health.publish()
+            try:
+                await asyncio.wait_for(asked.wait(), PERIOD)
+            except asyncio.TimeoutError:
+                continue
+    finally:
+        await server.stop()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node as a program; return 0 when it was asked to end, 1 when it could not start."""
+    node = None
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        # No executor spins it, so nobody would answer who asks for its parameters.
+        node = rclpy.create_node(
+            NAME, automatically_declare_parameters_from_overrides=True, start_parameter_services=False
+        )
+        asyncio.run(serve(node, declare(node, ConsoleSettings)))
+    except (MagnetosutureError, ParameterException, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        pass  # before the page was there
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

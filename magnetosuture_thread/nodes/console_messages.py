@@ -1,0 +1,177 @@
+"""The graph's messages as what the operator's page is told: pure functions, plain types."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3
+from magnetosuture_msgs.msg import (
+    BarrierMargin,
+    CoilBridgeState,
+    PredictedThread,
+    SafetyMargins,
+    SteeringState,
+    TrackerState,
+)
+from nav_msgs.msg import Path
+from visualization_msgs.msg import Marker, MarkerArray
+
+from magnetosuture_thread.geometry.orientation import angle_of
+from magnetosuture_thread.nodes.messages import needle_pose
+
+TRACKER = {
+    TrackerState.STATE_SEARCHING: "searching",
+    TrackerState.STATE_TRACKED: "tracked",
+    TrackerState.STATE_LOST: "lost",
+}
+BRIDGE = {
+    CoilBridgeState.STATE_UNCONFIGURED: "unconfigured",
+    CoilBridgeState.STATE_INACTIVE: "inactive",
+    CoilBridgeState.STATE_ACTIVE: "active",
+    CoilBridgeState.STATE_FAULT: "fault",
+}
+FRICTION = {
+    SafetyMargins.FRICTION_UNKNOWN: "unknown",
+    SafetyMargins.FRICTION_FREE: "free",
+    SafetyMargins.FRICTION_PULLED: "pulled",
+    SafetyMargins.FRICTION_RESTING: "resting",
+}
+KINDS = {
+    BarrierMargin.KIND_CONNECTIVITY: "connectivity",
+    BarrierMargin.KIND_COMPRESSION: "compression",
+    BarrierMargin.KIND_OBSTACLE: "obstacle",
+    BarrierMargin.KIND_ENHANCED_CONNECTIVITY: "enhanced_connectivity",
+    BarrierMargin.KIND_STIFFNESS: "stiffness",
+}
+LEVELS = {
+    DiagnosticStatus.OK: "ok",
+    DiagnosticStatus.WARN: "warn",
+    DiagnosticStatus.ERROR: "error",
+    DiagnosticStatus.STALE: "silent",
+}
+
+
+def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
+    """Return the needle's tail [m] and the angle of its heading there [rad].
+
+    Raises:
+        InvalidInputError: the pose is none in the dish plane.
+    """
+    pose = needle_pose(message)
+    return {"tail": pose.tail.tolist(), "heading": angle_of(pose.heading)}
+
+
+def tracker(message: TrackerState) -> dict[str, Any]:
+    """Return what the tracker says, and where the dish is in the image if it knows."""
+    view = None
+    if len(message.dish_centre) == 2 and message.metres_per_pixel > 0.0:
+        view = {
+            "centre": list(message.dish_centre),
+            "scale": message.metres_per_pixel,
+            "rotation": message.camera_rotation,
+        }
+    state = TRACKER.get(message.state, "searching")
+    return {"state": state, "reason": message.reason, "confidence": message.confidence, "view": view}
+
+
+def seen(message: Path) -> list[list[float]]:
+    """Return the vertices of the seen centreline [m]."""
+    places = (placed.pose.position for placed in message.poses)
+    return [[place.x, place.y] for place in places]
+
+
+def predicted(message: PredictedThread) -> dict[str, Any]:
+    """Return the predicted vertices [m], and how they were found."""
+    return {
+        "vertices": [[vertex.x, vertex.y] for vertex in message.vertices],
+        "residual": message.residual,
+        "step_time": message.step_time,
+        "status": message.solver_status,
+    }
+
+
+def margins(message: SafetyMargins) -> dict[str, Any]:
+    """Return the margins by node and by kind, as distances [m]; no number of a message that is not valid."""
+    return {
+        "valid": message.valid,
+        "reason": message.reason,
+        "clearance": clearances(message) if message.valid else [],
+        "least": {KINDS.get(least.kind, str(least.kind)): least.clearance for least in message.least},
+        "contact": list(message.contact_nodes),
+        "friction": {
+            "state": FRICTION.get(message.friction_state, "unknown"),
+            "nodes": list(message.friction_nodes),
+            "slowdown": message.slowdown,
+        },
+    }
+
+
+def clearances(message: SafetyMargins) -> list[float | None]:
+    """Return each node's least clearance of any obstacle [m]; None where none is near."""
+    nodes = np.asarray(message.node, dtype=np.intp)
+    if not nodes.size:
+        return []
+    least = np.full(int(nodes.max()) + 1, np.inf)
+    near = np.asarray(message.kind, dtype=np.uint8) == BarrierMargin.KIND_OBSTACLE
+    np.minimum.at(least, nodes[near], np.asarray(message.clearance)[near])
+    return [value if value < np.inf else None for value in least.tolist()]
+
+
+def obstacles(message: MarkerArray) -> list[dict[str, Any]]:
+    """Return the obstacles that markers show: discs as x, y and radius [m], others as the corners of triangles."""
+    shown: list[dict[str, Any]] = []
+    for marker in message.markers:
+        if marker.action != Marker.ADD:
+            continue
+        if marker.type == Marker.CYLINDER:
+            place = marker.pose.position
+            shown.append({"disc": [place.x, place.y, 0.5 * marker.scale.x]})
+        elif marker.type == Marker.TRIANGLE_LIST:
+            shown.append({"triangles": [[corner.x, corner.y] for corner in marker.points]})
+    return shown
+
+
+def steering(message: SteeringState) -> dict[str, Any]:
+    """Return what became of the velocity that the operator asked for [m/s]."""
+    return {
+        "asked": _plane(message.asked),
+        "passed": _plane(message.passed),
+        "slowdown": message.slowdown,
+        "held_off": message.held_off,
+        "reason": message.reason,
+    }
+
+
+def bridge(message: CoilBridgeState) -> dict[str, Any]:
+    """Return what the coil bridge does and why: velocities [m/s], currents [A]."""
+    return {
+        "state": BRIDGE.get(message.state, "fault"),
+        "armed": message.armed,
+        "emergency_stopped": message.emergency_stopped,
+        "reasons": list(message.reasons),
+        "commanded": _plane(message.commanded),
+        "applied": _plane(message.applied),
+        "reached": _plane(message.reached),
+        "saturated": message.saturated,
+        "driver": message.driver,
+        "driver_ready": message.driver_ready,
+        "driver_warnings": list(message.driver_warnings),
+        "current": list(message.current),
+        "measured_current": list(message.measured_current),
+        "refused": message.refused,
+    }
+
+
+def node_state(status: DiagnosticStatus) -> dict[str, Any]:
+    """Return what a node says of itself."""
+    return {
+        "level": LEVELS.get(status.level, "error"),
+        "message": status.message,
+        "values": {value.key: value.value for value in status.values},
+    }
+
+
+def _plane(velocity: Vector3) -> list[float]:
+    return [velocity.x, velocity.y]

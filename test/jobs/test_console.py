@@ -1,0 +1,365 @@
+"""The command `magnetosuture console` as a person runs it, with a page that is a program."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+import rclpy
+from magnetosuture_msgs.msg import CoilCurrents
+from rclpy.context import Context
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.cli import main
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.console_inbox import Inbox
+from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "post_wrap"
+OTHER = "petri_35mm_polyamide_post"
+WAIT = 60.0  # s
+
+
+class Console:
+    """The command, running."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+        self.lines: list[str] = []
+        self._reading = threading.Thread(target=self._read)
+        self._reading.start()
+
+    def find(self, pattern: str) -> str:
+        """Wait for a line of its output, and return what the pattern's group holds."""
+        deadline = time.monotonic() + WAIT
+        while time.monotonic() < deadline:
+            for line in list(self.lines):
+                if found := re.search(pattern, line):
+                    return found[1]
+            assert self.process.poll() is None, self.lines
+            time.sleep(0.02)
+        raise AssertionError(f"no {pattern} in {self.lines}")
+
+    def end(self) -> int:
+        """Press Ctrl-C, and return its exit code."""
+        self.process.send_signal(signal.SIGINT)
+        code = self.process.wait(30.0)
+        self._reading.join(10.0)
+        return code
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip())
+
+
+@contextmanager
+def running(*arguments: str, **environment: str) -> Iterator[Console]:
+    """Run the command on a free port; end it at the end if it has not."""
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "MAGNETOSUTURE_TOKEN": "only-for-this-test-0123", **environment},
+    ) as process:
+        console = Console(process)
+        try:
+            yield console
+        finally:
+            if process.poll() is None:
+                console.end()
+
+
+class Page:
+    """What a page in a browser does, without one."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse[bool]) -> None:
+        self._socket = socket
+        self._held: asyncio.Task[None] | None = None
+        self._answers: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        self.frames = 0
+        self.errors: list[str] = []
+        self.busy: set[str] = set()
+        self.graph: dict[str, Any] = {}
+        self.host: dict[str, Any] = {}
+
+    async def say(self, kind: str, **fields: Any) -> None:
+        """Say a word."""
+        await self._socket.send_str(json.dumps({"type": kind, **fields}))
+
+    async def ask(self, kind: str, **fields: Any) -> str:
+        """Ask for something and return the refusal, empty if it was done."""
+        await self.say(kind, **fields)
+        try:
+            answer = await asyncio.wait_for(self._answers.get(), WAIT)
+        except asyncio.TimeoutError:
+            raise AssertionError(f"no answer to {kind} {fields}; {self.errors[-5:]}") from None
+        return str(answer["refusal"])
+
+    def hold(self, direction: tuple[float, float], speed: float) -> None:
+        """Hold a key from now on."""
+
+        async def again_and_again() -> None:
+            while True:
+                await self.say("hold", direction=list(direction), speed=speed, sent=time.monotonic())
+                await asyncio.sleep(0.02)
+
+        self._held = asyncio.create_task(again_and_again())
+
+    async def let_go(self) -> None:
+        """Let the key go."""
+        if self._held is not None:
+            self._held.cancel()
+            await asyncio.gather(self._held, return_exceptions=True)
+        await self.say("release")
+
+    async def until(self, condition: Callable[[], Any], what: str) -> None:
+        """Wait until the page is told something."""
+        deadline = time.monotonic() + WAIT
+        while not (self.graph and condition()):
+            assert time.monotonic() < deadline, (
+                f"waited for {what}; {self.errors[-5:]}, {self.host}, {self.graph.get('bridge')}"
+            )
+            await asyncio.sleep(0.02)
+
+    async def listen(self) -> None:
+        """Hear what the page is told."""
+        async for message in self._socket:
+            if message.type is aiohttp.WSMsgType.BINARY:
+                self.frames += 1
+                await self.say("got", what="frame")
+                continue
+            told = json.loads(message.data)
+            if told["type"] == "state":
+                self.graph, self.host = told["graph"], told["host"]
+                self.busy.add(self.host["busy"])
+                await self.say("got", what="state")
+            elif told["type"] == "done":
+                self._answers.put_nowait(told)
+            elif told["type"] == "error":
+                self.errors.append(told["text"])
+        self.errors.append(f"the connection ended with {self._socket.close_code}")
+
+
+@asynccontextmanager
+async def opened(url: str) -> Any:
+    """Open the page at an address as the command prints it."""
+    address, token = url.split("/#token=")
+    async with aiohttp.ClientSession() as session, session.ws_connect(f"{address}/socket") as socket:
+        page = Page(socket)
+        await page.say("hello", token=token)
+        listening = asyncio.create_task(page.listen())
+        try:
+            yield page
+        finally:
+            await page.let_go()
+            listening.cancel()
+            await asyncio.gather(listening, return_exceptions=True)
+
+
+@contextmanager
+def wire(domain: int) -> Iterator[Inbox]:
+    """Give what goes to the simulated coils."""
+    context = Context()
+    rclpy.init(context=context, domain_id=domain, args=[])
+    node = rclpy.create_node("wire", context=context)
+    try:
+        yield Inbox(node, topics.RIG_CURRENTS, 10)
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def tail(page: Page) -> np.ndarray:
+    """Return where the needle's tail is seen."""
+    return np.array(page.graph["needle"]["tail"])
+
+
+async def steer_and_stop(page: Page, currents: Inbox, recordings: Path) -> None:
+    """Arm, steer, record, stop in an emergency, and choose another scenario."""
+    await page.until(lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "the graph")
+    assert page.host["mode"] == "simulated"
+    assert page.host["simulated"]
+    assert OTHER in page.host["scenarios"]
+    assert not page.graph["bridge"]["armed"]
+    assert await page.ask("take") == ""
+    assert await page.ask("record", on=True) == ""
+    await page.until(lambda: page.host["recording"], "the recording")
+    assert await page.ask("act", action="arm") == ""
+    before = tail(page)
+    page.hold((1.0, 0.0), 0.005)
+    await page.until(lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
+    assert abs(tail(page)[1] - before[1]) < 1e-3
+    await page.until(lambda: any(page.graph["bridge"]["current"]), "currents")
+    assert page.graph["steering"]["asked"] == [0.005, 0.0]
+    assert await page.ask("pause", still=True) == ""
+    await page.until(lambda: page.host["paused"] and page.graph["needle"]["age"] > 0.5, "no poses any more")
+    await page.until(lambda: not any(page.graph["bridge"]["current"]), "no currents without poses")
+    await page.let_go()
+    assert await page.ask("pause", still=False) == ""
+    await page.until(lambda: page.graph["needle"]["age"] < 0.5, "poses again")
+    await page.let_go()  # what was held before counts no more
+    page.hold((1.0, 0.0), 0.003)
+    await page.until(lambda: any(page.graph["bridge"]["current"]), "currents again")
+    assert await page.ask("act", action="stop") == ""
+    await page.until(lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
+    await page.let_go()
+    list(currents.take())
+    heard: list[CoilCurrents] = []
+
+    def enough() -> bool:
+        heard.extend(one for one, _ in currents.read())
+        return len(heard) > 10
+
+    await page.until(enough, "currents on the wire")
+    assert not any(any(one.current) for one in heard)
+    assert await page.ask("record", on=False) == ""
+    check(next(recordings.iterdir()))
+    assert "expected one of" in await page.ask("choose", scenario="../../etc/passwd.yaml")
+    await record_a_second(page)
+    assert await page.ask("choose", scenario=OTHER) == ""
+    await page.until(lambda: page.host["scenario"] == OTHER, "the other scenario to begin")
+    assert not page.host["recording"]
+    await page.until(lambda: not page.host["busy"] and page.graph["predicted"], "the other scenario")
+    assert f"starting {OTHER}" in page.busy
+    assert len(page.graph["obstacles"]) == 1
+    assert not page.graph["bridge"]["emergency_stopped"]
+    await record_a_second(page)
+
+
+async def record_a_second(page: Page) -> None:
+    """Begin a recording, and let it run for a second of the graph's time."""
+    assert await page.ask("record", on=True) == ""
+    began = page.graph["time"]
+    await page.until(lambda: page.host["recording"] and page.graph["time"] > began + 1.0, "a second")
+
+
+def check(path: Path) -> Bag:
+    """Check that a recording is whole and holds what was steered."""
+    bag = Bag(path)
+    assert bag.damage is None
+    assert "steered by a person" in bag.notes["simulated"]
+    assert "thread_model" in bag.notes["scenario"]
+    for name in ("/operator/servo_cv", "/needle/servo_cv", "/camera/image_raw/compressed", "/thread/obstacles"):
+        assert bag.counts[name] > 0, name
+    wishes = [record.decode().twist.linear.x for record in bag.records({"/operator/servo_cv"})]
+    assert 0.005 in wishes
+    return bag
+
+
+@pytest.mark.whole_graph
+def test_a_person_steers_the_simulated_rig(tmp_path: Path):
+    recordings = tmp_path / "recordings"
+
+    async def use(url: str, currents: Inbox) -> None:
+        async with opened(url) as page:
+            await steer_and_stop(page, currents, recordings)
+
+    with running("petri_35mm_polyamide", "--record", str(recordings)) as console:
+        domain = int(console.find(r"ROS domain (\d+)"))
+        url = console.find(r"open (http://127\.0\.0\.1:\d+/#token=only-for-this-test-0123)$")
+        with wire(domain) as currents:
+            asyncio.run(use(url, currents))
+        assert console.end() == 0
+    assert console.lines[-1] == "ended"
+    bags = sorted(recordings.iterdir())
+    assert len(bags) == 3
+    assert all(Bag(path).damage is None for path in bags)
+    assert Bag(bags[-1]).notes["setup"] == OTHER
+
+
+@pytest.mark.whole_graph
+def test_a_person_watches_a_bag():
+    async def use(url: str) -> None:
+        async with opened(url) as page:
+            await page.until(lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "a prediction")
+            assert page.host["mode"] == "replay"
+            assert page.host["can_pause"]
+            assert not page.host["can_record"]
+            assert await page.ask("take") == ""
+            assert "nothing steers it" in await page.ask("act", action="arm")
+            assert "nothing steers it" in page.graph["steering"]["reason"]
+            before = page.graph["time"]
+            await page.until(lambda: page.graph["time"] > before, "time to go on")
+            assert await page.ask("pause", still=True) == ""
+            await page.until(lambda: page.graph["predicted"]["age"] > 0.5, "time to stand still")
+            still = page.graph["time"]
+            await page.until(lambda: page.graph["predicted"]["age"] > 1.0, "time to stand still for longer")
+            assert page.graph["time"] == still
+            assert await page.ask("pause", still=False) == ""
+            await page.until(lambda: page.graph["time"] > still, "time to go on again")
+
+    with running("--replay", str(EXAMPLE)) as console:
+        asyncio.run(use(console.find(r"open (http://\S+)$")))
+        assert console.end() == 0
+
+
+@pytest.mark.whole_graph
+def test_a_graph_that_runs_is_joined_and_recorded(tmp_path: Path):
+    async def use(url: str) -> None:
+        async with opened(url) as page:
+            await page.until(lambda: page.graph["bridge"] is not None, "the bridge")
+            assert page.host["mode"] == "graph"
+            assert not page.host["simulated"]
+            assert not page.host["can_pause"]
+            assert await page.ask("take") == ""
+            assert "run by others" in await page.ask("choose", scenario=OTHER)
+            assert await page.ask("record", on=True) == ""
+            assert await page.ask("act", action="arm") == ""
+            await page.until(lambda: page.graph["bridge"]["armed"], "the bridge to be armed")
+            assert await page.ask("act", action="stop") == ""
+            await page.until(lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
+
+    with reserved_domain() as domain:
+        environment = graph_environment(domain)
+        arguments = ("-p", "coil_bridge:autostart:=active")
+        with (
+            NodeProcesses(("coil_bridge",), arguments, environment, tmp_path / "logs") as nodes,
+            running("--graph", "--record", str(tmp_path / "recordings"), ROS_DOMAIN_ID=str(domain)) as console,
+        ):
+            asyncio.run(use(console.find(r"open (http://\S+)$")))
+            nodes.check()
+            assert console.end() == 0
+            nodes.check()  # it is not ours to end
+    states = [record.decode() for record in Bag(next((tmp_path / "recordings").iterdir())).records({"/coils/state"})]
+    assert any(state.armed for state in states)
+    assert states[-1].emergency_stopped
+
+
+def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    for arguments, code, words in (
+        (["petri_36mm"], 2, "set-up: got 'petri_36mm'"),
+        (["--port", "70000"], 2, "console.port: got 70000"),
+        (["--address", "0.0.0.0"], 2, "a token, as 0.0.0.0 can be reached"),
+        (["--replay", str(tmp_path / "nowhere")], 1, "does not exist"),
+    ):
+        assert main(["console", *arguments]) == code
+        errors = capsys.readouterr().err
+        assert words in errors
+        assert errors.count("\n") == 1
+
+
+def test_without_ros_the_page_says_what_is_missing(monkeypatch, capsys: pytest.CaptureFixture[str]):
+    for name in [name for name in sys.modules if name.startswith("magnetosuture_thread.nodes")]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in [name for name in sys.modules if "console_hosts" in name or name.split(".")[0] == "rclpy"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    assert main(["console", "--port", "0"]) == 1
+    assert "the live graph needs ROS 2 Jazzy" in capsys.readouterr().err

@@ -1,0 +1,310 @@
+"""The operator's page's side of a graph, with the real coil bridge."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+import pytest
+from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents
+from rclpy.node import Node
+
+from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.nodes import (
+    camera_messages,
+    console_graph,
+    console_switches,
+    messages,
+    thread_messages,
+    topics,
+)
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+from magnetosuture_thread.nodes.console_graph import ConsoleGraph
+from magnetosuture_thread.nodes.console_host import GraphHost, joined
+from magnetosuture_thread.nodes.console_tap import ConsoleTap
+from magnetosuture_thread.nodes.processes import graph_environment
+from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
+
+SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
+
+
+@pytest.fixture
+def node(graph) -> Iterator[Node]:
+    """The console's node, in the graph of the test."""
+    with joined(domain=graph.domain) as made:
+        yield made
+
+
+@pytest.fixture
+def console(node: Node) -> ConsoleGraph:
+    """The graph as the page has it."""
+    return ConsoleGraph(node, ConsoleSettings())
+
+
+def act(console: ConsoleGraph, action: str) -> str:
+    """Press a switch."""
+    return asyncio.run(console.act(action))
+
+
+def bridge(console: ConsoleGraph) -> dict:
+    """Return what the page knows of the bridge, or nothing."""
+    return console.state()["bridge"] or {}
+
+
+def tell(graph, topic: topics.Topic, message, until: Callable[[], object], what: str) -> None:
+    """Say something again and again until the page knows; what was said before it was found is lost."""
+
+    def told() -> bool:
+        graph.publish(topic, message)
+        return bool(until())
+
+    graph.wait(told, what)
+
+
+def test_a_wish_is_published_at_once_with_a_stamp_of_now(graph, console):
+    wishes = graph.listen(topics.OPERATOR_COMMAND)
+    before = graph.probe.get_clock().now().nanoseconds
+
+    def heard() -> bool:
+        console.steer((0.003, -0.001))
+        return bool(wishes)
+
+    graph.wait(heard, "the wish")
+    wish = wishes[0]
+    assert (wish.twist.linear.x, wish.twist.linear.y) == (0.003, -0.001)
+    assert wish.header.frame_id == "dish"
+    assert before <= messages.nanoseconds(wish.header.stamp) <= graph.probe.get_clock().now().nanoseconds
+
+
+def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
+    graph.add(CoilBridgeNode, autostart="active")
+    graph.wait(lambda: bridge(console).get("state") == "active", "the bridge")
+    assert not bridge(console)["armed"]
+    assert act(console, "arm") == ""
+    graph.wait(lambda: bridge(console)["armed"], "the bridge to be armed")
+    assert act(console, "disarm") == ""
+    graph.wait(lambda: not bridge(console)["armed"], "the bridge to be disarmed")
+    assert act(console, "arm") == ""
+    assert act(console, "stop") == ""
+    graph.wait(lambda: bridge(console)["emergency_stopped"], "the emergency stop")
+    assert bridge(console)["state"] == "fault"
+    assert "emergency stop" in act(console, "arm")
+    assert act(console, "reset") == ""
+    graph.wait(lambda: bridge(console)["state"] == "active", "the bridge to be active again")
+    assert not bridge(console)["armed"]
+    assert "expected one of arm, disarm, stop, reset" in act(console, "dance")
+
+
+def test_a_stop_waits_for_no_other_action_and_ends_one_that_waits(graph, console):
+    async def both() -> tuple[str, str]:
+        arming = asyncio.create_task(console.act("arm"))  # nobody is there to answer
+        await asyncio.sleep(0)
+        stopping = asyncio.create_task(console.act("stop"))
+        await asyncio.sleep(0.05)
+        assert arming.done()
+        assert not stopping.done()
+        graph.add(CoilBridgeNode, autostart="active")
+        return await arming, await stopping
+
+    armed, stopped = asyncio.run(both())
+    assert "meanwhile" in armed
+    assert stopped == ""
+    graph.wait(lambda: bridge(console).get("emergency_stopped", False), "the emergency stop")
+    assert not bridge(console)["armed"]
+
+
+def test_a_switch_that_nobody_offers_is_refused_in_words(console, monkeypatch):
+    monkeypatch.setattr(console_switches, "TIMEOUT", 0.1)
+    assert act(console, "arm") == "nobody offers coils/arm within 0.1 s"
+
+
+def test_a_held_graph_is_told_nothing_but_a_stop(graph, console):
+    graph.add(CoilBridgeNode, autostart="active")
+    wishes = graph.listen(topics.OPERATOR_COMMAND)
+
+    def heard(speed: float) -> bool:
+        console.steer((speed, 0.0))
+        return bool(wishes) and wishes[-1].twist.linear.x == speed
+
+    graph.wait(lambda: heard(0.001), "a wish")
+    console.held = "starting petri"
+    assert act(console, "arm") == "starting petri"
+    console.steer((0.003, 0.0))
+    assert console.state()["steering"]["reason"] == "starting petri"
+    console.held = ""
+    graph.wait(lambda: heard(0.002), "another wish")
+    assert {wish.twist.linear.x for wish in wishes} == {0.001, 0.002}
+    console.held = "starting petri"
+    assert act(console, "stop") == ""
+    graph.wait(lambda: bridge(console).get("emergency_stopped", False), "the emergency stop")
+
+
+def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console):
+    stamp = graph.now()
+    assert console.state()["needle"] is None
+    assert console.state()["obstacles"] == []
+    discs = thread_messages.obstacle_markers(stamp, [Disc((0.001, 0.002), 0.003)])
+    pose = messages.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
+    path = messages.PathMaker().message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
+    margins = thread_messages.invalid_margins(stamp, "no pose")
+    tell(graph, topics.OBSTACLE_MARKERS, discs, lambda: console.state()["obstacles"], "the obstacles")
+    tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
+    tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["seen"], "the seen thread")
+    tell(graph, topics.MARGINS, margins, lambda: console.state()["margins"], "the margins")
+    state = console.state()
+    assert state["needle"]["tail"] == [0.003, -0.004]
+    assert state["needle"]["heading"] == pytest.approx(np.pi / 2)
+    assert 0.0 <= state["needle"]["age"] < 60.0
+    assert state["seen"] == [[0.0, 0.0], [0.001, 0.0]]
+    assert state["margins"]["reason"] == "no pose"
+    assert state["obstacles"] == [{"disc": [0.001, 0.002, 0.003]}]
+    assert state["dish_diameter"] == 0.035
+    console.begin(ConsoleSettings(dish_diameter=0.15))
+    state = console.state()
+    assert state["dish_diameter"] == 0.15
+    assert (state["needle"], state["seen"]) == (None, [])
+    graph.wait(lambda: len(console.state()["obstacles"]) == 1, "what is said once and for all")
+
+
+def test_a_node_that_says_no_more_is_silent(graph, console, monkeypatch):
+    node = graph.add(CoilBridgeNode)
+    graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")
+    assert console.nodes()["coil_bridge"]["level"] == "ok"
+    assert console.nodes()["coil_bridge"]["values"]["driver"] == "recording"
+    assert console.says("coil_bridge")
+    monkeypatch.setattr(console_graph, "SILENT", 0.3)
+    graph.remove(node)
+    graph.wait(lambda: console.nodes()["coil_bridge"]["level"] == "silent", "silence")
+    assert not console.says("coil_bridge")
+
+
+@pytest.mark.parametrize("transport", ["compressed", "raw"])
+def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
+    console = ConsoleGraph(node, ConsoleSettings(image_transport=transport))
+    assert console.frame() is None
+    pixels = np.full((120, 160, 3), (200, 60, 30), np.uint8)
+    done, jpeg = cv2.imencode(".jpg", pixels)
+    assert done
+    if transport == "raw":
+        topic, message = topics.IMAGE, camera_messages.image(graph.now(), pixels)
+    else:
+        topic, message = topics.COMPRESSED_IMAGE, camera_messages.compressed_image(graph.now(), jpeg.ravel())
+    tell(graph, topic, message, console.frame, "a frame")
+    first = console.frame()
+    assert first is not None
+    tell(graph, topic, message, lambda: (console.frame() or first)[0] > first[0], "another")
+    newest = console.frame()
+    assert newest is not None
+    shown = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None
+    assert np.abs(shown.astype(int) - pixels).max() < 12
+
+
+def test_with_a_simulated_clock_wishes_are_stamped_by_it(graph):
+    rig = graph.add(RigSimulatorNode, use_sim_time=True, **SMALL)
+    wishes = graph.listen_later(topics.OPERATOR_COMMAND)
+    with joined(domain=graph.domain, simulated_clock=True) as node:
+        console = ConsoleGraph(node, ConsoleSettings())
+        graph.wait(lambda: console.state()["time"] > 1.0, "/clock")
+
+        def heard() -> bool:
+            console.steer((0.001, 0.0))
+            return bool(wishes)
+
+        graph.wait(heard, "a wish")
+        assert messages.nanoseconds(wishes[0].header.stamp) <= rig.time.stamp(rig.time.elapsed()) < 1000e9
+
+
+def test_a_rig_is_paused_where_there_is_one(graph, console):
+    host = GraphHost(console)
+    assert not host.state()["can_pause"]
+    assert "nothing in this graph" in asyncio.run(host.pause(True))
+    rig = graph.add(RigSimulatorNode, **SMALL)
+    graph.wait(lambda: host.state()["can_pause"] and host.state()["simulated"], "the rig")
+    assert asyncio.run(host.pause(True)) == ""
+    assert host.state()["paused"]
+    assert rig.time.paused
+    assert asyncio.run(host.pause(False)) == ""
+    assert not host.state()["paused"]
+    assert not rig.time.paused
+    assert "run by others" in asyncio.run(host.choose("petri_150mm_silk"))
+    assert "--graph" in asyncio.run(host.record(True))
+
+
+def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_then_on(graph, node):
+    graph.listen_later(topics.OBSTACLE_MARKERS)
+    graph.publish(topics.OBSTACLE_MARKERS, thread_messages.obstacle_markers(graph.now(), []))
+    taken: list[tuple[str, int, bytes]] = []
+    tap = ConsoleTap(node, [topics.OBSTACLE_MARKERS, topics.CURRENTS], None, lambda *message: taken.append(message))
+
+    def taken_both() -> bool:
+        tap.look()
+        return {topic for topic, _, _ in taken} == {"/thread/obstacles", "/coils/currents"}
+
+    try:
+        tell(graph, topics.CURRENTS, CoilCurrents(current=[1.0, 2.0]), taken_both, "both")
+    finally:
+        tap.close()
+    said = {topic: (arrival, data) for topic, arrival, data in taken}
+    arrival, data = said["/coils/currents"]
+    assert abs(arrival * 1e-9 - time.time()) < 60.0
+    assert list(thread_messages.decoded(topics.CURRENTS, data).current) == [1.0, 2.0]
+
+
+def test_a_bridge_that_is_heard_says_all_that_the_page_shows(graph, console):
+    message = CoilBridgeState(state=CoilBridgeState.STATE_ACTIVE, armed=True, driver="roboclaw", current=[1.5, -2.0])
+    message.applied.x = 0.002
+    tell(graph, topics.BRIDGE_STATE, message, lambda: bridge(console), "the state")
+    told = bridge(console)
+    assert (told["state"], told["armed"], told["driver"]) == ("active", True, "roboclaw")
+    assert (told["current"], told["applied"]) == ([1.5, -2.0], [0.002, 0.0])
+
+
+def program(domain: int, *parameters: str) -> subprocess.Popen[str]:
+    """Run the node as a program."""
+    given = [part for parameter in parameters for part in ("-p", parameter)]
+    command = [sys.executable, "-m", "magnetosuture_thread.nodes.console", "--ros-args", *given]
+    environment = graph_environment(domain)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, which: signal.Signals):
+    reports = graph.listen_later(topics.DIAGNOSTICS)
+    with program(graph.domain, "port:=0", "dish_diameter:=0.15") as process:
+        try:
+            assert process.stdout is not None
+            found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
+            assert found is not None
+            with urllib.request.urlopen(found[0], timeout=10.0) as page:
+                assert page.status == 200
+            graph.wait(lambda: any("console: state" in r.status[0].name for r in reports), "its report", timeout=30.0)
+            process.send_signal(which)
+            assert process.wait(20.0) == 0
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    ("parameter", "words"),
+    [
+        ("dish_diameter:=35.0", "console.dish_diameter: got 35.0"),
+        ("dish:=0.035", "console.dish: got 0.035"),
+        ("address:=0.0.0.0", "a token, as 0.0.0.0 can be reached"),
+    ],
+)
+def test_the_node_refuses_parameters_in_one_line(graph, parameter: str, words: str):
+    with program(graph.domain, parameter) as process:
+        _, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 1
+    assert words in errors
+    assert errors.count("\n") == 1

@@ -1,0 +1,158 @@
+"""What the operator's page is told of each message."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point
+from magnetosuture_msgs.msg import (
+    BarrierMargin,
+    CoilBridgeState,
+    PredictedThread,
+    SafetyMargins,
+    SteeringState,
+    TrackerState,
+)
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.nodes import console_messages, messages, thread_messages
+
+STAMP = Time(sec=12)
+
+
+def plain(told: Any) -> Any:
+    """Return what a page gets; a value that JSON does not know is an error."""
+    return json.loads(json.dumps(told, allow_nan=False))
+
+
+def test_the_needle():
+    message = messages.pose_message(STAMP, np.array([0.003, -0.004]), np.array([0.6, 0.8]))
+    told = plain(console_messages.needle(message))
+    assert told["tail"] == [0.003, -0.004]
+    assert told["heading"] == pytest.approx(np.arctan2(0.8, 0.6))
+    message.header.frame_id = "map"
+    with pytest.raises(InvalidInputError, match="'dish'"):
+        console_messages.needle(message)
+
+
+def test_the_tracker_with_and_without_the_dish():
+    message = TrackerState(state=TrackerState.STATE_LOST, reason="glare", dish_centre=[320.0, 240.0])
+    assert plain(console_messages.tracker(message)) == {
+        "state": "lost",
+        "reason": "glare",
+        "confidence": 0.0,
+        "view": None,
+    }
+    message.metres_per_pixel, message.camera_rotation = 8e-5, 0.1
+    view = {"centre": [320.0, 240.0], "scale": 8e-5, "rotation": 0.1}
+    assert plain(console_messages.tracker(message))["view"] == view
+    assert console_messages.tracker(TrackerState())["state"] == "searching"
+    assert console_messages.tracker(TrackerState(state=TrackerState.STATE_TRACKED))["state"] == "tracked"
+
+
+def test_the_threads():
+    path = messages.PathMaker().message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
+    assert plain(console_messages.seen(path)) == [[0.0, 0.001], [0.002, 0.003]]
+    message = PredictedThread(vertices=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
+    assert plain(console_messages.predicted(message)) == {
+        "vertices": [[0.1, 0.2]],
+        "residual": 1e-9,
+        "step_time": 1e-4,
+        "status": "solved",
+    }
+
+
+def test_of_each_node_the_least_clearance_of_any_obstacle():
+    obstacle, connectivity = BarrierMargin.KIND_OBSTACLE, BarrierMargin.KIND_CONNECTIVITY
+    message = SafetyMargins(
+        valid=True,
+        kind=[connectivity, obstacle, obstacle, obstacle],
+        node=[3, 1, 1, 2],
+        obstacle=[-1, 0, 1, 1],
+        value=[0.0] * 4,
+        clearance=[0.0, 5e-4, 2e-4, 0.0],
+        least=[BarrierMargin(kind=obstacle, node=2, clearance=0.0), BarrierMargin(kind=connectivity, clearance=1e-6)],
+        contact_nodes=[2],
+        friction_state=SafetyMargins.FRICTION_PULLED,
+        friction_nodes=[1, 2],
+        slowdown=0.81,
+    )
+    told = plain(console_messages.margins(message))
+    assert told["clearance"] == [None, 2e-4, 0.0, None]
+    assert told["least"] == {"obstacle": 0.0, "connectivity": 1e-6}
+    assert told["contact"] == [2]
+    assert told["friction"] == {"state": "pulled", "nodes": [1, 2], "slowdown": 0.81}
+    assert (told["valid"], told["reason"]) == (True, "")
+
+
+def test_margins_that_are_not_valid_have_no_number():
+    told = plain(console_messages.margins(thread_messages.invalid_margins(STAMP, "no pose")))
+    assert (told["valid"], told["reason"], told["clearance"], told["least"]) == (False, "no pose", [], {})
+    assert told["friction"]["state"] == "unknown"
+
+
+def test_every_kind_of_barrier_has_a_name():
+    names = {name for name in vars(BarrierMargin) if name.startswith("KIND_")}
+    assert names
+    assert {f"KIND_{name.upper()}" for name in console_messages.KINDS.values()} == names
+
+
+def test_discs_are_discs_and_polygons_triangles_and_what_was_there_before_is_gone():
+    square = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
+    markers = thread_messages.obstacle_markers(STAMP, [Disc((0.001, 0.002), 0.003), square])
+    disc, triangles = plain(console_messages.obstacles(markers))
+    assert disc == {"disc": [0.001, 0.002, 0.003]}
+    corners = np.array(triangles["triangles"]).reshape(-1, 3, 2)
+    edges = corners[:, 1:] - corners[:, :1]
+    areas = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    assert areas.sum() == pytest.approx(1e-4)
+    assert console_messages.obstacles(thread_messages.obstacle_markers(STAMP, [])) == []
+
+
+def test_the_steering():
+    message = SteeringState(slowdown=0.9, held_off=True, reason="")
+    message.asked.x, message.passed.y = 0.005, 0.004
+    assert plain(console_messages.steering(message)) == {
+        "asked": [0.005, 0.0],
+        "passed": [0.0, 0.004],
+        "slowdown": 0.9,
+        "held_off": True,
+        "reason": "",
+    }
+
+
+def test_the_bridge():
+    message = CoilBridgeState(
+        state=CoilBridgeState.STATE_FAULT,
+        emergency_stopped=True,
+        reasons=["fault: emergency stop"],
+        driver="roboclaw",
+        driver_warnings=["hot"],
+        current=[1.0, 2.0],
+        measured_current=[0.9],
+        refused=3,
+    )
+    told = plain(console_messages.bridge(message))
+    assert told["state"] == "fault"
+    assert told["emergency_stopped"]
+    assert not told["armed"]
+    assert told["reasons"] == ["fault: emergency stop"]
+    assert (told["current"], told["measured_current"], told["refused"]) == ([1.0, 2.0], [0.9], 3)
+    assert told["driver_warnings"] == ["hot"]
+
+
+def test_what_a_node_says():
+    status = DiagnosticStatus(
+        level=DiagnosticStatus.WARN, message="no pose", values=[KeyValue(key="refused", value="2")]
+    )
+    assert plain(console_messages.node_state(status)) == {
+        "level": "warn",
+        "message": "no pose",
+        "values": {"refused": "2"},
+    }
