@@ -12,7 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-NODES = ("vision_tracker", "thread_model", "coil_bridge", "rig_simulator", "path_follower")
+NODES = ("vision_tracker", "thread_model", "coil_bridge", "rig_simulator", "path_follower", "console")
 TIMEOUT = 90.0  # s; the first start compiles kernels
 
 LISTEN = """

@@ -43,7 +43,7 @@ def test_every_message_package_that_the_nodes_import_is_declared():
     assert used <= declared
 
 
-@pytest.mark.parametrize("name", ["vision_tracker", "thread_model", "coil_bridge"])
+@pytest.mark.parametrize("name", ["vision_tracker", "thread_model", "coil_bridge", "console"])
 def test_every_node_is_an_executable_and_launched(name: str):
     assert f'{name} = "magnetosuture_thread.nodes.{name}:main"' in PYPROJECT
     launch = ast.parse((ROOT / "launch" / "magnetosuture.launch.py").read_text())
