@@ -63,6 +63,7 @@ OWNERS = {
     "rosbags": {"bags"},
     "zstandard": {"bags"},
     "numba": {"compiled"},
+    "playwright": {"jobs"},
     "osqp": {"model"},
     "shapely": {"geometry"},
     "jinja2": {"study"},

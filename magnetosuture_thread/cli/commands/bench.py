@@ -18,6 +18,10 @@ With --bridge, time the coil bridge instead: how long until the duties of two si
 pseudo-terminals, are zero, after a commander fell silent and after kill -9 of commander, tracker and bridge;
 how even its loop is; and what 10,000 hostile messages can do. Meanwhile all cores are kept busy. Takes nine
 minutes.
+
+With --console, time the operator's page instead, in Chromium without a window, on the whole graph around the
+simulated rig with 81 segments: from a key press to the filtered velocity at the bridge, and the pictures that
+the page draws. Needs chromium and playwright. Takes three minutes.
 """
 
 
@@ -27,7 +31,12 @@ def add(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--peers", action="store_true", help="time other solvers and simulators too (needs the extra `peers`)"
     )
-    parser.add_argument("--bridge", action="store_true", help="time the coil bridge instead, with simulated boards")
+    either = parser.add_mutually_exclusive_group()
+    either.add_argument("--bridge", action="store_true", help="time the coil bridge instead, with simulated boards")
+    either.add_argument("--console", action="store_true", help="time the operator's page instead, in a browser")
+    parser.add_argument(
+        "--presses", type=whole_number, default=200, metavar="N", help="of --console: of a key (default: 200)"
+    )
     for name, default, what in (
         ("trials", 500, "a commander that falls silent"),
         ("kills", 20, "kill -9 of each process"),
@@ -44,7 +53,9 @@ def add(subparsers: Subparsers) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Time the model, or the coil bridge."""
+    """Time the model, the coil bridge, or the operator's page."""
+    if options.console:
+        return _bench_console(options)
     return _bench_bridge(options) if options.bridge else _bench_model(options)
 
 
@@ -71,5 +82,20 @@ def _bench_bridge(options: argparse.Namespace) -> int:
     with progress(console, "bench") as advance:
         report = bench_bridge(options.trials, options.kills, options.hostile, say=sayer(console), progress=advance)
     console.print(bridge_table(report))
+    write_json(options.json, json.dumps(report.to_json(), indent=2, allow_nan=False))
+    return DONE
+
+
+def _bench_console(options: argparse.Namespace) -> int:
+    from magnetosuture_thread.jobs.bench_console import bench_console
+    from magnetosuture_thread.study.console_report import console_lines, console_table
+
+    console = make_console()
+    say = sayer(console)
+    with progress(console, "bench") as advance:
+        report = bench_console(options.presses, say=say, progress=advance)
+    console.print(console_table(report))
+    for line in console_lines(report):
+        say(line)
     write_json(options.json, json.dumps(report.to_json(), indent=2, allow_nan=False))
     return DONE

@@ -1,0 +1,212 @@
+"""The job `magnetosuture bench --console`: from a key press to the velocity at the bridge, and the page's pictures."""
+
+from __future__ import annotations
+
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.study.console_report import ConsoleReport, Delays
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+SCENARIO = "petri_150mm_silk"  # whose thread has n = 81
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+WIDTH, HEIGHT = 1366, 768  # of the page [px]
+PATIENCE = 240.0  # s for the graph to be there; the first start on a machine compiles
+HELD, LET_GO = 0.25, 0.35  # s that a key is held, and not held, on average
+KEYS = ("ArrowLeft", "ArrowRight")  # in turn, so that the needle stays where it is
+GRACE = 20.0  # s for the command to end
+LISTEN = "() => { window.bench_keys = []; addEventListener('keydown', (event) => { if (!event.repeat)"
+LISTEN += " window.bench_keys.push(performance.timeOrigin + event.timeStamp); }, true); }"
+
+Say = Callable[[str], None]
+Times = dict[str, list[float]]
+
+
+class Server:
+    """The command `magnetosuture console`, running.
+
+    Args:
+        scenario: of the simulated rig.
+    """
+
+    def __init__(self, scenario: str) -> None:
+        command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", scenario, "--port", "0"]
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        )
+        self._lines: list[str] = []
+        self._reading = threading.Thread(target=self._read, daemon=True)
+        self._reading.start()
+
+    def says(self, pattern: str) -> str:
+        """Wait for a line, and return what the pattern's group holds.
+
+        Raises:
+            GraphError: the command ended, or says no such thing.
+        """
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            if found := re.search(pattern, "\n".join(self._lines)):
+                return found[1]
+            if self._process.poll() is not None:
+                raise GraphError(f"the console ended: {self._lines[-1] if self._lines else 'it said nothing'}")
+            time.sleep(0.05)
+        raise GraphError(f"after {PATIENCE:g} s the console is not ready: {self._lines[-1:]}")
+
+    def end(self) -> None:
+        """Press Ctrl-C."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(GRACE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reading.join()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.append(line.rstrip())
+
+
+def bench_console(
+    presses: int, say: Say = lambda text: None, progress: Callable[[float], None] = lambda share: None
+) -> ConsoleReport:
+    """Press keys in a browser without a window, on the page of the whole graph around the simulated rig.
+
+    Args:
+        presses: of a key.
+        say: called with a line for a person at each stage.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigurationError: the browser, or what drives it, is not installed.
+        GraphError: the graph does not start, or moves nothing.
+    """
+    browser = _browser()
+    segments = read_setup(SCENARIO).model.segments
+    say(f"starting {SCENARIO}, {segments} segments, and a browser")
+    server = Server(SCENARIO)
+    try:
+        domain = int(server.says(r"ROS domain (\d+)"))
+        url = server.says(r"open (http\S+)")
+        server.says(r"(runs; the coils)")
+        with _page(browser, url) as page, _heard(domain) as heard:
+            _click(page, "#take")
+            _click(page, "#arm")
+            page.evaluate(LISTEN)
+            began, before = time.monotonic(), _stats(page)
+            _press(page, presses, progress)
+            after, took = _stats(page), time.monotonic() - began
+            keys = [float(stamp) * 1e-3 for stamp in page.evaluate("() => window.bench_keys")]
+    finally:
+        server.end()
+    if not heard[NEEDLE_SETPOINT.recorded]:
+        raise GraphError("no key moved the needle")
+    rates = {name: (after[name] - before[name]) / took for name in ("drawn", "states", "frames")}
+    delays = [Delays.between(words, keys, heard[channel.recorded]) for channel, words in _STATIONS]
+    return ConsoleReport(SCENARIO, segments, tuple(delays), rates["drawn"], rates["states"], rates["frames"])
+
+
+_STATIONS = (
+    (OPERATOR_COMMAND, "the page's wish in the graph"),
+    (NEEDLE_COMMAND, "the filtered velocity at the bridge"),
+    (NEEDLE_SETPOINT, "the velocity of the coils' currents"),
+)
+
+
+def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
+    """Hold a key, and let it go, again and again; at random times, so that they meet every phase of all loops."""
+    chance = random.Random(1)
+    for done in range(presses):
+        page.keyboard.down(KEYS[done % len(KEYS)])
+        time.sleep(HELD * chance.uniform(0.8, 1.2))
+        page.keyboard.up(KEYS[done % len(KEYS)])
+        time.sleep(LET_GO * chance.uniform(0.8, 1.2))
+        progress((done + 1) / presses)
+
+
+def _click(page: Page, what: str) -> None:
+    page.locator(f"{what}:enabled").click(timeout=1e3 * PATIENCE)
+
+
+def _stats(page: Page) -> dict[str, Any]:
+    return dict(page.evaluate("() => ({ ...window.console_stats })"))
+
+
+def _browser() -> str:
+    """Return the browser's program."""
+    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if found is None:
+        raise ConfigurationError("browser", "none found", f"one of {', '.join(BROWSERS)}: apt install chromium")
+    return found
+
+
+@contextmanager
+def _page(browser: str, url: str) -> Iterator[Page]:
+    """Open a page in a browser without a window."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        raise ConfigurationError(
+            "playwright", "not installed", "what drives the browser: pip install playwright"
+        ) from None
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
+        try:
+            page = started.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            page.goto(url)
+            yield page
+        finally:
+            started.close()
+
+
+@contextmanager
+def _heard(domain: int) -> Iterator[Times]:
+    """Give the times [s] at which a velocity that is not zero came on each topic, filled when the block ends."""
+    from rclpy.serialization import deserialize_message
+
+    from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.processes import environment_of, graph_environment
+    from magnetosuture_thread.nodes.recorder import Recorder
+
+    taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_COMMAND, topics.NEEDLE_SETPOINT]
+    came: list[tuple[str, int, bytes]] = []
+    times: Times = {topic.channel.recorded: [] for topic in taken}
+    with environment_of(graph_environment(domain)):
+        recorder = Recorder(
+            domain, taken, simulated_clock=False, receive=lambda topic, at, data: came.append((topic, at, data))
+        )
+    over = threading.Event()
+
+    def listen() -> None:
+        while not over.is_set():
+            recorder.spin(0.05)
+
+    thread = threading.Thread(target=listen)
+    thread.start()
+    try:
+        yield times
+    finally:
+        over.set()
+        thread.join()
+        recorder.close()
+        for topic, at, data in came:
+            linear = deserialize_message(data, topics.NEEDLE_COMMAND.message).twist.linear
+            if linear.x or linear.y:
+                times[topic].append(at * 1e-9)
