@@ -34,7 +34,8 @@ class NeedleFilter:
     tip: along the needle's chord it is driven, across it turns about the chord's middle, and J_p u is what
     that moves the point p by. All rows are hard. Rest is always allowed, and nothing but a command ever moves
     the needle: where it is too near already, h < 0, it may leave or slide along but go no deeper, and while
-    it is told to move it leaves, at up to a tenth of the speed.
+    it is told to move it leaves, at up to a tenth of the speed. What asks to leave is soft, and is left out
+    where that cannot be solved; the needle never goes faster than it is told: |u| <= |v|.
 
     Source: [Forghani2025], h_obs,needle,O and the controller's part in u_0. Deviation: connectivity does
     not act on the needle, so its part of the program stands alone and is solved alone; h is the signed
@@ -88,15 +89,19 @@ class NeedleFilter:
             aside = np.einsum("ij,ij->i", near.outward, turning[near.node])
             rows = along[:, None] * chord + aside[:, None] * across
         lower = -self.gain * np.maximum(margin, 0.0)
-        speed = math.hypot(*(np.asarray(commanded) / UNIT).tolist())
+        asked = np.asarray(commanded, dtype=np.float64)
+        speed = math.hypot(*asked.tolist())
         beyond = np.flatnonzero(margin < 0.0)
-        leaving = np.minimum(-self.gain * margin[beyond], LEAVING * speed)
-        return self._solved(
-            np.asarray(commanded, dtype=np.float64),
-            np.vstack([rows, rows[beyond]]),
-            np.concatenate([lower, leaving]),
-            np.concatenate([np.zeros(len(rows)), np.full(len(beyond), YIELDING)]),
-        )
+        if not len(beyond):
+            return self._solved(asked, rows, lower, np.zeros(len(rows)))
+        leaving = np.minimum(-self.gain * margin[beyond], LEAVING * speed / UNIT)
+        compliance = np.concatenate([np.zeros(len(rows)), np.full(len(beyond), YIELDING)])
+        try:
+            passed = self._solved(asked, np.vstack([rows, rows[beyond]]), np.concatenate([lower, leaving]), compliance)
+        except SolverError:  # of rows that ask for the opposite of each other; what forbids never does
+            passed = self._solved(asked, rows, lower, np.zeros(len(rows)))
+        faster = math.hypot(*passed.tolist())
+        return passed * (speed / faster) if faster > speed else passed
 
     def _solved(
         self,

@@ -209,6 +209,8 @@ class ThreadSession:
         if not abs(age) <= self.settings.steering_timeout:
             return at_rest(velocity, f"the last predicted thread is {age:.2f} s old")
         assert outcome.margins is not None
+        if not self._needle.length:
+            pose = self.settings.attachment_pose(pose)  # the point that is steered
         return steered(self._needle, outcome.margins.friction, pose.tail, pose.heading, velocity)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:

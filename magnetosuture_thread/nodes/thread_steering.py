@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from geometry_msgs.msg import TwistStamped
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from magnetosuture_thread.coils.sources import SourceWatch
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.model.session import ThreadSession
@@ -17,7 +19,8 @@ class ThreadSteering:
     """Answers every velocity that an operator asks for by one that the thread and the obstacles allow.
 
     It never speaks by itself: an operator who falls silent is followed by silence, and the bridge stops. The command
-    keeps the stamp of what was asked, so that the bridge counts how old that is.
+    keeps the stamp of what was asked, so that the bridge counts how old that is. Of two operators at once neither is
+    answered: the bridge, which hears one publisher only, could not tell.
 
     Args:
         node: has the topics.
@@ -29,13 +32,18 @@ class ThreadSteering:
         self._session, self._health = session, health
         self._commands = topics.NEEDLE_COMMAND.publisher(node)
         self._states = topics.STEERING_STATE.publisher(node)
-        topics.OPERATOR_COMMAND.subscribe(node, self.on_asked)
+        self._sources = SourceWatch()
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        topics.OPERATOR_COMMAND.subscribe_numbered(node, self.on_asked)
 
-    def on_asked(self, message: TwistStamped) -> None:
+    def on_asked(self, message: TwistStamped, number: int) -> None:
         """Pass on what is allowed of a velocity; one that cannot be used is refused, and the needle told nothing."""
+        speaking = self._sources.hear(number, self._steady.now().nanoseconds * 1e-9)
         try:
             asked = messages.plane_velocity(message, OPERATOR_COMMAND.name)
             stamp = messages.checked_nanoseconds(message.header.stamp, OPERATOR_COMMAND.name)
+            if speaking > 1:
+                raise InvalidInputError(OPERATOR_COMMAND.name, f"{speaking} publishers at once", "one")
             try:
                 what = self._session.on_asked(stamp, asked)
             except SolverError as error:

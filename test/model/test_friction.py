@@ -7,6 +7,7 @@ import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
 from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, ObstacleAvoidance
+from magnetosuture_thread.model.barriers.rows import BarrierKind
 from magnetosuture_thread.model.friction import (
     UNKNOWN,
     Friction,
@@ -51,9 +52,19 @@ def test_who_moves_elsewhere_pulls_nothing():
 
 def test_the_threshold_is_of_the_clearance():
     """At 0.96 mm from the discs; the threshold is not within."""
-    near = float(np.hypot(0.5e-3, 1.9e-3) - 1e-3)
+    avoided = barriers(*GATE)[1]
+    near = float(avoided.clearance[avoided.nodes[:, -1] == 3].max())
+    assert near == pytest.approx(np.hypot(0.5e-3, 1.9e-3) - 1e-3)
     for threshold, count in ((0.999 * near, 0), (1.001 * near, 2)):
         assert len(FrictionLaw(threshold, 0.9, 0.0).judge(barriers(*GATE), np.ones(8)).nodes) == count
+
+
+def test_a_node_at_the_threshold_itself_is_free():
+    """Two rows of one node with the same clearance, as no roundings can be told apart in a scene."""
+    node, near = np.array([[3], [3]]), np.full(2, 5e-4)
+    rows = BarrierRows(BarrierKind.OBSTACLE, node, np.array([0, 1]), near, np.zeros((2, 1, 2)), near)
+    assert FrictionLaw(5e-4, 0.9, 0.0).judge([rows], np.ones(8)).state is FrictionState.FREE
+    assert FrictionLaw(np.nextafter(5e-4, 1.0), 0.9, 0.0).judge([rows], np.ones(8)).nodes == (3,)
 
 
 def test_the_needle_itself_is_no_friction_of_the_thread():
@@ -73,6 +84,13 @@ def test_speeds_are_averaged():
     back = NodeMotion(0.2)
     back.follow_on(motion)
     np.testing.assert_allclose(back.take(moved, interval), np.full(3, expected * np.exp(-0.5)), rtol=1e-12)
+
+
+def test_without_an_interval_it_begins_anew():
+    motion = NodeMotion(0.0)
+    motion.take(np.zeros((3, 2)), 0.1)
+    assert motion.take(np.full((3, 2), 1e-3), 0.1).min() > 0.0
+    np.testing.assert_array_equal(motion.take(np.full((3, 2), 9e-3), 0.0), np.zeros(3))
 
 
 def test_trembling_is_no_motion():

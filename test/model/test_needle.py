@@ -55,6 +55,12 @@ def test_from_outside_of_the_safe_set_it_comes_back(position: list[float]):
     assert np.linalg.norm(where) == pytest.approx(2.2e-3, abs=1e-6)
 
 
+def test_it_leaves_no_faster_than_it_would_approach():
+    """0.01 mm too near: 20 / s times that, and not a tenth of 20 mm/s; a thousandth of the speed is given way."""
+    found = filtered((DISC,), [2.19e-3, 0.0], [-20e-3, 0.0])
+    np.testing.assert_allclose(found, [2e-4, 0.0], atol=1.01e-3 * 20e-3)
+
+
 @pytest.mark.parametrize("position", [[1.5e-3, 0.0], [2.1e-3, 0.0], [2.2e-3, 0.0], [2.5e-3, 0.0]])
 def test_nobody_but_a_command_moves_the_needle(position: list[float]):
     np.testing.assert_array_equal(filtered((DISC,), position, [0.0, 0.0]), [0.0, 0.0])
@@ -81,6 +87,40 @@ def test_no_point_of_a_needle_enters(curvature: float):
         angle += 2e-3 * turned
         least = min(least, float(surroundings.near(tail + body.turned(heading)[0]).distance.min(initial=1.0)))
     assert 0.0 < least < 3e-4  # it came near, and kept off
+
+
+@pytest.mark.parametrize("length", [0.0, 2.5e-3, 7e-3])
+def test_it_never_goes_faster_than_it_is_told_nor_away_from_where_it_is_safe(length: float):
+    """In a channel of two walls and before a disc, wherever it lies, in them too."""
+    walls = tuple(Polygon(((-0.01, y), (0.01, y), (0.01, y + 4e-3), (-0.01, y + 4e-3))) for y in (-5e-3, 1e-3))
+    surroundings = Surroundings((*walls, Disc((0.012, 0.0), 2e-3)), 5e-3)
+    needle = NeedleFilter(surroundings, 2e-4, 20.0, BandedSolver(), length=length, curvature=100.0)
+    random = np.random.default_rng(3)
+    unsafe = 0
+    for _ in range(600):
+        angle, tail, asked = random.uniform(0.0, 7.0), random.uniform(-0.014, 0.014, 2), random.uniform(-0.02, 0.02, 2)
+        heading = np.array([np.cos(angle), np.sin(angle)])
+        passed = needle.safe_velocity(tail, heading, asked)
+        assert np.linalg.norm(passed) <= np.linalg.norm(asked) * (1.0 + 1e-9)
+        points = tail + needle_points(length, 100.0, 5e-4).turned(heading)[0] if length else tail[None]
+        if surroundings.near(points).distance.min(initial=1.0) < 2e-4:
+            unsafe += 1
+        else:
+            assert passed @ asked >= -1e-12
+    assert 100 < unsafe < 500
+
+
+def test_where_leaving_one_is_entering_another_it_only_goes_no_deeper():
+    """What asks to leave may be more than the program can be solved with; what forbids never is."""
+
+    class Overcharged(BandedSolver):
+        def solve(self, program, *start):
+            solution = super().solve(program, *start)
+            return solution._replace(residuals=Residuals(1.0, 0.0, 0.0)) if program.compliance.any() else solution
+
+    position = [0.0, 1.5e-3]
+    np.testing.assert_allclose(filtered((DISC,), position, [2e-3, -3e-3], Overcharged()), [2e-3, 0.0], atol=1e-9)
+    np.testing.assert_allclose(filtered((DISC,), position, [2e-3, 3e-3], Overcharged()), [2e-3, 3e-3], atol=1e-9)
 
 
 def test_driven_at_an_obstacle_for_long_it_never_enters():

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
 from nav_msgs.msg import Path
 from rclpy.serialization import serialize_message
@@ -134,6 +134,27 @@ def test_an_operator_who_falls_silent_is_followed_by_silence(graph):
         told = f"needle velocity: got {wrong}"
         graph.wait(lambda told=told: any(told in v.value for m in health for v in m.status[0].values), "the refusal")
     assert len(commands) == len(states) == 1
+
+
+def test_of_two_operators_at_once_neither_is_answered(graph):
+    graph.add(ThreadModelNode, initial_shape="straight")
+    commands, health = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.DIAGNOSTICS)
+    asked = messages.twist_message(stamp(1.0), np.array([1e-3, 0.0]))
+    other = graph.probe.create_publisher(TwistStamped, topics.OPERATOR_COMMAND.name, topics.OPERATOR_COMMAND.qos)
+    graph.wait(lambda: other.get_subscription_count() > 0, "the other to be found")
+    for k in range(2):
+        graph.publish(topics.OPERATOR_COMMAND, asked)
+        graph.wait(lambda k=k: len(commands) == k + 1, "an answer")
+    for _ in range(3):
+        graph.publish(topics.OPERATOR_COMMAND, asked)
+        other.publish(asked)
+
+    def refused() -> int:
+        return int(next((v.value for v in health[-1].status[0].values if v.key == "refused"), 0)) if health else 0
+
+    graph.wait(lambda: len(commands) + refused() == 8, "all to be heard")
+    assert refused() >= 3
+    assert "publishers at once, expected one" in str(health[-1].status[0].values)
 
 
 def test_the_order_of_pose_and_centreline_does_not_matter(graph):
