@@ -14,13 +14,15 @@ from magnetosuture_thread.console.lateness import Lateness
 from magnetosuture_thread.console.outbox import Message, Outbox
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.console.steering import Steering
-from magnetosuture_thread.console.words import Got, HandBack, Hello, Hold, Release, Take, Visible, Word, read_word
+from magnetosuture_thread.console.words import Act, Got, HandBack, Hello, Hold, Release, Take, Visible, Word, read_word
 from magnetosuture_thread.errors import InvalidInputError
 
 HELLO_WITHIN = 5.0  # of the connection [s]
 SEND_WITHIN = 2.0  # before a page that takes nothing is cut off [s]
 LATE_FOR = 1.0  # before a page whose words all come late has to connect again [s]
-MOST_WORDS = 400  # a second
+MOST_WORDS = 400  # a second; of what is beyond, only an emergency stop is obeyed
+FLOOD = 2000  # of those beyond, in all, after which the connection is closed
+STOP = Act("stop")
 
 
 class Client:
@@ -58,7 +60,7 @@ class Client:
         self._commands = False
         self._lateness = Lateness()
         self._in_time = 0.0  # when the last word came that was not late
-        self._second, self._words = 0, 0
+        self._second, self._words, self._excess = 0, 0, 0
 
     def tell(self, what: str, message: Message) -> None:
         """Let the page have the newest `state` or `frame` when it can take it."""
@@ -114,8 +116,10 @@ class Client:
         now = asyncio.get_running_loop().time()
         self._steering.hear(self.number)
         try:
-            self._count(now)
+            crowded = self._count(now)
             word = self._read(kind, data)
+            if crowded and word != STOP:
+                raise InvalidInputError("messages", f"{self._words} in a second", f"at most {MOST_WORDS}")
             if isinstance(word, Got):
                 self._outbox.got(word.what)
                 self._wake.set()
@@ -125,8 +129,10 @@ class Client:
             else:
                 await self._obey(word, now)
         except InvalidInputError as error:
-            self._steering.release(self.number)
+            self._steering.interrupt(self.number)
             self._answer("error", text=str(error))
+            if self._excess > FLOOD:
+                await self._socket.close(code=1008, message=b"too many messages")
 
     async def _obey(self, word: Word, now: float) -> None:
         if isinstance(word, Hold):
@@ -151,16 +157,18 @@ class Client:
             if not self._steering.hold(self.number, word.velocity):
                 self._answer("error", text="hold: this page does not steer; take steering first")
             return
-        self._steering.release(self.number)
+        self._steering.interrupt(self.number)
         self._answer("error", text=f"hold: came {late:.2f} s late, expected at most {self._settings.hold_timeout:g} s")
         if now - self._in_time > LATE_FOR:
             await self._socket.close(code=1008, message=b"every word comes late")
 
-    def _count(self, now: float) -> None:
+    def _count(self, now: float) -> bool:
+        """Count a message; return whether it is one too many."""
         second = int(now)
         self._second, self._words = second, self._words + 1 if second == self._second else 1
-        if self._words > MOST_WORDS:
-            raise InvalidInputError("messages", f"{self._words} in a second", f"at most {MOST_WORDS}")
+        crowded = self._words > MOST_WORDS
+        self._excess += crowded
+        return crowded
 
     def _answer(self, kind: str, **fields: Any) -> None:
         self._outbox.answer(json.dumps({"type": kind, **fields}))

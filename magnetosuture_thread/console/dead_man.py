@@ -22,6 +22,7 @@ class DeadManSwitch:
         self._timeout = timeout
         self._velocity: Velocity | None = None
         self._heard = -math.inf
+        self._held = False  # as last heard, though it may be too old to go on
         self._latched = False
 
     @property
@@ -37,10 +38,11 @@ class DeadManSwitch:
     def hold(self, velocity: Velocity, now: float) -> Velocity | None:
         """Hear what is held; return the command that has to go out at once, None if there is none.
 
-        After a stop of a movement nothing passes until a release was heard.
+        After a stop while something was held nothing passes until a release was heard.
         """
         if velocity == REST:
             return self.release()
+        self._held = True
         if self._latched:
             return None
         changed = velocity != self._velocity
@@ -49,12 +51,16 @@ class DeadManSwitch:
 
     def release(self) -> Velocity | None:
         """Hear that nothing is held any more; return the zero that has to go out at once, if one has to."""
-        self._latched = False
+        self._held = self._latched = False
+        return self._rest()
+
+    def interrupt(self) -> Velocity | None:
+        """End the movement, but believe nothing of what is held; return the zero that has to go out at once."""
         return self._rest()
 
     def stop(self) -> Velocity | None:
-        """As `release`, but what is held now, if anything, has to be released before anything passes again."""
-        self._latched = self._latched or self.moving
+        """As `interrupt`, but what was held last, if anything, has to be released before anything passes again."""
+        self._latched = self._latched or self._held
         return self._rest()
 
     def due(self, now: float) -> Velocity | None:

@@ -145,7 +145,9 @@ class ConsoleServer:
             "available": self._steering.available,
             "pages": len(self._clients),
         }
-        return state_message(self._graph.state(), self._host.state(), lease)
+        graph = self._graph.state()
+        self._steering.watch(bool((graph.get("bridge") or {}).get("armed")))
+        return state_message(graph, self._host.state(), lease)
 
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:

@@ -26,6 +26,7 @@ class Steering:
         self._lease = Lease(SILENCE)
         self._switch = DeadManSwitch(timeout)
         self._pulse: asyncio.TimerHandle | None = None
+        self._armed = False
 
     @property
     def holder(self) -> int | None:
@@ -57,8 +58,8 @@ class Steering:
     def show(self, client: int, seen: bool) -> None:
         """Know whether a client's page is seen; a hidden one steers nothing."""
         self._lease.hide(client, not seen)
-        if not seen:
-            self.release(client)
+        if not seen and client == self.holder:
+            self.rest()
 
     def hold(self, client: int, velocity: Velocity) -> bool:
         """Hear what a client holds; return whether it is the one who steers, its page seen."""
@@ -73,6 +74,17 @@ class Steering:
         """Hear that a client holds nothing any more."""
         if client == self.holder:
             self._send(self._switch.release())
+
+    def interrupt(self, client: int) -> None:
+        """End the movement of a client of whom something came that cannot be used; a stop stays in force."""
+        if client == self.holder:
+            self._send(self._switch.interrupt())
+
+    def watch(self, armed: bool) -> None:
+        """Know whether the bridge is armed; when it ceases to be, by whomever, what is held has to be released."""
+        if self._armed and not armed:
+            self.rest()
+        self._armed = armed
 
     def rest(self) -> None:
         """Let the needle rest, whoever steers, until what is held has been released."""

@@ -71,6 +71,35 @@ def test_after_a_stop_of_nothing_the_next_key_counts():
     assert switch.hold(EAST, 0.0) == EAST
 
 
+def test_a_stop_counts_though_what_is_held_was_not_heard_in_time():
+    """The network held the words up, and the key is still down as they come again."""
+    switch = DeadManSwitch(0.15)
+    switch.hold(EAST, 0.0)
+    assert switch.due(0.2) == REST
+    assert switch.stop() is None
+    assert switch.hold(EAST, 0.3) is None
+    switch.release()
+    assert switch.hold(EAST, 0.4) == EAST
+
+
+def test_a_stop_after_a_release_asks_for_no_other():
+    switch = DeadManSwitch(0.15)
+    switch.hold(EAST, 0.0)
+    switch.release()
+    assert switch.stop() is None
+    assert switch.hold(EAST, 0.1) == EAST
+
+
+def test_an_interruption_ends_the_movement_and_lifts_no_stop():
+    switch = DeadManSwitch(0.15)
+    switch.hold(EAST, 0.0)
+    assert switch.interrupt() == REST
+    assert switch.hold(EAST, 0.01) == EAST
+    switch.stop()
+    assert switch.interrupt() is None
+    assert switch.hold(EAST, 0.02) is None
+
+
 def test_a_second_stop_does_not_undo_the_first():
     switch = DeadManSwitch(0.15)
     switch.hold(EAST, 0.0)
@@ -79,7 +108,9 @@ def test_a_second_stop_does_not_undo_the_first():
     assert switch.hold(EAST, 0.01) is None
 
 
-words = st.lists(st.tuples(st.sampled_from(["hold", "release", "stop", "due"]), st.floats(0.0, 0.2)), max_size=60)
+words = st.lists(
+    st.tuples(st.sampled_from(["hold", "release", "interrupt", "stop", "due"]), st.floats(0.0, 0.2)), max_size=60
+)
 
 
 @given(words)
@@ -92,7 +123,7 @@ def test_whatever_is_said_every_movement_is_ended_by_one_zero(said):
             heard = now
             out = switch.hold(EAST, now)
         else:
-            out = switch.due(now) if word == "due" else {"release": switch.release, "stop": switch.stop}[word]()
+            out = switch.due(now) if word == "due" else getattr(switch, word)()
         if out == EAST:
             assert now - heard < 0.15
         sent.append(out)

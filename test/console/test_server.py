@@ -382,6 +382,73 @@ def test_an_emergency_stop_of_anybody_rests_the_needle_until_the_key_is_let_go()
     run(test, hold_timeout=1.0)
 
 
+@pytest.mark.parametrize(
+    "between", [{"type": "nonsense"}, {"type": "hold", "direction": [1, 0], "speed": 1, "sent": 1}]
+)
+def test_what_cannot_be_used_does_not_lift_a_stop(between: dict[str, Any]):
+    """A word that is refused or late is no key that was let go."""
+
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+        await page.say(type="act", action="stop")
+        await until(lambda: here.graph.actions == ["stop"])
+        count = len(here.graph.commands)
+        await page.say(**between)
+        await page.hold(1, 0)
+        await until(lambda: page.of("error"))
+        await page.say(type="act", action="reset")
+        await until(lambda: here.graph.actions == ["stop", "reset"])
+        assert len(here.graph.commands) == count
+        await page.say(type="release")
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+
+    run(test, hold_timeout=1.0)
+
+
+def test_a_bridge_that_somebody_else_disarms_asks_for_the_key_anew():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await until(lambda: page.of("state"))
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+        here.graph.shown["bridge"].update(armed=False, emergency_stopped=True)
+        await until(lambda: here.graph.last == REST)
+        here.graph.shown["bridge"].update(armed=True, emergency_stopped=False)
+        count = len(here.graph.commands)
+        await page.hold(1, 0)
+        await page.say(type="act", action="reset")
+        await until(lambda: here.graph.actions == ["reset"])
+        assert len(here.graph.commands) == count
+        await page.say(type="release")
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+
+    run(test, hold_timeout=1.0)
+
+
+def test_a_key_that_is_held_as_the_page_hides_has_to_be_let_go():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        await page.hold(1, 0)
+        await page.say(type="visible", seen=False)
+        await page.say(type="visible", seen=True)
+        await page.hold(1, 0)
+        await page.say(type="record", on=True)
+        await until(lambda: here.host.asked)
+        assert here.graph.velocities == [(0.003, 0.0), REST]
+        await page.say(type="release")
+        await page.hold(1, 0)
+        await until(lambda: here.graph.last == (0.003, 0.0))
+
+    run(test, hold_timeout=1.0)
+
+
 def test_a_refusal_is_told():
     async def test(here: Console) -> None:
         page = await here.page()
@@ -455,6 +522,24 @@ def test_a_flood_of_messages_is_refused():
         for _ in range(1500):
             await page.say(type="release")
         await until(lambda: any("in a second" in entry["text"] for entry in page.of("error")))
+
+    run(test)
+
+
+def test_an_emergency_stop_comes_through_a_flood_which_ends_the_connection():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.take()
+        for _ in range(1200):
+            await page.say(type="release")
+        await page.say(type="act", action="stop")
+        await until(lambda: here.graph.actions == ["stop"])
+        with contextlib.suppress(ConnectionError):
+            for _ in range(20_000):
+                if page.socket.closed:
+                    break
+                await page.say(type="release")
+        await until(lambda: page.socket.closed and not here.server._clients)
 
     run(test)
 
