@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.configuration import load_setup
+from magnetosuture_thread.configuration import from_mapping, load_setup, read_yaml, to_mapping
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
@@ -74,6 +75,7 @@ def read_setup(name: str) -> Setup:
     """
     path = setup_file(name)
     settings = load_setup(path, CLASSES)
+    settings[ConsoleSettings.GROUP] = _console(path, settings)
     # What several nodes must know of the same thing is in the section of each, as ROS has it.
     for one, other in SAME:
         value, expected = (getattr(settings[group], field) for group, field in (one, other))
@@ -85,3 +87,16 @@ def read_setup(name: str) -> Setup:
     if outside:
         raise ConfigurationError("path_follower.waypoints", outside[0], f"within the dish, {radius:g} m", str(path))
     return Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))
+
+
+def _console(path: Path, settings: dict[str, Any]) -> ConsoleSettings:
+    """Return the page's settings: what its section does not say of dish and needle is as the other nodes have it.
+
+    Set-ups from before the page have no such section, and those in their bags neither.
+    """
+    group = ConsoleSettings.GROUP
+    section = read_yaml(path, "set-up file").get(group, {"ros__parameters": {}})
+    mine = [(field, other) for (owner, field), other in SAME if owner == group]
+    given = section["ros__parameters"]
+    told = {field: getattr(settings[owner], name) for field, (owner, name) in mine if field not in given}
+    return from_mapping(ConsoleSettings, {**to_mapping(settings[group]), **told}, str(path))

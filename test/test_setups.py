@@ -96,6 +96,21 @@ def test_sections_that_contradict_each_other_are_refused(tmp_path: Path, section
         read_setup(str(path))
 
 
+@pytest.mark.parametrize("section", ["", "console: {ros__parameters: {port: 0}}"])
+def test_the_page_shows_the_dish_and_the_needle_of_the_others_where_it_is_not_told(tmp_path: Path, section: str):
+    """As in set-ups, and in bags, from before there was a page."""
+    path = tmp_path / "before.yaml"
+    length = "needle_length: 0.004"
+    path.write_text(
+        f"vision_tracker: {{ros__parameters: {{dish_diameter: 0.05, {length}}}}}\n"
+        f"coil_bridge: {{ros__parameters: {{dish_diameter: 0.05, {length}, needle_curvature: 8.0}}}}\n"
+        f"path_follower: {{ros__parameters: {{{length}, needle_curvature: 8.0}}}}\n{section}\n"
+    )
+    page = read_setup(str(path)).console
+    assert (page.dish_diameter, page.needle_length, page.needle_curvature) == (0.05, 0.004, 8.0)
+    assert page.port == (0 if section else 8090)
+
+
 def test_a_setup_is_found_by_path(tmp_path: Path):
     path = tmp_path / "mine.yaml"
     path.write_text("thread_model: {ros__parameters: {segments: 30}}\n")
