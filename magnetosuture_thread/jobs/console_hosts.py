@@ -201,11 +201,13 @@ class SimulatedHost(RecordingHost):
         if not self.busy:
             return
         missing = [name for name in (RIG, *NODES) if not self.graph.says(name)]
-        if not missing and self.graph.state()["bridge"] is not None:
+        bridge = self.graph.state()["bridge"] or {}
+        if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
             self._hold("")
             self.say(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > START_TIMEOUT:
-            raise GraphError(f"after {START_TIMEOUT:g} s nothing is heard of {', '.join(missing) or 'the bridge'}")
+            unheard = ", ".join(missing) or "a bridge that is ready"
+            raise GraphError(f"after {START_TIMEOUT:g} s nothing is heard of {unheard}")
 
     async def close(self) -> None:
         """End recording and nodes."""

@@ -1,9 +1,10 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
 // data-friction (free, pulled, resting, unknown, invalid, old, none), data-colour of the predicted thread,
-// data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels.
+// data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import { GREY, MIDDLING, SEEN, VELOCITY, nodeLook, onGround, threadLook } from "./colours.js";
 import { Placement, needleArc } from "./geometry.js";
+import { drawObstacles } from "./obstacles.js";
 
 const STALE = 0.5; // [s] a needle that is older is drawn grey
 const ARROW = 0.3; // of the dish's diameter, at the greatest speed
@@ -13,6 +14,8 @@ export class Dish {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d", { alpha: false });
+    this.ground = document.createElement("canvas"); // image and obstacles, which change less often than the rest
+    this.under = []; // what the ground was drawn of
     this.image = null;
     this.placement = null; // in pixels of the page
     this.dark = matchMedia("(prefers-color-scheme: dark)");
@@ -39,14 +42,13 @@ export class Dish {
     this.ink = bright ? "#1d2833" : "#e6ecf1";
     this.velocity = onGround(VELOCITY, !bright);
     this.halo = bright ? "rgba(255,255,255,0.9)" : "rgba(10,15,20,0.9)";
-    this.#plain();
-    context.fillStyle = this.paper;
-    context.fillRect(0, 0, width, height);
-    if (shown) this.#drawImage(graph.tracker.view);
-    else this.#drawFloor(graph);
+    this.#drawGround(graph, shown ? graph.tracker.view : null, width, height);
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.drawImage(this.ground, 0, 0);
+    plain(context, ratio);
     const look = threadLook(graph?.predicted, graph?.margins, since);
+    const tip = graph?.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop().join(",") : "";
     if (graph) {
-      this.#drawObstacles(graph.obstacles ?? []);
       this.#line(graph.seen ?? [], 12, SEEN);
       this.#drawPredicted(graph, look);
       this.#drawNeedle(graph, since);
@@ -55,83 +57,42 @@ export class Dish {
     if (leash) this.#drawLeash(leash);
     this.#drawScaleBar(width, height);
     Object.assign(canvas.dataset, {
-      friction: look.state, colour: look.colour, image: shown ? "yes" : "no",
+      friction: look.state, colour: look.colour, image: shown ? "yes" : "no", tip,
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
   }
 
-  #plain() {
-    this.context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
-    this.context.globalAlpha = 1;
-    this.context.setLineDash([]);
-    this.context.lineJoin = this.context.lineCap = "round";
-  }
-
-  #drawImage(view) {
-    const { context, ratio } = this;
-    context.setTransform(...this.placement.image(view).map((entry) => entry * ratio));
-    context.drawImage(this.image, -0.5, -0.5); // a pixel's place is its middle
-    this.#plain();
-    if (!this.dark.matches) return;
-    context.fillStyle = "rgba(10, 15, 20, 0.22)";
-    context.fillRect(0, 0, this.canvas.width, this.canvas.height);
-  }
-
-  #drawFloor(graph) {
-    const { context, placement } = this;
-    const radius = (placement.scale * (graph?.dish_diameter ?? 0.035)) / 2;
-    context.beginPath();
-    context.arc(...placement.centre, radius, 0, 2 * Math.PI);
-    context.fillStyle = this.dark.matches ? "#232d36" : "#f7fafc";
-    context.fill();
-    context.strokeStyle = this.dark.matches ? "#5b6b78" : "#8fa2b2";
-    context.lineWidth = 2;
-    context.stroke();
-  }
-
-  #drawObstacles(obstacles) {
-    const { context, placement } = this;
-    context.fillStyle = "rgba(120, 112, 98, 0.38)";
-    context.strokeStyle = "rgba(88, 78, 62, 0.95)";
-    context.lineWidth = 1.5;
-    for (const obstacle of obstacles) {
+  // Draw the ground anew where anything of it has changed.
+  #drawGround(graph, view, width, height) {
+    const obstacles = graph?.obstacles ?? [];
+    const under = [
+      view && this.image, this.canvas.width, this.canvas.height, this.ratio, this.dark.matches, graph?.dish_diameter,
+      JSON.stringify([view, obstacles]),
+    ];
+    if (under.every((entry, at) => entry === this.under[at])) return;
+    this.under = under;
+    const { ground, placement, ratio } = this;
+    [ground.width, ground.height] = [this.canvas.width, this.canvas.height];
+    const context = ground.getContext("2d", { alpha: false });
+    plain(context, ratio);
+    context.fillStyle = this.paper;
+    context.fillRect(0, 0, width, height);
+    if (view) {
+      context.setTransform(...placement.image(view).map((entry) => entry * ratio));
+      context.drawImage(this.image, -0.5, -0.5); // a pixel's place is its middle
+      plain(context, ratio);
+      context.fillStyle = this.dark.matches ? "rgba(10, 15, 20, 0.22)" : "transparent";
+      context.fillRect(0, 0, width, height);
+    } else {
       context.beginPath();
-      if (obstacle.disc) {
-        const [x, y, r] = obstacle.disc;
-        context.arc(...placement.at([x, y]), placement.scale * r, 0, 2 * Math.PI);
-        context.fill();
-        context.stroke();
-      } else {
-        this.#drawTriangles(obstacle.triangles ?? []);
-      }
+      context.arc(...placement.centre, (placement.scale * (graph?.dish_diameter ?? 0.035)) / 2, 0, 2 * Math.PI);
+      context.fillStyle = this.dark.matches ? "#232d36" : "#f7fafc";
+      context.fill();
+      context.strokeStyle = this.dark.matches ? "#5b6b78" : "#8fa2b2";
+      context.lineWidth = 2;
+      context.stroke();
     }
-  }
-
-  // Triangles, three corners each: filled together, the sides that no other triangle shares drawn as the outline.
-  #drawTriangles(corners) {
-    const { context, placement } = this;
-    const points = corners.map((corner) => placement.at(corner));
-    const sides = new Map();
-    for (let at = 0; at + 2 < points.length; at += 3) {
-      const [a, b, c] = points.slice(at, at + 3);
-      const turned = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) < 0;
-      const way = turned ? [a, c, b] : [a, b, c];
-      way.forEach((point, corner) => (corner ? context.lineTo(...point) : context.moveTo(...point)));
-      context.closePath();
-      way.forEach((from, corner) => {
-        const to = way[(corner + 1) % 3];
-        const key = [from, to].map((point) => point.map((entry) => entry.toFixed(2)).join()).sort().join(" ");
-        sides.set(key, sides.has(key) ? null : [from, to]);
-      });
-    }
-    context.fill("nonzero");
-    context.beginPath();
-    for (const side of sides.values()) {
-      if (!side) continue;
-      context.moveTo(...side[0]);
-      context.lineTo(...side[1]);
-    }
-    context.stroke();
+    drawObstacles(context, placement, obstacles);
   }
 
   #trace(points) {
@@ -273,4 +234,11 @@ export class Dish {
     context.textAlign = "center";
     context.fillText(`${step * 1e3} mm`, x + size / 2, y - 8);
   }
+}
+
+function plain(context, ratio) {
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.globalAlpha = 1;
+  context.setLineDash([]);
+  context.lineJoin = context.lineCap = "round";
 }

@@ -8,7 +8,9 @@ import { Plots } from "./plots.js";
 import { SILENT } from "./why.js";
 
 const BEAT = 30; // [ms] between two words while something is held
-const PANEL = 100; // [ms] between two looks at the panel and the plots
+const PANEL = 100; // [ms] between two looks at the panel
+const PLOTS = 250; // [ms] between two drawings of the plots
+const BETWEEN = 0.06; // [s] after a state; without the next, a camera frame is drawn by itself
 const NOTICE = 7000; // [ms]
 
 const stats = { fps: 0, drawn: 0, states: 0, frames: 0, errors: 0 };
@@ -21,7 +23,7 @@ const clock = () => performance.now() / 1000;
 
 const state = {
   link: "connecting", problem: "", graph: null, host: null, lease: null, heard: 0, me: null, commands: false,
-  speed: 0.003, maxSpeed: 0.01, adjusted: false, dirty: true, sending: false, stopped: false,
+  speed: 0.003, maxSpeed: 0.01, adjusted: false, sending: false, stopped: false,
 };
 const dish = new Dish(find("dish"));
 const plots = new Plots(document);
@@ -34,12 +36,14 @@ const since = () => (state.graph ? clock() - state.heard : 0);
 const mine = () => state.link === "open" && state.commands && state.me !== null && state.lease?.holder === state.me;
 
 function opened() {
-  Object.assign(state, { link: "open", problem: "", me: null, dirty: true });
+  Object.assign(state, { link: "open", problem: "", me: null });
+  drawSoon();
   connection.send({ type: "visible", seen: !document.hidden });
 }
 
 function closed(reason) {
-  Object.assign(state, { link: "closed", problem: reason, lease: null, me: null, sending: false, dirty: true });
+  Object.assign(state, { link: "closed", problem: reason, lease: null, me: null, sending: false });
+  drawSoon();
   input.drop();
 }
 
@@ -56,7 +60,8 @@ function said(message) {
 function newState(message) {
   connection.send({ type: "got", what: "state" });
   stats.states += 1;
-  Object.assign(state, { graph: message.graph, host: message.host, lease: message.lease, heard: clock(), dirty: true });
+  Object.assign(state, { graph: message.graph, host: message.host, lease: message.lease, heard: clock() });
+  drawSoon();
   plots.add(message.graph, state.heard);
   const stopped = Boolean(message.graph.bridge?.emergency_stopped);
   if (stopped && !state.stopped) input.drop();
@@ -69,7 +74,7 @@ async function frame(buffer) {
     dish.image?.close();
     dish.image = image;
     stats.frames += 1;
-    state.dirty = true;
+    if (since() > BETWEEN) drawSoon(); // else the next state draws it
   } catch {
     stats.errors += 1;
     notice("A camera frame could not be read");
@@ -127,13 +132,20 @@ find("speed").addEventListener("input", ({ target }) => {
 });
 find("speed").addEventListener("pointerup", ({ target }) => target.blur());
 document.addEventListener("visibilitychange", () => connection.send({ type: "visible", seen: !document.hidden }));
-addEventListener("resize", () => (state.dirty = true));
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => (state.dirty = true));
+addEventListener("resize", drawSoon);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  drawSoon();
+  plots.draw();
+});
+
+let asked = false;
+function drawSoon() {
+  if (!asked) requestAnimationFrame(draw);
+  asked = true;
+}
 
 function draw() {
-  requestAnimationFrame(draw);
-  if (!state.dirty) return;
-  state.dirty = false;
+  asked = false;
   stats.drawn += 1;
   dish.draw(state.graph, { since: since(), leash: mine() ? input.leash() : null, maxSpeed: state.maxSpeed });
 }
@@ -147,7 +159,7 @@ function look() {
   }
   if (state.graph && since() > SILENT) {
     input.drop(); // nobody steers blind
-    state.dirty = true;
+    drawSoon();
   }
   document.body.dataset.link = state.link;
   showPanel({
@@ -155,15 +167,15 @@ function look() {
     lease: state.lease, me: state.me, mine: mine(), commands: state.commands, held: state.sending, hasImage: dish.image !== null,
     fps: stats.fps, speed: state.speed, maxSpeed: state.maxSpeed,
   });
-  plots.draw();
 }
 
 setInterval(() => {
   input.poll();
   beat();
-  if (input.pointer) state.dirty = true;
+  if (input.pointer) drawSoon();
 }, BEAT);
 setInterval(look, PANEL);
+setInterval(() => plots.draw(), PLOTS);
 connection.open();
 look();
-draw();
+drawSoon();

@@ -57,7 +57,7 @@ function showHost({ host, mine, open }) {
   const select = find("scenario");
   const names = host?.scenarios ?? [];
   if ([...select.options].map((option) => option.value).join("\n") !== names.join("\n")) {
-    select.replaceChildren(...names.map((name) => new Option(name.replaceAll("_", " "), name)));
+    select.replaceChildren(...names.map((name) => new Option(spoken(name), name)));
   }
   if (host && document.activeElement !== select && select.value !== host.scenario) select.value = host.scenario;
   const allowed = open && mine && host && !host.busy;
@@ -73,7 +73,10 @@ function showHost({ host, mine, open }) {
   write("recording", host?.busy ? capital(host.busy) : host?.recording ? `Recording to ${host.recording}` : "");
 }
 
-function showCoils({ graph, since, commands, mine, open }) {
+// A set-up's name for a person, also of one that is a path.
+const spoken = (name) => name.split("/").pop().replace(/\.yaml$/, "").replaceAll("_", " ");
+
+function showCoils({ graph, host, since, commands, mine, open }) {
   const bridge = graph?.bridge;
   const fresh = bridge && bridge.age + since <= SILENT;
   const armed = Boolean(bridge?.armed);
@@ -85,9 +88,9 @@ function showCoils({ graph, since, commands, mine, open }) {
   else if (bridge.state !== "active") write("coils", bridge.state, "silent");
   else write("coils", armed ? "armed" : "disarmed", armed ? "ok" : "warn");
   find("stop").disabled = open && !commands;
-  find("arm").disabled = !(open && mine && bridge && !armed && !latched && bridge.state === "active");
+  find("arm").disabled = !(open && mine && !host?.busy && bridge && !armed && !latched && bridge.driver_ready && bridge.state === "active");
   find("disarm").disabled = !(open && commands && armed);
-  find("reset").disabled = !(open && mine && latched);
+  find("reset").disabled = !(open && mine && !host?.busy && latched);
   const warnings = bridge?.driver_warnings ?? [];
   const driver = bridge ? [`Driver ${bridge.driver}: ${bridge.driver_ready ? "ready" : "not ready"}`, ...warnings].join(" · ") : "Driver: nothing heard";
   write("driver", bridge?.refused ? `${driver} · ${bridge.refused} commands refused` : driver);
@@ -170,7 +173,8 @@ function showNodes({ graph, since }) {
   const rows = Object.entries(graph.nodes ?? {}).map(([name, { level, message, age }]) => {
     const total = isNumber(age) ? age + since : null;
     const stale = level === "silent" || total === null || total > NODE_SILENT;
-    return [name, stale ? "silent" : level, stale ? `nothing for ${seconds(total)}` : seconds(total), message ?? ""];
+    const heard = stale ? `nothing for ${seconds(total)}` : total < 1 ? "now" : `${Math.floor(total)} s ago`;
+    return [name, stale ? "silent" : level, heard, message ?? ""];
   });
   if (!rows.length) rows.push(["no node heard yet", "", "", ""]);
   fill(find("nodes"), rows, ([name, level, age, message]) => {

@@ -1,7 +1,7 @@
 // Running plots of the last 30 s, drawn a few times a second.
 
 import { COILS, FREE, MIDDLING, RESTING, VELOCITY, onGround } from "./colours.js";
-import { isNumber, leastClearance, length, plural } from "./format.js";
+import { fixed, isNumber, leastClearance, length, plural } from "./format.js";
 
 const SPAN = 30; // [s]
 const EDGE = { left: 27, right: 4, top: 7, bottom: 4 };
@@ -67,7 +67,7 @@ export class Plots {
     const values = samples.flatMap((sample) => series.map(({ of }) => of(sample))).filter(isNumber);
     const high0 = niceCeiling(values.reduce((most, value) => Math.max(most, value), least));
     const lowest = values.reduce((most, value) => Math.min(most, value), 0);
-    const low0 = lowest < 0 ? -niceCeiling(-lowest) : 0;
+    const low0 = lowest < -0.02 * high0 ? -niceCeiling(-lowest) : 0;
     const end = samples.length ? samples[samples.length - 1].time : 0;
     const x = (time) => EDGE.left + ((time - end + SPAN) / SPAN) * (width - EDGE.left - EDGE.right);
     const y = (value) => EDGE.top + ((high0 - value) / (high0 - low0)) * (height - EDGE.top - EDGE.bottom);
@@ -89,7 +89,7 @@ export class Plots {
       context.lineTo(width - EDGE.right, y(value));
       context.stroke();
       context.fillStyle = this.dark.matches ? "#a3b0bc" : "#56636f";
-      context.fillText(String(value), EDGE.left - 4, y(value));
+      if (value || y(low) - y(0) > 12 || !low) context.fillText(String(value), EDGE.left - 4, y(value));
     }
   }
 
@@ -151,4 +151,4 @@ function niceCeiling(value) {
   return Number((factor * power).toPrecision(3));
 }
 
-const figure = (value, digits, unit) => (isNumber(value) ? `${value.toFixed(digits)} ${unit}` : "no data");
+const figure = (value, digits, unit) => (isNumber(value) ? `${fixed(value, digits)} ${unit}` : "no data");
