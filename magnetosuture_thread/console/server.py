@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 
 from aiohttp import web
 from aiohttp.typedefs import Handler
@@ -71,6 +72,9 @@ class ConsoleServer:
             ) from None
         self._runner, self._port = runner, runner.addresses[0][1]
         self._telling = asyncio.create_task(self._tell())
+        # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
+        gc.collect()
+        gc.freeze()
         return page_url("127.0.0.1" if is_any(address) else address, self._port, self._token)
 
     async def stop(self) -> None:

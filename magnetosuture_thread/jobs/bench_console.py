@@ -12,22 +12,28 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
+from magnetosuture_thread.configuration import read_yaml
 from magnetosuture_thread.errors import ConfigurationError, GraphError
-from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
+from magnetosuture_thread.interface import NEEDLE_SETPOINT, OPERATOR_COMMAND
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.console_report import ConsoleReport, Delays
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-SCENARIO = "petri_150mm_silk"  # whose thread has n = 81
+SCENARIO = "petri_35mm_polyamide"
+SEGMENTS, FRAME_RATE = 81, 30.0  # in place of the scenario's own
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH, HEIGHT = 1366, 768  # of the page [px]
 PATIENCE = 240.0  # s for the graph to be there; the first start on a machine compiles
 HELD, LET_GO = 0.25, 0.35  # s that a key is held, and not held, on average
-KEYS = ("ArrowLeft", "ArrowRight")  # in turn, so that the needle stays where it is
+KEYS = (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"))  # by axis; the second where the tip is beyond 0
 GRACE = 20.0  # s for the command to end
 LISTEN = "() => { window.bench_keys = []; addEventListener('keydown', (event) => { if (!event.repeat)"
 LISTEN += " window.bench_keys.push(performance.timeOrigin + event.timeStamp); }, true); }"
@@ -99,10 +105,8 @@ def bench_console(
         GraphError: the graph does not start, or moves nothing.
     """
     browser = _browser()
-    segments = read_setup(SCENARIO).model.segments
-    say(f"starting {SCENARIO}, {segments} segments, and a browser")
-    server = Server(SCENARIO)
-    try:
+    say(f"starting {SCENARIO} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
+    with TemporaryDirectory() as folder, _serving(Path(folder)) as server:
         domain = int(server.says(r"ROS domain (\d+)"))
         url = server.says(r"open (http\S+)")
         server.says(r"(runs; the coils)")
@@ -114,29 +118,47 @@ def bench_console(
             _press(page, presses, progress)
             after, took = _stats(page), time.monotonic() - began
             keys = [float(stamp) * 1e-3 for stamp in page.evaluate("() => window.bench_keys")]
-    finally:
-        server.end()
     if not heard[NEEDLE_SETPOINT.recorded]:
         raise GraphError("no key moved the needle")
     rates = {name: (after[name] - before[name]) / took for name in ("drawn", "states", "frames")}
     delays = [Delays.between(words, keys, heard[channel.recorded]) for channel, words in _STATIONS]
-    return ConsoleReport(SCENARIO, segments, tuple(delays), rates["drawn"], rates["states"], rates["frames"])
+    return ConsoleReport(SCENARIO, SEGMENTS, tuple(delays), rates["drawn"], rates["states"], rates["frames"])
+
+
+@contextmanager
+def _serving(folder: Path) -> Iterator[Server]:
+    """Run the command with the scenario that is measured."""
+    content = read_yaml(read_setup(SCENARIO).path, "set-up file")
+    content["thread_model"]["ros__parameters"]["segments"] = SEGMENTS
+    content["rig_simulator"]["ros__parameters"]["frame_rate"] = FRAME_RATE
+    path = folder / f"{SCENARIO}.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    server = Server(str(path))
+    try:
+        yield server
+    finally:
+        server.end()
 
 
 _STATIONS = (
     (OPERATOR_COMMAND, "the page's wish in the graph"),
-    (NEEDLE_COMMAND, "the filtered velocity at the bridge"),
-    (NEEDLE_SETPOINT, "the velocity of the coils' currents"),
+    (NEEDLE_SETPOINT, "the filtered velocity at the bridge"),
 )
 
 
 def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
-    """Hold a key, and let it go, again and again; at random times, so that they meet every phase of all loops."""
+    """Hold a key, and let it go, again and again; at random times, so that they meet every phase of all loops.
+
+    Each leads the needle towards the dish's centre: at the wall nothing would move.
+    """
     chance = random.Random(1)
     for done in range(presses):
-        page.keyboard.down(KEYS[done % len(KEYS)])
+        tip = [float(entry) for entry in (page.get_attribute("#dish", "data-tip") or "0,0").split(",")]
+        axis = done % 2
+        key = KEYS[axis][int(tip[axis] > 0.0)]
+        page.keyboard.down(key)
         time.sleep(HELD * chance.uniform(0.8, 1.2))
-        page.keyboard.up(KEYS[done % len(KEYS)])
+        page.keyboard.up(key)
         time.sleep(LET_GO * chance.uniform(0.8, 1.2))
         progress((done + 1) / presses)
 
@@ -179,13 +201,11 @@ def _page(browser: str, url: str) -> Iterator[Page]:
 @contextmanager
 def _heard(domain: int) -> Iterator[Times]:
     """Give the times [s] at which a velocity that is not zero came on each topic, filled when the block ends."""
-    from rclpy.serialization import deserialize_message
-
-    from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes import messages, topics
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment
     from magnetosuture_thread.nodes.recorder import Recorder
 
-    taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_COMMAND, topics.NEEDLE_SETPOINT]
+    taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_SETPOINT]
     came: list[tuple[str, int, bytes]] = []
     times: Times = {topic.channel.recorded: [] for topic in taken}
     with environment_of(graph_environment(domain)):
@@ -207,6 +227,5 @@ def _heard(domain: int) -> Iterator[Times]:
         thread.join()
         recorder.close()
         for topic, at, data in came:
-            linear = deserialize_message(data, topics.NEEDLE_COMMAND.message).twist.linear
-            if linear.x or linear.y:
+            if messages.serialised_velocity(data).any():
                 times[topic].append(at * 1e-9)

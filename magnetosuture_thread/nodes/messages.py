@@ -17,6 +17,7 @@ from geometry_msgs.msg import (
 )
 from magnetosuture_msgs.msg import TrackerState
 from nav_msgs.msg import Path
+from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 from magnetosuture_thread.errors import InvalidInputError
@@ -174,6 +175,12 @@ def plane_velocity(message: TwistStamped, field: str) -> np.ndarray:
     others = [linear.z, angular.x, angular.y, angular.z]
     if any(value != 0.0 for value in others):
         raise InvalidInputError(f"{field}.twist", f"linear.z, angular = {others}", "zeros: x and y alone count")
+    return np.array([linear.x, linear.y])
+
+
+def serialised_velocity(data: bytes) -> np.ndarray:
+    """Return the velocity of a serialised stamped twist, shape (2,) [m/s]."""
+    linear = deserialize_message(data, TwistStamped).twist.linear
     return np.array([linear.x, linear.y])
 
 

@@ -78,10 +78,10 @@ class ConsoleReport:
 
 def console_table(report: ConsoleReport) -> Table:
     """Return the figures as a table that fits 80 columns."""
-    title = f"operator's page on {report.scenario} (simulated), n = {report.segments}; times from a key press in ms"
+    title = f"operator's page, simulated rig, n = {report.segments}; ms from a key press"
     table = Table(title=title, title_justify="left", title_style="bold")
     table.add_column("", no_wrap=True)
-    for name in ("median", "p99", "greatest", "presses", "lost"):
+    for name in ("median", "p99", "most", "keys", "lost"):
         table.add_column(name, justify="right", no_wrap=True)
     for each in report.delays:
         values = (f"{1e3 * value:.1f}" for value in (each.median, each.p99, each.greatest))

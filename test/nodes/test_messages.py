@@ -11,6 +11,7 @@ from geometry_msgs.msg import Point, Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
 from magnetosuture_msgs.msg import BarrierMargin, Disc, ObstacleSet, Outline, Polygon, ThreadMaterial
+from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.errors import InvalidInputError
@@ -111,6 +112,7 @@ def test_paths_and_velocities_go_there_and_back():
     assert messages.path_points(messages.PathMaker().message(STAMP, np.empty((0, 2)))).shape == (0, 2)
     twist = messages.twist_message(STAMP, np.array([1.0, -2.0]))
     np.testing.assert_array_equal(messages.plane_velocity(twist, "needle/servo_cv"), [1.0, -2.0])
+    np.testing.assert_array_equal(messages.serialised_velocity(serialize_message(twist)), [1.0, -2.0])
 
 
 @pytest.mark.parametrize("topic", [*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS], ids=lambda topic: topic.name)
