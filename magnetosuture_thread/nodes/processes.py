@@ -167,13 +167,12 @@ class NodeProcesses:
         """Return whether a node has ended."""
         return self._processes[label].poll() is not None
 
-    def end(self, *labels: str) -> None:
-        """End nodes, politely first, and wait until they have ended; all of them if none is named."""
-        ending = [self._processes.pop(label) for label in labels or tuple(self._processes)]
-        for process in ending:
+    def end(self) -> None:
+        """End the nodes, politely first, and wait until they have ended."""
+        for process in self._processes.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
-        for process in ending:
+        for process in self._processes.values():
             try:
                 process.wait(GRACE)
             except subprocess.TimeoutExpired:
