@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +56,11 @@ class Bench:
     def frames(self) -> int:
         """Return how many camera frames the page has got."""
         return int(self.page.evaluate("window.console_stats.frames"))
+
+    def under_friction(self) -> int:
+        """Return how many nodes the page says are under friction."""
+        found = re.search(r"(\d+) node", self.page.inner_text("#friction"))
+        return int(found[1]) if found else 0
 
     def rests(self) -> None:
         """Wait until the needle, without a current, stays where it is while ten camera frames come."""
@@ -137,7 +143,7 @@ def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path)
     assert count > 50
     assert red > green > blue  # orange
     light_and_dark(page, tmp_path, "pulled")
-    pilot.follow(AROUND)  # so far that the thread does not slip back
+    pilot.follow(AROUND, lambda: bench.under_friction() >= 3)  # so far that the thread does not slip back
     pilot.press()
     pilot.until(lambda: pilot.shown("friction") == "resting", "the thread to rest")
     count, red, green, blue = bench.colour_of_thread()
