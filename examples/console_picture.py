@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
+from magnetosuture_thread.jobs.bench_console import BROWSERS
+
 PICTURE = Path(__file__).parents[1] / "docs" / "console.png"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SCREEN: ViewportSize = {"width": 1366, "height": 768}
 WAIT = 30.0  # s
 SPEED = 4e-3  # m/s

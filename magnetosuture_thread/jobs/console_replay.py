@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.jobs.console_hosts import RecordingHost
 from magnetosuture_thread.jobs.playing import Playing
 from magnetosuture_thread.jobs.simulate import Say
@@ -70,7 +69,7 @@ class ReplayHost(RecordingHost):
         return "what comes of a bag is recorded by `magnetosuture replay BAG --output DIR`"
 
     async def watch(self) -> None:
-        """Raise `GraphError` if a node has ended, or the bag cannot be played on."""
+        """Raise what ended the replay, as a node that has ended or a bag that cannot be played on."""
         if self._problem is not None:
             raise self._problem
 
@@ -100,7 +99,7 @@ class ReplayHost(RecordingHost):
             live.play_on(playing.records)
         except _AskedToEndError:
             pass
-        except MagnetosutureError as error:
+        except Exception as error:  # in a thread nobody else would hear of it
             self._problem = error
         finally:
             live.close()

@@ -13,10 +13,10 @@ from playwright.sync_api import Browser, sync_playwright
 
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.jobs.bench_console import BROWSERS
 from test.console.scene import RecordingGraph, RecordingHost
 
 TOKEN = "a-token-of-the-tests"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 class ServedConsole:

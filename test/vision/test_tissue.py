@@ -29,7 +29,13 @@ def setup() -> Setup:
 
 @pytest.fixture(scope="module")
 def camera(setup: Setup) -> DishCamera:
-    """Return a camera that shows the needle 44 pixels long; the set-up's own takes three quarters of that."""
+    """Return the set-up's own camera, which shows the needle 33 pixels long."""
+    return setup.rig.camera()
+
+
+@pytest.fixture(scope="module")
+def fine_camera(setup: Setup) -> DishCamera:
+    """Return a camera that shows the needle 44 pixels long."""
     return replace(setup.rig, camera_width=1280, camera_height=960).camera()
 
 
@@ -43,21 +49,28 @@ def assert_measured(setup: Setup, camera: DishCamera, tail: np.ndarray, heading:
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_the_needle_is_measured_between_tissue_and_ring(setup: Setup, camera: DishCamera, place: str):
+def test_the_needle_is_measured_between_tissue_and_ring(
+    setup: Setup, camera: DishCamera, fine_camera: DishCamera, place: str
+):
     x, y, heading = PLACES[place]
     tail = np.array([x, y])
     behind, _ = needle_axis(tail, heading + np.pi, 0.004, 0.0, np.linspace(0.0, 1.0, 20))
-    assert_measured(setup, camera, tail, heading, behind)
+    for taking in (camera, fine_camera):
+        assert_measured(setup, taking, tail, heading, behind)
 
 
 @pytest.mark.parametrize("angle", [35.0, 45.0, 60.0, 90.0])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
-    setup: Setup, camera: DishCamera, angle: float, side: float
+    setup: Setup, camera: DishCamera, fine_camera: DishCamera, angle: float, side: float
 ):
-    """As when the needle was turned sharply, and has not pulled its thread straight yet."""
+    """As when the needle was turned sharply, and has not pulled its thread straight yet.
+
+    At 35 degrees the set-up's own camera has too few pixels between the two: the heading may be off by 6 degrees.
+    """
     x, y, heading = PLACES["free"]
     tail = np.array([x, y])
     away = heading + side * np.radians(angle)
     back, _ = needle_axis(tail, away, 0.02, 0.0, np.linspace(0.0, 1.0, 50))
-    assert_measured(setup, camera, tail, heading, back)
+    for taking in (fine_camera, *([camera] if angle > 40.0 else [])):
+        assert_measured(setup, taking, tail, heading, back)
