@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import select
 import time
 from typing import Any
 
@@ -36,7 +38,7 @@ class ExchangePort(serial.Serial):
         self._until = 0.0
         try:
             # The lock comes before anything is changed at the port, and so does not disturb who has it.
-            super().__init__(path, baud_rate, timeout=answer_timeout, write_timeout=answer_timeout, exclusive=True)
+            super().__init__(path, baud_rate, timeout=answer_timeout, exclusive=True)
         except (serial.SerialException, ValueError) as error:
             raise DeviceError(_why_not(path, error)) from error
 
@@ -65,13 +67,23 @@ class ExchangePort(serial.Serial):
             self._packet.clear()
             if time.monotonic() >= self._until:
                 return b""
-            super().write(packet)
+            self._send(packet)
             self._until = time.monotonic() + self.answer_timeout
         if time.monotonic() >= self._until:
             size = min(size, self.in_waiting)
         data = super().read(size)
         self.answer += data
         return data
+
+    def _send(self, packet: bytes) -> None:
+        """Give a packet to the kernel in one piece, once there is room for it.
+
+        The library's own write takes a packet that is out for one that is not, where this thread was held up on the
+        way back from the kernel.
+        """
+        _, room, _ = select.select([], [self], [], max(0.0, self._until - time.monotonic()))
+        if not room or os.write(self.fileno(), packet) < len(packet):
+            raise serial.SerialTimeoutException("no room for a packet")
 
 
 def _why_not(path: str, error: Exception) -> str:

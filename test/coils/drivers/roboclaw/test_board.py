@@ -10,11 +10,13 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import serial
 
+from magnetosuture_thread.coils.drivers.roboclaw import port as port_module
 from magnetosuture_thread.coils.drivers.roboclaw import rules
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
@@ -24,7 +26,6 @@ from magnetosuture_thread.rig.power.board import RoboClawBoard
 from magnetosuture_thread.rig.power.packets import checksum
 
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
-HELD_UP = 3.0 * ANSWER_TIMEOUT
 
 
 class Peer:
@@ -96,6 +97,24 @@ def wait_for(port: ExchangePort, answer_timeout: float) -> None:
     port.timeout = port.answer_timeout = answer_timeout
 
 
+class Clock:
+    """A clock by which a thread is held up when a test says so, and not when the machine is busy."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._now = 100.0
+        patch.setattr(port_module, "time", SimpleNamespace(monotonic=lambda: self._now))
+
+    def hold_up(self) -> None:
+        """Let more time go by than a board has for an answer."""
+        self._now += 3.0 * ANSWER_TIMEOUT
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """What our end goes by."""
+    return Clock(monkeypatch)
+
+
 @pytest.fixture
 def patient(port: ExchangePort) -> None:
     """Give boards that do answer all the time they may need on a busy machine."""
@@ -126,7 +145,7 @@ def simulated(made: RoboClawBoard, step: float | None = None) -> Callable[[bytes
 
 def test_a_packet_goes_out_in_one_piece(port, monkeypatch):
     written: list[bytes] = []
-    monkeypatch.setattr(serial.Serial, "write", lambda _, data: written.append(data))
+    monkeypatch.setattr(ExchangePort, "_send", lambda _, data: written.append(data))
     with pytest.raises(DeviceError):
         board(port, hurries=True).write_zero()
     packet = bytes((128, 34, 0, 0, 0, 0))
@@ -155,6 +174,7 @@ def test_one_packet_may_get_lost(peer, port):
 
 
 def test_nothing_is_tried_twice_in_a_hurry(peer, port):
+    wait_for(port, 0.5)
     peer.answer(lambda _: b"")
     with pytest.raises(DeviceError):
         board(port, hurries=True).write_zero()
@@ -168,36 +188,38 @@ def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     assert len(port.answer) < 48  # which the library would wait for
 
 
-def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port, monkeypatch):
-    write = serial.Serial.write
+def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port, clock, monkeypatch):
+    write = os.write
 
-    def held_up(self: serial.Serial, data: bytes) -> int | None:
-        written = write(self, data)
-        assert os.read(peer.host, 100) == data
-        os.write(peer.host, b"\xff")
-        time.sleep(HELD_UP)
+    def held_up(file: int, data: bytes) -> int:
+        written = write(file, data)
+        if file == port.fileno():
+            assert os.read(peer.host, 100) == data
+            write(peer.host, b"\xff")
+            clock.hold_up()
         return written
 
-    monkeypatch.setattr(serial.Serial, "write", held_up)
+    monkeypatch.setattr(os, "write", held_up)
     board(port, hurries=True).write_zero()
 
 
-def test_of_an_answer_in_pieces_no_piece_is_lost_to_a_thread_that_was_held_up(peer, port):
+def test_of_an_answer_in_pieces_no_piece_is_lost_to_a_thread_that_was_held_up(peer, port, clock):
     port.begin()
     port.write(b"?")
     os.write(peer.host, b"1234")
     answer = port.read(1)
-    time.sleep(HELD_UP)
+    clock.hold_up()
     assert answer + port.read(2) + port.read(3) + port.read(1) == b"1234"
     assert os.read(peer.host, 100) == b"?"
 
 
-def test_a_packet_that_was_held_up_is_made_anew(peer, port):
+def test_a_packet_that_was_held_up_is_made_anew(peer, port, clock):
     os.set_blocking(peer.host, False)
-    held_up = iter([HELD_UP, 0.0])
+    held_up = iter([True, False])
 
     def send(_: int, value: int) -> bool:
-        time.sleep(next(held_up))
+        if next(held_up):
+            clock.hold_up()
         port.write(bytes((value,)))
         return bool(port.read(1))
 
@@ -205,6 +227,15 @@ def test_a_packet_that_was_held_up_is_made_anew(peer, port):
     with pytest.raises(DeviceError):
         board(port)._exchange(send, lambda: next(values), bool)
     assert os.read(peer.host, 100) == b"\x02"
+
+
+def test_a_line_without_room_for_a_packet_keeps_nobody(peer, port):
+    assert not os.get_blocking(port.fileno())
+    with suppress(BlockingIOError):
+        while True:
+            os.write(port.fileno(), bytes(100))
+    with pytest.raises(DeviceError, match="no valid answer to DutyM1M2"):
+        board(port).write_zero()
 
 
 @pytest.mark.parametrize("tenths", range(1, 11))

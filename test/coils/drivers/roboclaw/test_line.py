@@ -143,13 +143,13 @@ def test_a_board_has_as_long_for_an_answer_as_is_set(bench):
     line, opened = LineThread(0, path, {0: 128}, settings, Mailbox(2, [""], 0.1)), []
 
     def connect(port: ExchangePort) -> None:
-        opened.append((port.timeout, port.write_timeout, port.answer_timeout))
+        opened.append((port.timeout, port.answer_timeout))
         line.end()
 
     vars(line)["_connect"] = connect
     line.start()
     line.join(10.0)
-    assert opened == [(0.25, 0.25, 0.25)]
+    assert opened == [(0.25, 0.25)]
 
 
 @pytest.mark.parametrize("boards", [(0,), (0, 1)])
