@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gc
+import signal
 import sys
 from collections.abc import Callable, Sequence
+from types import FrameType
 from typing import TypeVar
 
 import rclpy
@@ -31,6 +33,16 @@ def run(
     Returns:
         0 when it was asked to end, 1 when it could not start.
     """
+    spins = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        # rclpy hears the signal first, and ends the executor. A KeyboardInterrupt as well, amid a message that its
+        # library makes in Python, would come out as another error.
+        if not spins:
+            raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
     try:
         rclpy.init(args=list(arguments) if arguments is not None else None)
     except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
@@ -46,6 +58,7 @@ def run(
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
+        spins = True
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

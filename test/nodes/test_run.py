@@ -165,6 +165,8 @@ with NodeProcesses(["coil_bridge"], [], dict(os.environ), Path({str(tmp_path)!r}
 
 
 END_AT_WORK = """
+import os
+import signal
 import sys
 import rclpy
 from rclpy.node import Node
@@ -180,6 +182,11 @@ class Late(Node):
     def work(self):
         if sys.argv[1] == "asked":
             rclpy.shutdown()
+        elif sys.argv[1] == "interrupted":
+            os.kill(os.getpid(), signal.SIGINT)
+            while rclpy.ok():
+                pass
+            print("went on", flush=True)
         else:
             self.said.destroy()
         self.said.publish(String(data="late"))
@@ -194,3 +201,9 @@ def test_a_callback_that_is_still_at_work_at_the_end_is_no_failure(environment, 
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
     assert (ended.returncode == 0) is clean, ended.stderr
     assert ("Traceback" not in ended.stderr) is clean
+
+
+def test_an_interruption_waits_until_a_callback_is_done(environment):
+    command = [sys.executable, "-c", END_AT_WORK, "interrupted"]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "went on\n", "")
