@@ -28,6 +28,7 @@ from magnetosuture_thread.study.currents import CurrentSeries
 from magnetosuture_thread.study.replayed import Collector, Spread, Summary, error_figures, stage_latencies
 
 if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.interruption import Interruption
     from magnetosuture_thread.nodes.replay import LiveReplay
 
 Say = Callable[[str], None]
@@ -133,6 +134,7 @@ class _Replay:
         """Play the bag into the graph, record and judge its outputs; return what went wrong later, as well."""
         # Only here, where it is needed: without ROS the other commands still work.
         from magnetosuture_thread.nodes import topics
+        from magnetosuture_thread.nodes.interruption import Interruption
         from magnetosuture_thread.nodes.processes import (
             NodeProcesses,
             environment_of,
@@ -143,7 +145,7 @@ class _Replay:
         from magnetosuture_thread.nodes.replay_time import Timeline
 
         qos = self.folder / "lossless.yaml"
-        playing = Playing(self.given)
+        playing, interruption = Playing(self.given), Interruption()
         problem = ""
         with reserved_domain() as domain:
             environment = graph_environment(domain)
@@ -155,22 +157,27 @@ class _Replay:
                 outputs = BagWriter(self.folder / "bag", self.given.notes)
                 for topic in topics.OUTPUTS:
                     outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
+
+                def watch() -> None:
+                    interruption.check()
+                    nodes.check()
+
                 live = LiveReplay(
                     domain,
                     Timeline(self.given.begin, self.rate),
                     played=playing.topics(),
                     nodes=len(playing.nodes),
                     receive=outputs.write,
-                    watch=nodes.check,
+                    watch=watch,
                     say=self.say,
                 )
                 try:
-                    with outputs:
+                    with outputs, interruption:
                         self._play(live, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE_REPLAY}")
                     self.say("judging what came out")
                     summary = self._judge(live)
                     if loop:
-                        problem = self._play_on(live)
+                        problem = self._play_on(live, interruption)
                 finally:
                     live.close()
         qos.unlink()
@@ -184,11 +191,12 @@ class _Replay:
         length = max(self.given.duration, 1e-9)
         live.play(Playing(self.given).records(), lambda time: self.progress(min(1.0, time / length)))
 
-    def _play_on(self, live: LiveReplay) -> str:
+    def _play_on(self, live: LiveReplay, interruption: Interruption) -> str:
         """Play on for who watches; return what ended it, if it was not a person."""
         self.say("the first pass is recorded and judged; playing on until Ctrl-C")
         try:
-            live.play_on(Playing(self.given).records)
+            with interruption:
+                live.play_on(Playing(self.given).records)
         except KeyboardInterrupt:
             self.say("ended")
         except GraphError as error:

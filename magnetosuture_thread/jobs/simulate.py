@@ -125,6 +125,7 @@ def _run(
     # Only here, where it is needed: without ROS the other commands still work.
     from magnetosuture_thread.nodes import topics
     from magnetosuture_thread.nodes.coil_client import CoilClient
+    from magnetosuture_thread.nodes.interruption import Interruption
     from magnetosuture_thread.nodes.processes import (
         NodeProcesses,
         environment_of,
@@ -157,7 +158,7 @@ def _run(
             environment_of(environment),
             NodeProcesses(("rig_simulator", *NODES), arguments, environment, folder / "logs") as nodes,
         ):
-            running = False
+            running, interruption = False, Interruption()
             early: dict[str, bytes] = {}
 
             def receive(topic: str, arrival: int, data: bytes) -> None:
@@ -170,6 +171,10 @@ def _run(
                 early.clear()
                 bag.write(topic, arrival, data)
 
+            def check() -> None:
+                interruption.check()
+                nodes.check()
+
             recorder = Recorder(domain, taken, simulated_clock=pace is not None, receive=receive)
             try:
                 perhaps = (
@@ -179,13 +184,15 @@ def _run(
                     topics.FAULT_REQUEST,
                     *topics.SETTINGS,
                 )
-                _wait(recorder, nodes.check, {topic.name for topic in perhaps})
+                with interruption:
+                    _wait(recorder, check, {topic.name for topic in perhaps})
                 if boards:
                     _arm(CoilClient)
                 say("running" if pace is None else f"running at {pace:g} times the speed")
                 running = True
                 nodes.start("path_follower", arguments=BRIDGE_AND_RECORDER)
-                return _follow(recorder, nodes.check, setup, duration, pace or 1.0, progress)
+                with interruption:
+                    return _follow(recorder, check, setup, duration, pace or 1.0, progress)
             except KeyboardInterrupt:
                 if not running:
                     raise

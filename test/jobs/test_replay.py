@@ -168,6 +168,23 @@ def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]
                 process.communicate(timeout=30)
 
 
+def test_an_interruption_waits_until_a_message_is_played(pose_bag: Path, tmp_path: Path):
+    went_on: list[float] = []
+
+    def interrupt(share: float) -> None:
+        signal.raise_signal(signal.SIGINT)
+        went_on.append(share)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            replay(pose_bag, tmp_path / "out", progress=interrupt)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert len(went_on) == 1
+    assert not (tmp_path / "out").exists()
+
+
 def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag: Path, tmp_path: Path):
     command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(pose_bag)]
     with started([*command, "--output", "out", "--loop"], tmp_path) as process:
@@ -191,7 +208,8 @@ def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag:
             assert sorted(watch.predicted[again:]) == watch.predicted[again:]
         process.send_signal(signal.SIGINT)
         shown, errors = process.communicate(timeout=30)
-    assert (process.returncode, errors) == (0, "")
+    assert errors == ""
+    assert process.returncode == 0
     assert "results: out" in shown
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert Bag(tmp_path / "out" / "bag").counts["/thread/predicted"] == 60

@@ -1,0 +1,87 @@
+"""Ctrl-C that waits for a good moment."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from magnetosuture_thread.nodes.interruption import Interruption
+
+
+@pytest.fixture
+def heeded() -> Iterator[dict[signal.Signals, Any]]:
+    """Signals as a command in a terminal has them: SIGINT and SIGTERM interrupt, SIGHUP is ignored."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    given: dict[signal.Signals, Any] = {
+        signal.SIGINT: interrupt,
+        signal.SIGTERM: interrupt,
+        signal.SIGHUP: signal.SIG_IGN,
+    }
+    before = {which: signal.signal(which, handler) for which, handler in given.items()}
+    yield given
+    for which, handler in before.items():
+        signal.signal(which, handler)
+
+
+def kept(which: signal.Signals, done: list[str], *, asks: bool = False, error: Exception | None = None) -> None:
+    """Get a signal, and go on."""
+    with Interruption() as interruption:
+        interruption.check()
+        os.kill(os.getpid(), which)
+        done.append("went on")
+        if error is not None:
+            raise error
+        if asks:
+            interruption.check()
+            done.append("went on again")
+
+
+@pytest.mark.parametrize("asks", [True, False])
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_kept_until_it_is_asked_for_or_the_end(heeded, which: signal.Signals, asks: bool):
+    done: list[str] = []
+    with pytest.raises(KeyboardInterrupt):
+        kept(which, done, asks=asks)
+    assert done == ["went on"]
+    assert {number: signal.getsignal(number) for number in heeded} == heeded
+
+
+def test_what_is_raised_already_stays(heeded):
+    with pytest.raises(ValueError, match="mine"):
+        kept(signal.SIGINT, [], error=ValueError("mine"))
+    assert {number: signal.getsignal(number) for number in heeded} == heeded
+
+
+def test_a_signal_is_raised_once(heeded):
+    interruption = Interruption()
+    with pytest.raises(KeyboardInterrupt), interruption:
+        os.kill(os.getpid(), signal.SIGINT)
+    with interruption:
+        interruption.check()
+
+
+def test_what_is_ignored_stays_ignored(heeded):
+    done: list[str] = []
+    kept(signal.SIGHUP, done, asks=True)
+    assert done == ["went on", "went on again"]
+
+
+def test_in_another_thread_signals_stay_as_they_are(heeded):
+    found: list[object] = []
+
+    def work() -> None:
+        with Interruption():
+            found.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == [heeded[signal.SIGINT]]
