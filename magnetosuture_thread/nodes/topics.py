@@ -25,6 +25,9 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import Channel
 
 SENSOR = qos_profile_sensor_data
+# Of frames that wait only the newest two: a tracker that was held up would otherwise be late for many more, and coils
+# rest while poses are old.
+FRAMES = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -111,8 +114,8 @@ class Topic:
         return subscription
 
 
-IMAGE = Topic(interface.IMAGE, SENSOR)
-COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, SENSOR)
+IMAGE = Topic(interface.IMAGE, FRAMES)
+COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, FRAMES)
 CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR)
 NEEDLE_POSE = Topic(interface.NEEDLE_POSE, SENSOR)
 TRACKER_STATE = Topic(interface.TRACKER_STATE, RELIABLE)

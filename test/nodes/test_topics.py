@@ -14,7 +14,8 @@ from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 
 
 def test_only_camera_and_pose_are_sensor_data():
-    sensors = {topic.channel.name for topic in (*topics.INPUTS, *topics.OUTPUTS) if topic.qos is topics.SENSOR}
+    said = (*topics.INPUTS, *topics.OUTPUTS)
+    sensors = {topic.channel.name for topic in said if topic.qos.reliability == ReliabilityPolicy.BEST_EFFORT}
     cameras = {channel.name for channel in CAMERA.values()}
     assert sensors == {*cameras, "camera/camera_info", "needle/measured_cp"}
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from typing import Any
+
 import numpy as np
 from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import TrackerState
@@ -72,6 +75,27 @@ def test_every_frame_gets_a_state_and_a_pose_comes_once_three_agree(graph, camer
     assert len(poses) == 2
 
 
+def test_of_frames_that_wait_only_the_newest_two_are_tracked(graph, camera, thread_arc, monkeypatch):
+    node = graph.add(VisionTrackerNode, confirm_frames=1)
+    tracking = graph.listen(topics.TRACKER_STATE)
+    begun, go = threading.Event(), threading.Event()
+    look = node._session.on_image
+
+    def held_up(*frame: Any) -> Any:
+        begun.set()
+        assert go.wait(10.0)
+        return look(*frame)
+
+    monkeypatch.setattr(node._session, "on_image", held_up)
+    image = frame(camera, thread_arc)
+    for index in range(8):
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5 + index)))
+        assert begun.wait(10.0)
+    go.set()
+    graph.wait(lambda: tracking and tracking[-1].header.stamp.sec == 12, "the newest")
+    assert [state.header.stamp.sec for state in tracking] == [5, 11, 12]
+
+
 def test_a_raw_image_is_taken_too(graph, camera, thread_arc):
     graph.add(VisionTrackerNode, image_transport="raw", confirm_frames=1)
     poses = graph.listen(topics.NEEDLE_POSE)
@@ -102,11 +126,11 @@ def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_a
     graph.add(VisionTrackerNode, confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
     tracking = graph.listen(topics.TRACKER_STATE)
-    for data in (b"", b"no image", b"\xff\xd8\xff\xe0" + bytes(40)):
+    for count, data in enumerate((b"", b"no image", b"\xff\xd8\xff\xe0" + bytes(40)), 1):
         message = CompressedImage(format="jpeg", data=data)
         message.header.stamp = graph.now()
         graph.publish(topics.COMPRESSED_IMAGE, message)
-    graph.wait(lambda: len(tracking) == 3, "a state for each")
+        graph.wait(lambda n=count: len(tracking) == n, "a state for each")
     assert all("expected a JPEG or PNG image" in state.reason for state in tracking)
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
