@@ -20,7 +20,7 @@ import yaml
 
 from magnetosuture_thread.configuration import read_yaml
 from magnetosuture_thread.errors import ConfigurationError, GraphError
-from magnetosuture_thread.interface import NEEDLE_SETPOINT, OPERATOR_COMMAND
+from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.console_report import ConsoleReport, Delays
 
@@ -200,18 +200,22 @@ def _page(browser: str, url: str) -> Iterator[Page]:
 
 @contextmanager
 def _heard(domain: int) -> Iterator[Times]:
-    """Give the times [s] at which a velocity that is not zero came on each topic, filled when the block ends."""
+    """Give the times [s] at which a velocity that is not zero was sent on each topic, filled when the block ends.
+
+    By the senders' stamps: when we hear of it is no concern of the coils. A wish that got lost on its way to us is
+    known by the command that followed from it, which keeps its stamp.
+    """
     from magnetosuture_thread.nodes import messages, topics
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment
     from magnetosuture_thread.nodes.recorder import Recorder
 
-    taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_SETPOINT]
-    came: list[tuple[str, int, bytes]] = []
-    times: Times = {topic.channel.recorded: [] for topic in taken}
+    taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_COMMAND, topics.NEEDLE_SETPOINT]
+    came: list[tuple[str, bytes]] = []
     with environment_of(graph_environment(domain)):
         recorder = Recorder(
-            domain, taken, simulated_clock=False, receive=lambda topic, at, data: came.append((topic, at, data))
+            domain, taken, simulated_clock=False, receive=lambda topic, _, data: came.append((topic, data))
         )
+    times: Times = {channel.recorded: [] for channel, _ in _STATIONS}
     over = threading.Event()
 
     def listen() -> None:
@@ -226,6 +230,9 @@ def _heard(domain: int) -> Iterator[Times]:
         over.set()
         thread.join()
         recorder.close()
-        for topic, at, data in came:
-            if messages.serialised_velocity(data).any():
-                times[topic].append(at * 1e-9)
+        for topic, data in came:
+            stamp = messages.header_stamp(data)
+            if stamp is not None and messages.serialised_velocity(data).any():
+                times[OPERATOR_COMMAND.recorded if topic == NEEDLE_COMMAND.recorded else topic].append(stamp * 1e-9)
+        for found in times.values():
+            found.sort()

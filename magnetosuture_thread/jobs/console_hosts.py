@@ -22,6 +22,9 @@ from magnetosuture_thread.nodes.console_tap import SAID, ConsoleTap
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.setups import Setup, read_setup
 
+# The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so these two
+# go before the browser and the rig, and behind the bridge.
+PREFERRED, PRIORITY = ("vision_tracker", "thread_model"), 5
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
 
 
@@ -203,6 +206,8 @@ class SimulatedHost(RecordingHost):
         missing = [name for name in (RIG, *NODES) if not self.graph.says(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
+            for name in PREFERRED:  # only now: while it compiles for the first time, others shall not wait for it
+                self.say(f"{name}: {self._nodes.prefer(name, PRIORITY)}")
             self._hold("")
             self.say(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > START_TIMEOUT:

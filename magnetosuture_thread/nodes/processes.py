@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 
 from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.nodes.scheduling import take_priority
 
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
 LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
@@ -156,6 +157,10 @@ class NodeProcesses:
                 start_new_session=True,  # Ctrl-C is ours to pass on
                 preexec_fn=_end_with_parent,
             )
+
+    def prefer(self, label: str, priority: int) -> str:
+        """Give a node a real-time priority, where the system allows any; return how it is scheduled then."""
+        return take_priority(priority, self._processes[label].pid)
 
     def kill(self, label: str) -> None:
         """End a node without a word to it, as a crash would."""

@@ -1,4 +1,4 @@
-"""Priority over other processes, for a node whose loop may not wait for them."""
+"""Priority over other processes, for a node that may not wait for them."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from pathlib import Path
 ORDINARY = "ordinary"
 
 
-def take_priority(priority: int) -> str:
-    """Give all threads of this process a real-time priority, and say what came of it.
+def take_priority(priority: int, process: int | None = None) -> str:
+    """Give all threads of a process a real-time priority, and say what came of it.
 
     Under the ordinary scheduling a process that wakes up waits for others that are busy, here by up to some
     milliseconds. Threads that begin later inherit the priority.
 
     Args:
         priority: of SCHED_FIFO, 1 to 99; with 0 all stays as it is.
+        process: its number; this one if None.
 
     Returns:
         How the process is scheduled now, for a person.
@@ -23,7 +24,7 @@ def take_priority(priority: int) -> str:
     if not priority:
         return ORDINARY
     try:
-        for thread in Path("/proc/self/task").iterdir():
+        for thread in Path(f"/proc/{process or 'self'}/task").iterdir():
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except ProcessLookupError:
         pass  # a thread that has just ended
