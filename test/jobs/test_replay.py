@@ -168,20 +168,10 @@ def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]
                 process.communicate(timeout=30)
 
 
-def test_an_interruption_waits_until_a_message_is_played(pose_bag: Path, tmp_path: Path):
-    went_on: list[float] = []
-
-    def interrupt(share: float) -> None:
-        signal.raise_signal(signal.SIGINT)
-        went_on.append(share)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            replay(pose_bag, tmp_path / "out", progress=interrupt)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert len(went_on) == 1
+def test_an_interruption_waits_until_a_message_is_played(pose_bag: Path, tmp_path: Path, interrupting):
+    with pytest.raises(KeyboardInterrupt):
+        replay(pose_bag, tmp_path / "out", progress=interrupting)
+    assert len(interrupting.went_on) == 1
     assert not (tmp_path / "out").exists()
 
 

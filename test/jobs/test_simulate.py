@@ -248,7 +248,9 @@ def test_an_interrupted_run_that_has_begun_keeps_what_was_recorded(scenario: Pat
         assert process.stdout is not None
         next(line for line in process.stdout if "running" in line)
         deadline = time.monotonic() + 60.0
-        while sum(path.stat().st_size for path in tmp_path.glob(".bag*/*.mcap")) < 500_000:  # some of the run
+        while (
+            sum(path.stat().st_size for path in tmp_path.glob(".bag*/*.mcap")) < 1_500_000
+        ):  # a second or more of the run
             assert time.monotonic() < deadline
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
@@ -256,3 +258,10 @@ def test_an_interrupted_run_that_has_begun_keeps_what_was_recorded(scenario: Pat
     assert process.returncode == 1
     assert f"what was recorded is in {tmp_path / 'bag'}" in " ".join(rest.split())
     assert Bag(tmp_path / "bag").counts["/needle/measured_cp"] > 10
+
+
+def test_an_interruption_waits_until_what_came_is_recorded(scenario: Path, tmp_path: Path, interrupting):
+    with pytest.raises(KeyboardInterrupt):
+        simulate(str(scenario), tmp_path / "bag", duration=60.0, progress=interrupting)
+    assert len(interrupting.went_on) == 1
+    assert (tmp_path / "bag" / "metadata.yaml").exists()
