@@ -15,8 +15,7 @@ from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.jobs.bench_console import BROWSERS
 from test.console.scene import RecordingGraph, RecordingHost
-
-TOKEN = "a-token-of-the-tests"
+from test.console.visitor import TOKEN
 
 
 class ServedConsole:

@@ -1,0 +1,131 @@
+"""A client of the server that is no browser and may lie, and a server for one test."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import aiohttp
+
+from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.settings import ConsoleSettings
+from test.console.scene import RecordingGraph, RecordingHost
+
+TOKEN = "a-token-of-the-tests"
+SLOWEST = 10.0  # [s]
+REST = (0.0, 0.0)
+
+
+async def until(condition: Callable[[], Any]) -> Any:
+    """Wait until a condition holds, and return what it gave."""
+    end = time.monotonic() + SLOWEST
+    while not (result := condition()):
+        assert time.monotonic() < end, "the condition has not come true"
+        await asyncio.sleep(0.002)
+    return result
+
+
+class Page:
+    """A connected client, and what it was told."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket  # an aiohttp.ClientWebSocketResponse
+        self.told: list[dict[str, Any]] = []
+        self.frames: list[bytes] = []
+        self.number = 0
+        self.answers = True
+        self.reading = asyncio.create_task(self._read())
+
+    async def _read(self) -> None:
+        async for message in self.socket:
+            what = "state"
+            if message.type is aiohttp.WSMsgType.BINARY:
+                self.frames.append(message.data)
+                what = "frame"
+            else:
+                self.told.append(json.loads(message.data))
+                if self.told[-1]["type"] != "state":
+                    continue
+            if self.answers:
+                with contextlib.suppress(ConnectionError):
+                    await self.say(type="got", what=what)
+
+    async def say(self, **word: Any) -> None:
+        """Send a message."""
+        await self.socket.send_str(json.dumps(word))
+
+    async def hold(self, x: float, y: float, speed: float = 0.003, sent: float | None = None) -> None:
+        """Say that a direction is held, now."""
+        await self.say(type="hold", direction=[x, y], speed=speed, sent=time.monotonic() if sent is None else sent)
+
+    def tear(self) -> None:
+        """End the TCP connection without a word."""
+        self.socket._conn.transport.abort()
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        """Return what was told of a kind."""
+        return [message for message in self.told if message["type"] == kind]
+
+    async def pictures(self, count: int) -> None:
+        """Wait until so many frames have come."""
+        await until(lambda: len(self.frames) >= count)
+
+    @property
+    def lease(self) -> dict[str, Any]:
+        """Who steers, as last told."""
+        states = self.of("state")
+        return states[-1]["lease"] if states else {}
+
+    async def take(self) -> None:
+        """Take steering, and see that everybody is told."""
+        await self.say(type="take")
+        await until(lambda: self.lease.get("holder") == self.number)
+
+
+class Console:
+    """A server for one test, its graph and its host."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.graph, self.host = RecordingGraph(), RecordingHost()
+        self.settings = ConsoleSettings(**{"port": 0, "token": TOKEN, **settings})
+        self.server = ConsoleServer(self.settings, self.graph, self.host)
+        self.url = ""
+        self.session: aiohttp.ClientSession
+        self.sockets: list[Any] = []
+
+    async def connect(self, **options: Any) -> Any:
+        """Connect without a word."""
+        self.sockets.append(await self.session.ws_connect(self.url + "socket", **options))
+        return self.sockets[-1]
+
+    async def page(self, token: str = TOKEN, **options: Any) -> Page:
+        """Connect a page and greet."""
+        page = Page(await self.connect(**options))
+        await page.say(type="hello", token=token)
+        page.number = (await until(lambda: page.of("welcome")))[0]["you"]
+        return page
+
+
+@contextlib.asynccontextmanager
+async def console(**settings: Any) -> AsyncIterator[Console]:
+    """Serve for one test."""
+    served = Console(**settings)
+    served.url = (await served.server.start()).split("#")[0]
+    async with aiohttp.ClientSession() as served.session:
+        yield served
+        await served.server.stop()
+        await asyncio.gather(*(socket.close() for socket in served.sockets))
+
+
+def run(test: Callable[[Console], Awaitable[None]], **settings: Any) -> None:
+    """Run a test against a server of its own."""
+
+    async def served() -> None:
+        async with console(**settings) as here:
+            await test(here)
+
+    asyncio.run(served())
