@@ -21,7 +21,7 @@ minutes.
 
 With --console, time the operator's page instead, in Chromium without a window, on the whole graph around the
 simulated rig with 81 segments: from a key press to the filtered velocity at the bridge, and the pictures that
-the page draws. Needs chromium and playwright. Takes three minutes.
+the page draws; by the stamps of who sends. Needs chromium and playwright. Takes three minutes.
 """
 
 

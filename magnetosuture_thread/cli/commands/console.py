@@ -18,7 +18,8 @@ arrow keys, gamepad or mouse; emergency stop, arm and disarm.
 
 Without an option the whole graph is started around a simulated rig, with the coils disarmed, and any set-up
 can be chosen on the page. --graph serves the page on the graph that runs on this ROS domain, --replay on a
-bag that is played through the nodes over and over, which nobody can steer.
+bag that is played through the nodes over and over, which nobody can steer. Around a simulated rig vision_tracker
+and thread_model get a real-time priority, where the system allows any: the browser shall not keep them.
 
 The page is served on this machine alone unless --address and a token say otherwise. Without a token each
 start makes its own, which is in the address that is printed. One in the environment, as {TOKEN}, is not shown
