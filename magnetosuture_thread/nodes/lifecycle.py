@@ -77,13 +77,17 @@ class ManagedNode(LifecycleNode, Generic[C]):
         """Go as far as the parameter `autostart` says: unconfigured, inactive, or else active.
 
         Raises:
-            MagnetosutureError: a transition failed.
+            MagnetosutureError: a transition failed; the node is destroyed.
         """
         if self.get_parameter_or("autostart").value == "unconfigured":
             return
-        self.require(self.trigger_configure)
-        if self.get_parameter("autostart").value != "inactive":
-            self.require(self.trigger_activate)
+        try:
+            self.require(self.trigger_configure)
+            if self.get_parameter("autostart").value != "inactive":
+                self.require(self.trigger_activate)
+        except Exception:
+            self.destroy_node()
+            raise
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and take what they ask for."""
@@ -131,6 +135,12 @@ class ManagedNode(LifecycleNode, Generic[C]):
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """After an error that nobody foresaw, give all back; the node can be configured again."""
         return self.on_shutdown(state)
+
+    def destroy_node(self) -> None:
+        """Leave the graph at once."""
+        super().destroy_node()
+        # rclpy forgets it, and it keeps the node in the graph until garbage is collected.
+        self._state_machine.destroy_when_not_in_use()
 
     def _failed(self, error: Exception) -> TransitionCallbackReturn:
         self.problem = error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from typing import Any
 
@@ -274,6 +275,17 @@ def test_the_coils_are_left_at_zero(graph):
     assert applied(node)[-1].any()
     graph.remove(node)
     assert not applied(node)[-1].any()
+
+
+def test_a_bridge_that_is_destroyed_leaves_the_graph_at_once(graph):
+    gc.disable()
+    try:
+        node = graph.add(CoilBridgeNode)
+        graph.wait(lambda: "coil_bridge" in graph.probe.get_node_names(), "the bridge")
+        graph.remove(node)
+        graph.wait(lambda: graph.probe.get_node_names() == ["probe"], "the bridge to leave")
+    finally:
+        gc.enable()
 
 
 def test_it_starts_active_but_disarmed_and_arming_lets_commands_pass(graph):
