@@ -32,7 +32,7 @@ LEADS_ELSEWHERE = (
     "ROS_STATIC_PEERS",
     "ROS_SUPER_CLIENT",
 )
-_PARTICIPANTS = 4  # of a domain, whose discovery ports are looked at
+_PARTICIPANTS = 120  # of a domain: more discovery ports it does not have
 _PR_SET_PDEATHSIG = 1
 
 
@@ -62,8 +62,9 @@ def environment_of(environment: dict[str, str]) -> Iterator[None]:
 def reserved_domain() -> Iterator[int]:
     """Give a ROS domain that nobody on this machine uses.
 
-    A bag that is replayed must never reach a robot's coils, so it gets a domain of its own: one whose
-    first discovery ports nobody has bound, and that no other call, in any process, holds at the time.
+    A bag that is replayed must never reach a robot's coils, so it gets a domain of its own: one whose discovery ports
+    nobody has bound, and that no other call, in any process, holds at the time. All its ports are looked at: Fast DDS
+    counts the participants of a process over all domains, so the only one of a domain can have any of them.
 
     Raises:
         GraphError: all are in use.
@@ -77,10 +78,15 @@ def reserved_domain() -> Iterator[int]:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 continue
-            if all(_is_free(7400 + 250 * domain + 10 + 2 * k) for k in range(_PARTICIPANTS)):
+            if is_empty(domain):
                 yield domain
                 return
     raise GraphError("no free ROS domain from 1 to 100")
+
+
+def is_empty(domain: int) -> bool:
+    """Return whether nobody on this machine has a discovery port of a ROS domain."""
+    return all(_is_free(7400 + 250 * domain + 10 + 2 * k) for k in range(_PARTICIPANTS))
 
 
 def _is_free(port: int) -> bool:

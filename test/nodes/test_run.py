@@ -114,11 +114,12 @@ def test_processes_are_ended_whatever_happens(tmp_path: Path, environment: dict[
         nodes.check()
 
 
-def test_a_domain_is_given_once_and_not_where_somebody_is():
+@pytest.mark.parametrize("participant", [0, 20, 119])
+def test_a_domain_is_given_once_and_not_where_somebody_is(participant: int):
     with reserved_domain() as first, reserved_domain() as second:
         assert first != second
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
-            somebody.bind(("127.0.0.1", 7400 + 250 * (second % 100 + 1) + 10))
+            somebody.bind(("127.0.0.1", 7400 + 250 * (second % 100 + 1) + 10 + 2 * participant))
             with reserved_domain() as third:
                 assert third not in (first, second, second % 100 + 1)
 
