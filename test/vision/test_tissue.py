@@ -39,13 +39,14 @@ def fine_camera(setup: Setup) -> DishCamera:
     return replace(setup.rig, camera_width=1280, camera_height=960).camera()
 
 
-def assert_measured(setup: Setup, camera: DishCamera, tail: np.ndarray, heading: float, thread: np.ndarray) -> None:
-    """Assert that one frame gives the needle's pose to 2 pixels and 3 degrees."""
+def assert_measured(setup: Setup, camera: DishCamera, tail: np.ndarray, heading: float, thread: np.ndarray) -> float:
+    """Assert that one frame gives the needle's pose to 2 pixels and 3 degrees; return how far it is turned [rad]."""
     seen = VisionTracker(setup.vision).look(camera.render(tail, heading, thread))
     assert seen.state is State.TRACKED, seen.reason
     assert np.linalg.norm(seen.tail - tail) < 2.0 * camera.view.metres_per_pixel
-    turned = np.arctan2(seen.heading[1], seen.heading[0]) - heading
-    assert abs((turned + np.pi) % (2.0 * np.pi) - np.pi) < np.radians(3.0)
+    turned = (np.arctan2(seen.heading[1], seen.heading[0]) - heading + np.pi) % (2.0 * np.pi) - np.pi
+    assert abs(turned) < np.radians(3.0)
+    return float(turned)
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -73,4 +74,5 @@ def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
     away = heading + side * np.radians(angle)
     back, _ = needle_axis(tail, away, 0.02, 0.0, np.linspace(0.0, 1.0, 50))
     for taking in (fine_camera, *([camera] if angle > 40.0 else [])):
-        assert_measured(setup, taking, tail, heading, back)
+        turned = [assert_measured(setup, taking, tail, heading, back) for _ in range(20)]
+        assert np.ptp(turned) < np.radians(1.5)  # a fit that stops at the first guess goes by the noise

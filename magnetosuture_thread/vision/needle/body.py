@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ SHARPEST_PX = 4.5  # a tail fades within
 LENGTH_SLACK_PX, LENGTH_SLACK = 1.4, 0.007  # that the seen length may differ from the known one, and share of it
 MOST_BLOOM_PX = 0.6  # that an edge may seem to lie outside of where it is
 OFF_AXIS_PX = 0.4  # that the tip may lie aside of the axis on which lengths are measured
+TURNED = math.radians(2.0)  # that the needle may leave its tail beside that axis
 THREAD_PX = 0.6  # by which a thread under the body widens it at least
 TAIL_ROWS = 2.5  # next to the tail, that the thread pulls aside
 SEEN_WEIGHT = 0.3  # of the seen length beside the known one
@@ -169,13 +171,18 @@ def _body_axis(strip: Strip, tail: float, tip: float, body: float) -> tuple[Arc,
 def _along_body(
     gray: np.ndarray, strip: Strip, ends: tuple[float, float, float], body: float, width: float
 ) -> tuple[Strip, float] | None:
-    """Straighten once more along the body's own axis, where that leads elsewhere at the tip; None where it doesn't.
+    """Straighten once more along the body's own axis, where that leads elsewhere at an end; None where it doesn't.
 
-    Lengths are true along the axis only.
+    Lengths are true along the axis only, and a thread that turns back beside the needle has bent the first guess at
+    the tail: rows askew to the body take more of the thread for steel than the fit can pass over.
     """
     tail, tip, _ = ends
     axis = _body_axis(strip, tail, tip, body)
-    if axis is None or abs(float(axis[0].coordinates(strip.arc.at(np.array([tip])))[1][0])) < OFF_AXIS_PX:
+    if axis is None:
         return None
-    again = straight_strip(gray, axis[0], tip - tail, width)
+    arc = axis[0]
+    aside = abs(float(arc.coordinates(strip.arc.at(np.array([tip])))[1][0]))
+    if aside < OFF_AXIS_PX and arc.direction() @ strip.arc.direction(tail) > math.cos(TURNED):
+        return None
+    again = straight_strip(gray, arc, tip - tail, width)
     return None if again is None else (again, tip - tail)
