@@ -52,10 +52,15 @@ def test_frames_come_with_their_truth_and_the_camera(graph):
 def test_a_frame_period_is_kept_in_the_stamps(graph):
     needles = graph.listen_later(topics.TRUE_NEEDLE)
     graph.add(RigSimulatorNode, frame_rate=50.0, **SMALL)
-    graph.wait(lambda: len(needles) > 10, "frames")
-    steps = np.diff([nanoseconds(needle.header.stamp) for needle in needles])
-    assert (steps > 0).all()
-    assert np.median(steps) == pytest.approx(2e7, rel=0.05)
+
+    def periods() -> np.ndarray:
+        return np.diff([nanoseconds(needle.header.stamp) for needle in needles]) * 50e-9
+
+    graph.wait(lambda: len(needles) > 10 and np.any(np.abs(periods() - 1.0) < 0.05), "frames, and two in a row")
+    found = periods()
+    # A frame that nobody had time for is left out; the first may come late, by what a tick may come early.
+    assert found.min() > 0.89
+    assert np.abs(found - np.rint(found)).max() < 0.11
 
 
 def test_nothing_moves_without_a_current_then_the_needle_is_pulled(graph):
