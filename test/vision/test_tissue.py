@@ -67,7 +67,7 @@ def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
 ):
     """As when the needle was turned sharply, and has not pulled its thread straight yet.
 
-    At 35 degrees the set-up's own camera has too few pixels between the two: the heading may be off by 6 degrees.
+    At 35 degrees the set-up's own camera has too few pixels between the two: the heading may be off by 7 degrees.
     """
     x, y, heading = PLACES["free"]
     tail = np.array([x, y])
