@@ -17,6 +17,7 @@ from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_time import RigTime
 
 SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
@@ -61,6 +62,19 @@ def test_a_frame_period_is_kept_in_the_stamps(graph):
     # A frame that nobody had time for is left out; the first may come late, by what a tick may come early.
     assert found.min() > 0.89
     assert np.abs(found - np.rint(found)).max() < 0.11
+
+
+def test_a_tick_that_comes_late_leaves_no_frame_out_and_moves_none(graph, monkeypatch):
+    needles = graph.listen_later(topics.TRUE_NEEDLE)
+    late = [0.0, 0.05, 0.0, 0.6, 0.02, 0.0, 0.3, 0.85, 0.0]  # of a period
+    ticks = iter([0.02 * (1 + number + part) for number, part in enumerate(late)])
+    monkeypatch.setattr(RigTime, "elapsed", lambda rig_time: next(ticks, 1.0))
+    node = graph.add(RigSimulatorNode, frame_rate=50.0, **SMALL)
+    graph.wait(lambda: len(needles) > len(late), "a frame for each tick, and one much later")
+    steps = np.diff([nanoseconds(needle.header.stamp) for needle in needles[: len(late) + 1]])
+    assert steps[:-1] == pytest.approx(2e7, rel=1e-6)
+    assert steps[-1] == pytest.approx(1e9 - 0.18e9, rel=1e-6)
+    assert node._skipped == 40
 
 
 def test_nothing_moves_without_a_current_then_the_needle_is_pulled(graph):
