@@ -15,7 +15,7 @@ from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from test.console.scene import RecordingGraph, RecordingHost, picture
-from test.console.visitor import REST, SLOWEST, TOKEN, Console, Page, run, until
+from test.console.visitor import EAST, NORTH, REST, SLOWEST, TOKEN, Console, Page, run, until
 
 
 def test_the_page_is_served_whole_and_lets_nothing_else_in():
@@ -154,25 +154,19 @@ def test_the_host_is_told_what_the_one_who_steers_asks_for():
 )  # fmt: skip
 def test_a_hostile_message_is_refused_and_counts_as_a_release(hostile: str | bytes):
     async def test(here: Console) -> None:
-        page = await here.page()
-        await page.take()
-        await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        page = await here.steering()
         await (page.socket.send_bytes if isinstance(hostile, bytes) else page.socket.send_str)(hostile)
         await until(lambda: page.of("error"))
         assert here.graph.last == REST
         await page.hold(0, 1)
-        await until(lambda: here.graph.last == (0.0, 0.003))
+        await until(lambda: here.graph.last == NORTH)
 
     run(test, hold_timeout=1.0)
 
 
 def test_a_huge_message_ends_the_connection_and_the_movement():
     async def test(here: Console) -> None:
-        page = await here.page()
-        await page.take()
-        await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        page = await here.steering()
         with contextlib.suppress(ConnectionError):
             await page.socket.send_str("x" * 10_000_000)
         await until(lambda: here.graph.last == REST)
@@ -241,7 +235,7 @@ def test_a_page_that_stops_reading_does_not_delay_the_others():
             here.graph.picture = (number, picture() * 20)
             await asyncio.sleep(0)
         await quick.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        await until(lambda: here.graph.last == EAST)
         states = len(quick.of("state"))
         await until(lambda: len(quick.of("state")) > states + 10)
         stuck.tear()
@@ -276,10 +270,7 @@ def test_numbers_that_are_not_finite_reach_the_page_as_null():
 
 def test_the_end_of_the_server_steers_to_rest_first():
     async def test(here: Console) -> None:
-        page = await here.page()
-        await page.take()
-        await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        page = await here.steering()
         stopping = asyncio.create_task(here.server.stop())
         await asyncio.sleep(0)
         assert here.graph.last == REST  # before any connection has ended

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from test.console.visitor import REST, Console, run, until
+from test.console.visitor import EAST, NORTH, REST, Console, run, until
 
 
 def test_a_key_becomes_commands_until_it_is_released():
@@ -22,7 +22,7 @@ def test_a_key_becomes_commands_until_it_is_released():
         await until(lambda: here.graph.last == (here.settings.max_speed, 0.0))
         await page.say(type="release")
         await until(lambda: here.graph.last == REST)
-        assert here.graph.velocities[0] == (0.0, 0.003)
+        assert here.graph.velocities[0] == NORTH
         assert here.graph.velocities.count(REST) == 1
         count = len(here.graph.commands)
         states = len(page.told)
@@ -84,12 +84,12 @@ def test_words_that_the_network_held_up_move_nothing_and_a_page_that_stays_late_
         await page.hold(0, 1, sent=99.0)
         await until(lambda: here.graph.last == REST)
         assert "late" in page.of("error")[0]["text"]
-        assert (0.0, 0.003) not in here.graph.velocities
+        assert NORTH not in here.graph.velocities
         while not page.socket.closed:
             with contextlib.suppress(ConnectionError):
                 await page.hold(0, 1, sent=99.0)
             await asyncio.sleep(0.02)
-        assert (0.0, 0.003) not in here.graph.velocities
+        assert NORTH not in here.graph.velocities
         await until(lambda: not here.server._clients)
 
     run(test)
@@ -143,7 +143,7 @@ def test_an_emergency_stop_of_anybody_rests_the_needle_until_the_key_is_let_go()
         first, second = await here.page(), await here.page()
         await first.take()
         await first.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        await until(lambda: here.graph.last == EAST)
         await second.say(type="act", action="stop")
         await until(lambda: here.graph.actions == ["stop"])
         assert here.graph.last == REST
@@ -157,7 +157,7 @@ def test_an_emergency_stop_of_anybody_rests_the_needle_until_the_key_is_let_go()
         assert len(here.graph.commands) == count
         await first.say(type="release")
         await first.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        await until(lambda: here.graph.last == EAST)
 
     run(test, hold_timeout=1.0)
 
@@ -169,10 +169,7 @@ def test_what_cannot_be_used_does_not_lift_a_stop(between: dict[str, Any]):
     """A word that is refused or late is no key that was let go."""
 
     async def test(here: Console) -> None:
-        page = await here.page()
-        await page.take()
-        await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        page = await here.steering()
         await page.say(type="act", action="stop")
         await until(lambda: here.graph.actions == ["stop"])
         count = len(here.graph.commands)
@@ -184,18 +181,14 @@ def test_what_cannot_be_used_does_not_lift_a_stop(between: dict[str, Any]):
         assert len(here.graph.commands) == count
         await page.say(type="release")
         await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        await until(lambda: here.graph.last == EAST)
 
     run(test, hold_timeout=1.0)
 
 
 def test_a_bridge_that_somebody_else_disarms_asks_for_the_key_anew():
     async def test(here: Console) -> None:
-        page = await here.page()
-        await page.take()
-        await until(lambda: page.of("state"))
-        await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        page = await here.steering()
         here.graph.shown["bridge"].update(armed=False, emergency_stopped=True)
         await until(lambda: here.graph.last == REST)
         here.graph.shown["bridge"].update(armed=True, emergency_stopped=False)
@@ -206,7 +199,7 @@ def test_a_bridge_that_somebody_else_disarms_asks_for_the_key_anew():
         assert len(here.graph.commands) == count
         await page.say(type="release")
         await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        await until(lambda: here.graph.last == EAST)
 
     run(test, hold_timeout=1.0)
 
@@ -221,9 +214,9 @@ def test_a_key_that_is_held_as_the_page_hides_has_to_be_let_go():
         await page.hold(1, 0)
         await page.say(type="record", on=True)
         await until(lambda: here.host.asked)
-        assert here.graph.velocities == [(0.003, 0.0), REST]
+        assert here.graph.velocities == [EAST, REST]
         await page.say(type="release")
         await page.hold(1, 0)
-        await until(lambda: here.graph.last == (0.003, 0.0))
+        await until(lambda: here.graph.last == EAST)
 
     run(test, hold_timeout=1.0)

@@ -18,6 +18,7 @@ from test.console.scene import RecordingGraph, RecordingHost
 TOKEN = "a-token-of-the-tests"
 SLOWEST = 10.0  # [s]
 REST = (0.0, 0.0)
+EAST, NORTH = (0.003, 0.0), (0.0, 0.003)  # what a page asks for that holds a direction [m/s]
 
 
 async def until(condition: Callable[[], Any]) -> Any:
@@ -107,6 +108,14 @@ class Console:
         page = Page(await self.connect(**options))
         await page.say(type="hello", token=token)
         page.number = (await until(lambda: page.of("welcome")))[0]["you"]
+        return page
+
+    async def steering(self) -> Page:
+        """Connect a page that steers to the east."""
+        page = await self.page()
+        await page.take()
+        await page.hold(1, 0)
+        await until(lambda: self.graph.last == EAST)
         return page
 
 
