@@ -32,7 +32,7 @@ LEADS_ELSEWHERE = (
     "ROS_STATIC_PEERS",
     "ROS_SUPER_CLIENT",
 )
-_PARTICIPANTS = 120  # of a domain: more discovery ports it does not have
+_PARTICIPANTS = 120  # of a domain at most: it has no more discovery ports
 _PR_SET_PDEATHSIG = 1
 
 

@@ -248,9 +248,8 @@ def test_an_interrupted_run_that_has_begun_keeps_what_was_recorded(scenario: Pat
         assert process.stdout is not None
         next(line for line in process.stdout if "running" in line)
         deadline = time.monotonic() + 60.0
-        while (
-            sum(path.stat().st_size for path in tmp_path.glob(".bag*/*.mcap")) < 1_500_000
-        ):  # a second or more of the run
+        # a second or more of the run
+        while sum(path.stat().st_size for path in tmp_path.glob(".bag*/*.mcap")) < 1_500_000:
             assert time.monotonic() < deadline
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
