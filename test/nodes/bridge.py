@@ -1,0 +1,94 @@
+"""What the tests of the coil bridge say to it, and ask it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TwistStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from std_srvs.srv import SetBool, Trigger
+
+from magnetosuture_thread.interface import ARM
+from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+
+EAST = np.array([1.0, 0.0])
+TAIL = np.array([-0.0035, 0.0])
+LONG = {"command_timeout": 1.0, "pose_timeout": 1.0}  # one command and one pose last through a test
+
+
+def armed(graph, **parameters: Any) -> Any:
+    """Return a bridge that passes commands."""
+    node = graph.add(CoilBridgeNode, autostart="armed", **parameters)
+    graph.wait(lambda: node.station.latch.armed, "the bridge to be armed")
+    return node
+
+
+def command(graph, x: float = 0.01, y: float = 0.0) -> TwistStamped:
+    """Return a velocity command made now."""
+    return messages.twist_message(graph.now(), np.array([x, y]))
+
+
+def drive(graph, x: float = 0.005, y: float = 0.0) -> TwistStamped:
+    """Say where the needle is, then ask for a velocity; return that command."""
+    graph.publish(topics.NEEDLE_POSE, messages.pose_message(graph.now(), TAIL, EAST))
+    asked = command(graph, x, y)
+    graph.publish(topics.NEEDLE_COMMAND, asked)
+    return asked
+
+
+def call(graph, kind: Any, name: str, request: Any) -> Any:
+    """Call a service and return its answer."""
+    client = graph.probe.create_client(kind, name)
+    graph.wait(client.service_is_ready, f"the service {name}")
+    future = client.call_async(request)
+    graph.wait(future.done, f"an answer of {name}")
+    graph.probe.destroy_client(client)
+    return future.result()
+
+
+def press(graph, name: str) -> Any:
+    """Call emergency stop or reset."""
+    return call(graph, Trigger, name, Trigger.Request())
+
+
+def arm(graph, on: bool = True) -> Any:
+    """Arm or disarm."""
+    return call(graph, SetBool, ARM, SetBool.Request(data=on))
+
+
+def change(graph, transition: int) -> bool:
+    """Ask for a transition of the lifecycle."""
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return bool(call(graph, ChangeState, "coil_bridge/change_state", request).success)
+
+
+def stage(graph) -> str:
+    """Return the lifecycle's state."""
+    return str(call(graph, GetState, "coil_bridge/get_state", GetState.Request()).current_state.label)
+
+
+def applied(node) -> list[np.ndarray]:
+    """Return what the recording driver was told."""
+    return list(node.station.driver.applied)
+
+
+def driven(node) -> bool:
+    """Return whether any current was on."""
+    return any(currents.any() for currents in applied(node))
+
+
+def reasons(states) -> str:
+    """Return why the coils are at zero, by the last state."""
+    return "; ".join(states[-1].reasons) if states else ""
+
+
+def set_parameter(graph, name: str, value: float) -> Any:
+    """Set a number among the bridge's parameters."""
+    parameter = Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value))
+    request = SetParameters.Request(parameters=[parameter])
+    return call(graph, SetParameters, "coil_bridge/set_parameters", request).results[0]
