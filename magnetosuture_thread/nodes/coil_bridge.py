@@ -42,8 +42,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self.start()
         if self.settings is not None and self.settings.autostart == "armed":
             self.station.arm_when_ready()
-        # The first line that rclpy logs takes 0.1 s, as it looks for its caller in all modules: not amid commands.
-        self._step()
 
     def begin(self, settings: CoilBridgeSettings) -> None:
         """Open the driver; from now on it is told zero again and again."""

@@ -41,6 +41,8 @@ class CoilReport:
         self._states = topics.BRIDGE_STATE.publisher(node)
         self._rig = topics.RIG_CURRENTS.publisher(node)
         node.create_timer(TELLING, lambda: self.state(anyway=True), clock=steady)
+        # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
+        self._log("unconfigured", station.driver_state)
 
     def to_rig(self, currents: np.ndarray) -> None:
         """Send currents to the simulated rig."""

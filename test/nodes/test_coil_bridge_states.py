@@ -45,7 +45,7 @@ def test_a_bridge_that_is_destroyed_leaves_the_graph_at_once(graph):
 def test_its_state_is_logged_before_its_loop_runs(graph, capfd):
     """The first line takes long, and no command shall wait for it."""
     graph.nodes.append(CoilBridgeNode(context=graph.context))
-    assert "active; driver recording: ready" in capfd.readouterr().err
+    assert "unconfigured; driver" in capfd.readouterr().err
 
 
 def test_it_starts_active_but_disarmed_and_arming_lets_commands_pass(graph):
