@@ -40,15 +40,26 @@ def setup_file(name: str) -> Path:
     Raises:
         ConfigurationError: there is no such file.
     """
-    if Path(name).suffix in (".yaml", ".yml") or os.sep in name:
-        path = Path(name)
-    else:
-        path = share("magnetosuture_thread") / "config" / f"{name}.yaml"
+    return _named_file("set-up", name, "config", (".yaml", ".yml"))
+
+
+def scene_file(name: str) -> Path:
+    """Return the file of a scene, given as a path or as the name of one that ships with the package.
+
+    Raises:
+        ConfigurationError: there is no such file.
+    """
+    return _named_file("scene", name, "config/scenes", (".yaml", ".yml", ".json", ".geojson"))
+
+
+def _named_file(what: str, name: str, folder: str, endings: tuple[str, ...]) -> Path:
+    shipped = share("magnetosuture_thread") / folder
+    path = Path(name) if Path(name).suffix in endings or os.sep in name else shipped / f"{name}.yaml"
     try:
         exists = path.is_file()
     except (OSError, ValueError):  # no name that a file could have
         exists = False
     if not exists:
-        known = ", ".join(sorted(p.stem for p in (share("magnetosuture_thread") / "config").glob("*.yaml")))
-        raise ConfigurationError("set-up", name, f"a YAML file, or one of {known}")
+        known = ", ".join(sorted(p.stem for p in shipped.glob("*.yaml")))
+        raise ConfigurationError(what, name, f"a YAML file, or one of {known}")
     return path
