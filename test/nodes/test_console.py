@@ -139,7 +139,7 @@ def test_a_held_graph_is_told_nothing_but_a_stop(graph, console):
     console.held = "starting petri"
     assert act(console, "arm") == "starting petri"
     console.steer((0.003, 0.0))
-    assert console.state()["steering"]["reason"] == "starting petri"
+    assert console.state()["filter"]["reason"] == "starting petri"
     console.held = ""
     graph.wait(lambda: heard(0.002), "another wish")
     assert {wish.twist.linear.x for wish in wishes} == {0.001, 0.002}

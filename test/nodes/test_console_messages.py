@@ -13,9 +13,9 @@ from geometry_msgs.msg import Point
 from magnetosuture_msgs.msg import (
     BarrierMargin,
     CoilBridgeState,
+    FilterState,
     PredictedThread,
     SafetyMargins,
-    SteeringState,
     TrackerState,
 )
 
@@ -115,14 +115,17 @@ def test_discs_are_discs_and_polygons_triangles_and_what_was_there_before_is_gon
     assert console_messages.obstacles(thread_messages.obstacle_markers(STAMP, [])) == []
 
 
-def test_the_steering():
-    message = SteeringState(slowdown=0.9, held_off=True, reason="")
-    message.asked.x, message.passed.y = 0.005, 0.004
-    assert plain(console_messages.steering(message)) == {
-        "asked": [0.005, 0.0],
-        "passed": [0.0, 0.004],
+def test_the_filter_state():
+    message = FilterState(source="operator", slowdown=0.9, active=["friction", "ring"], overridden="needle", reason="")
+    message.commanded.x, message.filtered.y, message.applied.y = 0.005, 0.004, 0.003
+    assert plain(console_messages.filter_state(message)) == {
+        "source": "operator",
+        "commanded": [0.005, 0.0],
+        "filtered": [0.0, 0.004],
+        "applied": [0.0, 0.003],
         "slowdown": 0.9,
-        "held_off": True,
+        "active": ["friction", "ring"],
+        "overridden": "needle",
         "reason": "",
     }
 
