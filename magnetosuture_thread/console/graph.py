@@ -19,7 +19,7 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
       "filter": {"source": "operator|needle|", "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy],
                  "slowdown": float, "active": [str], "overridden": str, "reason": str, "age": s} | None,
       "bridge": {"state": "unconfigured|inactive|active|fault", "armed": bool, "emergency_stopped": bool,
-                 "reasons": [str], "commanded": [vx, vy], "applied": [vx, vy], "reached": [vx, vy], "saturated": bool,
+                 "reasons": [str], "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy], "saturated": bool,
                  "driver": str, "driver_ready": bool, "driver_warnings": [str], "current": [A],
                  "measured_current": [A], "refused": int, "age": s} | None,
       "nodes": {name: {"level": "ok|warn|error|silent", "message": str, "values": {str: str}, "age": s}},

@@ -129,6 +129,22 @@ def needle_pose(message: PoseWithCovarianceStamped) -> NeedlePose:
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
 
 
+def pose_covariance(message: PoseWithCovarianceStamped) -> np.ndarray | None:
+    """Return the covariance of x, y [m] and the heading's angle [rad], shape (3, 3); None for zeros, as for unknown.
+
+    Raises:
+        InvalidInputError: it is not finite, or a variance is negative.
+    """
+    whole = np.asarray(message.pose.covariance).reshape(6, 6)
+    if not whole.any():
+        return None
+    covariance = whole[np.ix_(_IN_PLANE, _IN_PLANE)]
+    if not np.isfinite(covariance).all() or (np.diag(covariance) < 0.0).any():
+        diagonal = np.diag(covariance).tolist()
+        raise InvalidInputError("needle/measured_cp.pose.covariance", diagonal, "finite variances of at least 0")
+    return covariance
+
+
 class PathMaker:
     """Makes paths, from one to the next in the same message: most of a new one's time is its hundred poses.
 

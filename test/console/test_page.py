@@ -393,7 +393,7 @@ WHY = [
     ("needle", {"age": 2.0}, "No needle pose for 2"),
     ("filter", {"commanded": [0.003, 0.0], "reason": "no prediction"}, "The needle rests: no prediction"),
     ("filter", {"commanded": [0.003, 0.0], "active": ["ring"]}, "The needle rests: held by ring"),
-    ("bridge", {"applied": [0.003, 0.0], "reached": [0.0021, 0.0]}, "Moving at 2.1 mm/s"),
+    ("bridge", {"filtered": [0.003, 0.0], "applied": [0.0021, 0.0]}, "Moving at 2.1 mm/s"),
 ]
 
 

@@ -27,9 +27,9 @@ export function whyAtRest(view) {
   if (tracker && tracker.state !== "tracked") return verdict("error", `Needle ${tracker.state}${tracker.reason ? `: ${tracker.reason}` : ""}`, others(bridge, []));
   if (graph.needle && graph.needle.age + since > SILENT) return verdict("error", `No needle pose for ${seconds(graph.needle.age + since)}`, others(bridge, []));
   const filter = graph.filter && graph.filter.age + since < SILENT ? graph.filter : null;
-  const reached = length(bridge.reached) ?? 0;
+  const filtered = length(bridge.filtered) ?? 0;
   const applied = length(bridge.applied) ?? 0;
-  if (applied > MOVES) return moving(reached, bridge, filter, graph);
+  if (filtered > MOVES) return moving(applied, bridge, filter, graph);
   if (filter && (length(filter.commanded) ?? 0) > MOVES) {
     const why = filter.reason || (filter.active.length ? `held by ${filter.active.join(", ")}` : "");
     return verdict("warn", why ? `The needle rests: ${why}` : "The needle rests", others(bridge, [filter.reason]));
@@ -40,7 +40,7 @@ export function whyAtRest(view) {
   return verdict("rest", `The needle rests: ${who.toLowerCase()}`, [view.commands ? "Take steering to move it." : "This page only watches: it was opened without the token."]);
 }
 
-function moving(reached, bridge, filter, graph) {
+function moving(applied, bridge, filter, graph) {
   const notes = [];
   const friction = graph.margins?.valid ? graph.margins.friction : null;
   const slowdown = filter?.slowdown ?? 1;
@@ -52,7 +52,7 @@ function moving(reached, bridge, filter, graph) {
   if (limits.length) notes.push(`Limited by ${limits.join(", ")}.`);
   if (filter?.overridden) notes.push(`Commands of the input ${filter.overridden} are overridden.`);
   if (bridge.saturated) notes.push("The coils are at their limit.");
-  return verdict(notes.length ? "warn" : "ok", `Moving at ${speedText(reached)}`, notes);
+  return verdict(notes.length ? "warn" : "ok", `Moving at ${speedText(applied)}`, notes);
 }
 
 const first = (list, otherwise) => list?.[0] ?? otherwise;
