@@ -10,6 +10,7 @@ from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.rhythm import Rhythm
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.scene import Scene
 
 NO_DRIVER = DriverState(False, "unconfigured")
 
@@ -29,7 +30,7 @@ class CoilStation:
 
     def __init__(self) -> None:
         self.latch = ArmingLatch()
-        Bridge(CoilBridgeSettings(), self.latch)  # loads its kernels: no step and no transition waits for a compiler
+        Bridge(CoilBridgeSettings(), self.latch, Scene())  # loads its kernels: no step and no transition waits for a compiler
         self.bridge: Bridge | None = None
         self.driver: CoilDriver | None = None
         self.outcome: Outcome | None = None
