@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
+SCENE_SERVER = "scene_server"  # besides, where the scene changes while the others run
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"
@@ -51,6 +52,8 @@ MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
 THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
 OBSTACLE_MARKERS = Channel("thread/obstacles", "visualization_msgs/msg/MarkerArray")
 OBSTACLE_SET = Channel("thread/obstacle_set", "magnetosuture_msgs/msg/ObstacleSet")  # around the thread, from now on
+SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene")  # dish and shapes from now on
+SCENE_MARKERS = Channel("scene/markers", "visualization_msgs/msg/MarkerArray")
 MATERIAL = Channel("thread/material", "magnetosuture_msgs/msg/ThreadMaterial")
 CURRENTS = Channel("coils/currents", "magnetosuture_msgs/msg/CoilCurrents")
 BRIDGE_STATE = Channel("coils/state", "magnetosuture_msgs/msg/CoilBridgeState")
@@ -58,6 +61,9 @@ DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
 # Services of the coil bridge, of std_srvs: SetBool, Trigger and Trigger.
 ARM, EMERGENCY_STOP, RESET = "coils/arm", "coils/emergency_stop", "coils/reset"
+
+# Services of the scene server, of magnetosuture_msgs: LoadScene, EditShape, EditShape and RemoveShape.
+LOAD_SCENE, ADD_SHAPE, REPLACE_SHAPE, REMOVE_SHAPE = "scene/load", "scene/add", "scene/replace", "scene/remove"
 
 # Services of std_srvs/SetBool that let time stand still: of a replayed bag, of the simulated rig.
 PAUSE_REPLAY, PAUSE_RIG = "replay/pause", "rig/pause"

@@ -61,5 +61,6 @@ def _named_file(what: str, name: str, folder: str, endings: tuple[str, ...]) -> 
         exists = False
     if not exists:
         known = ", ".join(sorted(p.stem for p in shipped.glob("*.yaml")))
-        raise ConfigurationError(what, name, f"a YAML file, or one of {known}")
+        formats = "YAML or GeoJSON" if ".geojson" in endings else "YAML"
+        raise ConfigurationError(what, name, f"a {formats} file, or one of {known}")
     return path

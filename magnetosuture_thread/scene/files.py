@@ -7,30 +7,53 @@ shapes:
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from magnetosuture_thread.configuration import read_yaml
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.resources import scene_file
-from magnetosuture_thread.scene.definitions import shape_from_mapping
-from magnetosuture_thread.scene.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.scene.definitions import (
+    description_of,
+    dish_from_mapping,
+    scene_of_parts,
+    shape_from_mapping,
+)
+from magnetosuture_thread.scene.geojson import scene_from_geojson, scene_to_geojson
+from magnetosuture_thread.scene.refusal import refusal
+from magnetosuture_thread.scene.scene import MAX_SHAPES, Scene
+from magnetosuture_thread.scene.text import parse_json, parse_yaml, read_text
 
-DISH_FIELDS = ("diameter", "depth")
+GEOJSON_ENDINGS = (".json", ".geojson")
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes lists that are the same object twice, as nothing that reads scenes takes aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Say that nothing is written as an alias."""
+        return True
 
 
 def read_scene(name: str) -> Scene:
     """Read a scene, given as a path or as the name of one that ships with the package.
 
     Raises:
-        ConfigurationError: there is no such file, or it holds anything invalid.
+        ConfigurationError: there is no such file, it is no regular file of at most 1 MB, or it holds anything
+            invalid.
     """
-    path = scene_file(name)
-    return scene_from_mapping(read_yaml(path, "scene file"), str(path))
+    try:
+        path = scene_file(name)
+    except ConfigurationError as error:
+        raise refusal(error.name, error.value, error.expectation) from None
+    text = read_text(path)
+    if path.suffix in GEOJSON_ENDINGS:
+        return scene_from_geojson(parse_json(text, str(path)), str(path))
+    return scene_from_mapping(parse_yaml(text, str(path)), str(path))
 
 
 def scene_from_mapping(content: Any, source: str = "") -> Scene:
@@ -43,44 +66,45 @@ def scene_from_mapping(content: Any, source: str = "") -> Scene:
     Raises:
         ConfigurationError: anything in it is missing, unknown or out of bounds.
     """
-    if not isinstance(content, Mapping) or set(content) - {"dish", "shapes"} or "dish" not in content:
-        raise ConfigurationError("scene", content, "dish, and shapes by name", source)
-    dish, shapes = content["dish"], content.get("shapes") or {}
-    if not isinstance(dish, Mapping) or set(dish) - set(DISH_FIELDS) or "diameter" not in dish:
-        raise ConfigurationError("dish", dish, f"{' and '.join(DISH_FIELDS)} [m]", source)
-    for field, value in dish.items():
-        if not isinstance(value, (int, float)) or isinstance(value, bool):
-            raise ConfigurationError(f"dish.{field}", value, "a number [m]", source)
+    if not isinstance(content, Mapping) or "dish" not in content:
+        raise refusal("scene", content, "dish, and shapes by name", source)
+    for name, value in content.items():
+        if name not in ("dish", "shapes"):
+            raise refusal(str(name), value, "dish and shapes, nothing else", source)
+    dish, shapes = dish_from_mapping(content["dish"], source), content.get("shapes")
+    if shapes is None:
+        shapes = {}
     if not isinstance(shapes, Mapping):
-        raise ConfigurationError("shapes", shapes, "shapes by name", source)
-    made = tuple(shape_from_mapping(str(name), description, source) for name, description in shapes.items())
-    try:
-        return Scene(Dish(**{field: float(value) for field, value in dish.items()}), made)
-    except ConfigurationError as error:
-        raise ConfigurationError(error.name, error.value, error.expectation, source) from None
+        raise refusal("shapes", shapes, "shapes by name", source)
+    if len(shapes) > MAX_SHAPES:
+        raise refusal("shapes", f"{len(shapes)} shapes", f"at most {MAX_SHAPES}", source)
+    made = tuple(shape_from_mapping(name, description, source) for name, description in shapes.items())
+    return scene_of_parts(dish, made, source)
 
 
 def scene_to_mapping(scene: Scene) -> dict[str, Any]:
     """Return what a scene file holds for a scene; a shape without a definition as disc or polygon."""
     return {
         "dish": {"diameter": scene.dish.diameter, "depth": scene.dish.depth},
-        "shapes": {shape.name: _description(shape) for shape in scene.shapes},
+        "shapes": {shape.name: description_of(shape) for shape in scene.shapes},
     }
 
 
 def write_scene(scene: Scene, path: Path) -> None:
-    """Write a scene file."""
-    text = yaml.safe_dump(scene_to_mapping(scene), sort_keys=False, default_flow_style=None, width=120)
-    path.write_text(text, encoding="utf-8")
+    """Write a scene file: GeoJSON where its name ends in .json or .geojson, else YAML. It is whole or not there.
 
-
-def _description(shape: SceneShape) -> dict[str, Any]:
-    if shape.definition:
-        return {**shape.definition, "kind": shape.kind}
-    geometry = shape.geometry
-    if isinstance(geometry, Disc):
-        return {"disc": {"center": list(geometry.centre), "radius": geometry.radius}, "kind": shape.kind}
-    fields = {"outline": [list(point) for point in geometry.outline]}
-    if geometry.holes:
-        fields["holes"] = [[list(point) for point in hole] for hole in geometry.holes]  # type: ignore[misc]
-    return {"polygon": fields, "kind": shape.kind}
+    Raises:
+        ConfigurationError: it cannot be written.
+    """
+    if path.suffix in GEOJSON_ENDINGS:
+        text = json.dumps(scene_to_geojson(scene), indent=1, allow_nan=False) + "\n"
+    else:
+        content = scene_to_mapping(scene)
+        text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise refusal("scene file", error.strerror or str(error), "a file that can be written", str(path)) from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,15 +14,19 @@ from typing import Any
 import numpy as np
 import shapely
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.scene.refusal import refusal
+from magnetosuture_thread.scene.text import is_number
 
 KINDS = ("tissue", "instrument", "wall")
 """What a shape is: tissue, an instrument or post, or a rigid wall inside of the dish."""
 
 MAX_SHAPES = 200
 MAX_VERTICES = 10_000  # of all polygons of a scene together
+MAX_HOLES = 100  # of a polygon: each is compared with each
 MAX_NAME_CHARS = 64
+MAX_COORDINATE = 1.0  # m; what is farther away is given in another unit
+MIN_RADIUS = 1e-6  # m
 VERSION_CHARS = 16
 
 
@@ -44,8 +49,8 @@ class Dish:
         """Check the bounds."""
         for name, low, high in (("diameter", 0.005, 0.5), ("depth", 1e-5, 0.1)):
             value = getattr(self, name)
-            if not (math.isfinite(value) and low <= value <= high):
-                raise ConfigurationError(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
+            if not (is_number(value) and low <= value <= high):
+                raise refusal(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
 
     @property
     def radius(self) -> float:
@@ -65,7 +70,7 @@ class SceneShape:
             empty where only the geometry is known, as of a message.
 
     Raises:
-        ConfigurationError: the name or the kind cannot be used.
+        ConfigurationError: the name or the kind cannot be used, or the geometry is out of bounds.
     """
 
     name: str
@@ -74,11 +79,20 @@ class SceneShape:
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check name and kind."""
-        if not self.name or len(self.name) > MAX_NAME_CHARS or not self.name.isprintable():
-            raise ConfigurationError("shape.name", self.name[:100], f"1 to {MAX_NAME_CHARS} printable characters")
+        """Check name, kind and bounds."""
+        if not is_name(self.name):
+            raise refusal("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
         if self.kind not in KINDS:
-            raise ConfigurationError(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
+            raise refusal(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
+        if isinstance(self.geometry, Disc):
+            object.__setattr__(self, "geometry", _checked_disc(self.name, self.geometry))
+            return
+        farthest = float(np.abs(self.geometry.outline).max())
+        if farthest > MAX_COORDINATE:
+            expectation = f"coordinates of at most {MAX_COORDINATE:g}, in metres"
+            raise refusal(f"{self.name}.polygon.outline", farthest, expectation)
+        if len(self.geometry.holes) > MAX_HOLES:
+            raise refusal(f"{self.name}.polygon.holes", f"{len(self.geometry.holes)} holes", f"at most {MAX_HOLES}")
 
     @property
     def solid(self) -> shapely.Geometry:
@@ -86,6 +100,16 @@ class SceneShape:
         if isinstance(self.geometry, Disc):
             return shapely.Point(self.geometry.centre).buffer(self.geometry.radius, quad_segs=64)
         return shapely.Polygon(self.geometry.outline, self.geometry.holes)
+
+    @cached_property
+    def label_point(self) -> tuple[float, float]:
+        """A point inside of the shape, well away from its boundary: where its name can stand [m]."""
+        if isinstance(self.geometry, Disc):
+            return self.geometry.centre[0], self.geometry.centre[1]
+        solid = self.solid
+        line = shapely.maximum_inscribed_circle(solid, tolerance=0.02 * math.sqrt(solid.area))
+        x, y = line.coords[0]
+        return float(x), float(y)
 
 
 @dataclass(frozen=True)
@@ -106,20 +130,25 @@ class Scene:
     def __post_init__(self) -> None:
         """Check the shapes together."""
         if len(self.shapes) > MAX_SHAPES:
-            raise ConfigurationError("scene.shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
+            raise refusal("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
         vertices = sum(
             sum(map(len, shape.geometry.rings)) for shape in self.shapes if isinstance(shape.geometry, Polygon)
         )
         if vertices > MAX_VERTICES:
-            raise ConfigurationError("scene.shapes", f"{vertices} vertices", f"at most {MAX_VERTICES} in all")
-        names = [shape.name for shape in self.shapes]
-        for index, shape in enumerate(self.shapes):
-            if shape.name in names[:index]:
-                raise ConfigurationError(f"scene.{shape.name}", "a name given twice", "a name for each shape")
-            if _distance_from_centre(shape.geometry) >= self.dish.radius:
-                raise ConfigurationError(
-                    f"scene.{shape.name}", "a shape outside of the dish", f"within {self.dish.radius:g} m of its centre"
+            raise refusal("shapes", f"{vertices} vertices", f"at most {MAX_VERTICES} in all")
+        names = Counter(shape.name for shape in self.shapes)
+        for shape in self.shapes:
+            if names[shape.name] > 1:
+                raise refusal(shape.name, "a name given twice", "a name of its own for each shape")
+            near, far = _reach(shape.geometry, self.dish.radius)
+            if near >= self.dish.radius:
+                raise refusal(
+                    shape.name,
+                    f"a shape outside of the dish, {near:.4g} m from its centre",
+                    f"a part of it within the dish, less than {self.dish.radius:g} m",
                 )
+            if not far:
+                raise refusal(shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres")
 
     @cached_property
     def version(self) -> str:
@@ -171,11 +200,34 @@ class Scene:
     def _require(self, name: str) -> None:
         if name not in self.names:
             known = ", ".join(self.names) or "none: the scene has no shapes"
-            raise ConfigurationError("shape.name", name[:100], f"one of {known}")
+            raise refusal("shape.name", name, f"one of {known}"[:400])
 
 
-def _distance_from_centre(geometry: Disc | Polygon) -> float:
-    """Return the distance of a shape from the dish's centre, 0 where it covers it [m]."""
+def is_name(text: Any) -> bool:
+    """Return whether a text can name a shape."""
+    return isinstance(text, str) and 0 < len(text) <= MAX_NAME_CHARS and text.isprintable() and text == text.strip()
+
+
+def _checked_disc(name: str, disc: Disc) -> Disc:
+    """Return a disc in plain numbers, once it is known to be within the bounds."""
+    values = (*disc.centre, disc.radius)
+    if len(values) != 3 or not all(math.isfinite(value) for value in values):
+        raise refusal(f"{name}.disc", list(values), "finite x, y and radius")
+    x, y, radius = map(float, values)
+    if max(abs(x), abs(y)) > MAX_COORDINATE:
+        raise refusal(f"{name}.disc.center", [x, y], f"two coordinates x, y of at most {MAX_COORDINATE:g}, in metres")
+    if not MIN_RADIUS <= radius <= MAX_COORDINATE:
+        raise refusal(f"{name}.disc.radius", radius, f"a number from {MIN_RADIUS:g} to {MAX_COORDINATE:g} m")
+    return Disc((x, y), radius)
+
+
+def _reach(geometry: Disc | Polygon, dish_radius: float) -> tuple[float, bool]:
+    """Return a shape's distance from the dish's centre [m], and whether it leaves any of the dish uncovered."""
     if isinstance(geometry, Disc):
-        return max(0.0, math.hypot(*geometry.centre) - geometry.radius)
-    return float(shapely.Polygon(geometry.outline, geometry.holes).distance(shapely.Point(0.0, 0.0)))
+        away = math.hypot(*geometry.centre)
+        return max(0.0, away - geometry.radius), away + dish_radius > geometry.radius
+    solid = shapely.Polygon(geometry.outline, geometry.holes)
+    near = float(solid.distance(shapely.Point(0.0, 0.0)))
+    if near > 0.0:
+        return near, True
+    return near, not solid.covers(shapely.Point(0.0, 0.0).buffer(dish_radius, quad_segs=32))

@@ -1,0 +1,176 @@
+"""Scene files: what is written is read back the same, and what is no scene is refused in one line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, scene_to_mapping, write_scene
+from magnetosuture_thread.scene.text import MAX_FILE_BYTES, parse_yaml
+from test.scene.scenes import SHAPES, every_shape
+
+DISH = "dish: {diameter: 0.035, depth: 0.003}\n"
+
+
+@pytest.mark.parametrize("ending", [".yaml", ".yml", ".json", ".geojson"])
+def test_a_written_scene_is_read_back_with_version_and_definitions(tmp_path: Path, ending: str):
+    scene, path = every_shape(), tmp_path / f"scene{ending}"
+    write_scene(scene, path)
+    again = read_scene(str(path))
+    assert again == scene
+    assert again.version == scene.version
+    for shape in again.shapes:
+        expected = {"kind": "tissue", **SHAPES[shape.name]}
+        assert {**shape.definition, "kind": shape.kind} == expected
+    write_scene(again, tmp_path / f"again{ending}")
+    assert (tmp_path / f"again{ending}").read_bytes() == path.read_bytes()
+    assert sorted(tmp_path.iterdir()) == sorted([path, tmp_path / f"again{ending}"])
+
+
+@pytest.mark.parametrize("ending", [".yaml", ".geojson"])
+def test_geometry_without_a_definition_is_written_bit_for_bit(tmp_path: Path, ending: str):
+    """As of a message: only the geometry is known."""
+    bare = Scene(Dish(0.05, 0.004), tuple(SceneShape(s.name, s.kind, s.geometry) for s in every_shape().shapes))
+    clockwise = Polygon(((0.0, -0.001), (0.0, -0.002), (1e-3 / 3.0, -0.002)), ())
+    bare = bare.add(SceneShape("clockwise", "wall", clockwise)).add(
+        SceneShape("tiny", "wall", Disc((-0.0, 1e-9), 1e-6))
+    )
+    write_scene(bare, tmp_path / f"bare{ending}")
+    assert read_scene(str(tmp_path / f"bare{ending}")).version == bare.version
+
+
+def test_a_shape_whose_points_are_one_list_is_written_without_aliases(tmp_path: Path):
+    point = [0.001, 0.0]
+    shape = SceneShape(
+        "a", "wall", Disc((0.0, 0.0), 0.001), {"capsule": {"start": point, "end": point, "radius": 0.001}}
+    )
+    write_scene(Scene(Dish(), (shape,)), tmp_path / "a.yaml")
+    assert "&" not in (tmp_path / "a.yaml").read_text()
+
+
+def test_a_scene_that_cannot_be_written_leaves_nothing(tmp_path: Path):
+    (tmp_path / "there.yaml").mkdir()
+    for path in (tmp_path / "there.yaml", tmp_path / "nowhere" / "a.yaml"):
+        with pytest.raises(ConfigurationError, match=r"scene file: got '.*', expected a file that can be written"):
+            write_scene(Scene(), path)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "there.yaml"]
+
+
+def test_a_dish_alone_is_a_scene(tmp_path: Path):
+    for text in ("dish: {diameter: 0.035}\n", f"{DISH}shapes:\n", f"{DISH}shapes: {{}}\n"):
+        (tmp_path / "dish.yaml").write_text(text)
+        scene = read_scene(str(tmp_path / "dish.yaml"))
+        assert scene == Scene(Dish(0.035, 0.003))
+        assert scene_to_mapping(scene) == {"dish": {"diameter": 0.035, "depth": 0.003}, "shapes": {}}
+
+
+def test_numbers_are_read_as_ros_reads_them(tmp_path: Path):
+    (tmp_path / "a.yaml").write_text(
+        "dish: {diameter: 35e-3}\nshapes: {a: {disc: {center: [0, 1e-3], radius: +1.e-3}}}\n"
+    )
+    assert read_scene(str(tmp_path / "a.yaml")).obstacles == (Disc((0.0, 0.001), 0.001),)
+
+
+BAD = [
+    ("", "scene: got None, expected dish, and shapes by name"),
+    ("[]", "scene: got [], expected dish, and shapes by name"),
+    ("shapes: {}", "scene: got {'shapes': {}}, expected dish, and shapes by name"),
+    (f"{DISH}obstacles: []", "obstacles: got [], expected dish and shapes, nothing else"),
+    ("dish: 0.035", "dish: got 0.035, expected diameter and depth [m]"),
+    ("dish: {depth: 0.003}", "dish: got {'depth': 0.003}, expected diameter and depth [m]"),
+    ("dish: {diameter: 35}", "dish.diameter: got 35.0, expected a number from 0.005 to 0.5 m"),
+    ("dish: {diameter: 35 mm}", "dish.diameter: got '35 mm', expected a number [m]"),
+    ("dish: {diameter: .nan}", "dish.diameter: got nan, expected a number"),
+    ("dish: {diameter: .inf}", "dish.diameter: got inf, expected a number"),
+    ("dish: {diameter: true}", "dish.diameter: got True, expected a number [m]"),
+    ("dish: {diameter: 0.035, radius: 0.01}", "dish.radius: got 0.01, expected one of diameter, depth"),
+    ("dish: {diameter: 1" + 400 * "0" + "}", "dish.diameter: got 1000000"),
+    (f"{DISH}shapes: [post]", "shapes: got ['post'], expected shapes by name"),
+    (f"{DISH}shapes: false", "shapes: got False, expected shapes by name"),
+    (f"{DISH}shapes: {{post: 3}}", "post: got 3, expected a shape, one of disc"),
+    (
+        f"{DISH}shapes: {{post: {{disc: {{center: [0, 0], raduis: 0.1}}}}}}",
+        "post.disc.radius: got None, expected a value",
+    ),
+    (f"{DISH}shapes: {{1: {{}}}}", "scene file: got 'the name 1 that is no text in line 2', expected valid YAML"),
+    (f"{DISH}shapes: {{on: {{}}}}", "scene file: got 'the name on that is no text in line 2', expected valid YAML"),
+    (f"{DISH}shapes: {{[a]: {{}}}}", "scene file: got 'a name that is no text in line 2', expected valid YAML"),
+    (f"{DISH}shapes: {{a: 1, a: 2}}", "scene file: got 'a is given twice in line 2', expected valid YAML"),
+    (f"{DISH}{DISH}", "scene file: got 'dish is given twice in line 2', expected valid YAML"),
+    (f"{DISH}shapes: {{a", "scene file: got \"did not find expected ',' or '}' in line"),
+    ("dish: \x07", "scene file: got '"),
+    ("a: &a [*a]", "scene file: got 'an anchor or alias (& or *) in line 1', expected plain YAML"),
+    ("dish: &d {diameter: 0.035}", "scene file: got 'an anchor or alias (& or *) in line 1', expected plain YAML"),
+    ("<<: {dish: 1}", "scene file: got 'the name << that is no text in line 1'"),
+    ("dish: !!python/object/apply:os.system [ls]", "scene file: got 'a tag (!) in line 1', expected plain YAML"),
+    ("dish: !!int '35'", "scene file: got 'a tag (!) in line 1', expected plain YAML"),
+    ("[" * 100_000, "scene file: got 'lists and mappings 21 deep in line 1', expected plain YAML, at most 20 deep"),
+    ("- " * 100_000, "scene file: got 'lists and mappings 21 deep in line 1', expected plain YAML, at most 20 deep"),
+    ("dish: " + "9" * 2000, "scene file: got 'a word of 2000 characters in line 1'"),
+    (f"{DISH}---\n{DISH}", "scene file: got 'but found another document in line 2', expected valid YAML"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), BAD, ids=lambda value: value[:40])
+def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: str, words: str):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        read_scene(str(path))
+    assert str(caught.value).startswith(f"{path}: {words}")
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500 + len(str(path))
+
+
+def test_many_names_take_no_time_to_compare():
+    text = "\n".join(f"name{index}: 1" for index in range(60_000))
+    assert len(parse_yaml(text)) == 60_000
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path):
+    for data, words in ((b"\xff\xfe\x00", "bytes that are no UTF-8 text"), (b"a\x00b", "expected valid YAML")):
+        (tmp_path / "a.yaml").write_bytes(data)
+        with pytest.raises(ConfigurationError, match=words):
+            read_scene(str(tmp_path / "a.yaml"))
+
+
+def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
+    fifo = tmp_path / "fifo.yaml"
+    os.mkfifo(fifo)
+    (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "device.yaml").symlink_to("/dev/zero")
+    for path in (fifo, tmp_path / "folder.yaml", tmp_path / "device.yaml", tmp_path / "none.yaml", Path("/dev/zero")):
+        with pytest.raises(
+            ConfigurationError, match=rf"^scene: got '{path}', expected a YAML or GeoJSON file, or one of dish_150mm"
+        ):
+            read_scene(str(path))
+    large = tmp_path / "large.yaml"
+    large.write_text(DISH + "#" * (MAX_FILE_BYTES - len(DISH)))
+    assert read_scene(str(large)).shapes == ()
+    large.write_text(DISH + "#" * (MAX_FILE_BYTES - len(DISH) + 1))
+    with pytest.raises(
+        ConfigurationError, match="scene file: got 'a larger file', expected a regular file of at most 1000 kB"
+    ):
+        read_scene(str(large))
+    large.unlink()
+    os.truncate(os.open(large, os.O_CREAT | os.O_WRONLY), 10**12)  # a terabyte with nothing in it
+    with pytest.raises(ConfigurationError, match="a larger file"):
+        read_scene(str(large))
+
+
+def test_a_pipe_that_takes_the_place_of_a_file_at_the_last_moment_holds_nobody_up(tmp_path: Path, monkeypatch):
+    fifo = tmp_path / "fifo.yaml"
+    os.mkfifo(fifo)
+    monkeypatch.setattr("magnetosuture_thread.scene.files.scene_file", lambda name: fifo)
+    with pytest.raises(ConfigurationError, match="got 'a folder, pipe or device', expected a regular file"):
+        read_scene(str(fifo))
+
+
+@pytest.mark.parametrize("name", ["", "nowhere", "a\0b", "x" * 5000, "../config/scenes/dish_35mm"])
+def test_a_name_that_no_scene_has_is_refused(name: str):
+    with pytest.raises(ConfigurationError, match=r"^scene: got .{2,200}, expected a YAML or GeoJSON file, or one of"):
+        read_scene(name)

@@ -1,0 +1,158 @@
+"""Scenes as messages: the same of both libraries, and refused where anything of them is not as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from magnetosuture_msgs.msg import Scene as SceneMessage
+from rclpy.serialization import deserialize_message, serialize_message
+
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Polygon
+from magnetosuture_thread.interface import SCENE
+from magnetosuture_thread.nodes.messages import stamp_of
+from magnetosuture_thread.nodes.scene_messages import scene_message
+from magnetosuture_thread.scene import Dish, Scene, SceneShape, messages, read_scene
+from test.scene.scenes import every_shape
+
+LARGE = Polygon(
+    tuple((0.01 * np.cos(a), 0.01 * np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi, 9000, endpoint=False))
+)
+SCENES = {
+    "every shape": every_shape(),
+    "hernia_ring": read_scene("hernia_ring"),
+    "empty": Scene(),
+    "large": Scene(Dish(), (SceneShape("large", "tissue", LARGE),)),
+}
+
+
+def sent(scene: Scene) -> SceneMessage:
+    """Return a scene as a node gets it."""
+    return deserialize_message(serialize_message(scene_message(stamp_of(7), scene)), SceneMessage)
+
+
+def recorded(scene: Scene) -> Any:
+    """Return a scene as a bag gives it."""
+    return typestore().deserialize_cdr(serialize_message(scene_message(stamp_of(7), scene)), SCENE.type_name)
+
+
+def written(scene: Scene) -> Any:
+    """Return a scene as a bag gives it that rosbags has written itself."""
+    store = typestore()
+
+    def make(type_name: str, **fields: Any) -> Any:
+        return store.types[type_name](**fields)
+
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=0, nanosec=7)
+    header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="dish")
+    data = store.serialize_cdr(messages.scene_message(scene, header, make), SCENE.type_name)
+    assert messages.scene_of(deserialize_message(bytes(data), SceneMessage)) == scene  # a node reads it too
+    return store.deserialize_cdr(data, SCENE.type_name)
+
+
+WAYS = pytest.mark.parametrize("way", [sent, recorded, written])
+
+
+@WAYS
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_goes_there_and_back(way: Callable[[Scene], Any], name: str):
+    again = messages.scene_of(way(SCENES[name]))
+    assert again == SCENES[name]
+    assert again.version == SCENES[name].version
+
+
+def test_the_fields_are_plain_and_those_of_the_message():
+    fields = messages.scene_fields(every_shape())
+    assert ["header", *fields] == list(SceneMessage.get_fields_and_field_types())
+    assert fields["shapes"][0] == {
+        "name": "post",
+        "kind": "instrument",
+        "disc": [{"x": 0.0077, "y": 0.0039, "radius": 0.0015}],
+        "polygon": [],
+    }
+    block = fields["shapes"][5]
+    assert (block["name"], block["disc"], len(block["polygon"][0]["holes"])) == ("block", [], 1)
+
+
+def harm_a_corner(message: Any) -> None:
+    message.shapes[1].polygon[0].outline.corners[3].x += 1e-12
+
+
+def harm_a_radius(message: Any) -> None:
+    message.shapes[0].disc[0].radius = np.nextafter(message.shapes[0].disc[0].radius, 1.0)
+
+
+def swap_two(message: Any) -> None:
+    message.shapes[0], message.shapes[1] = message.shapes[1], message.shapes[0]
+
+
+def of_one(of: str, value: Any) -> Callable[[Any], None]:
+    """Return what sets a field of a message's first disc or dish."""
+
+    def change(message: Any) -> None:
+        *path, name = of.split(".")
+        part = message
+        for step in path:
+            part = part[int(step)] if step.isdigit() else getattr(part, step)
+        setattr(part, name, value)
+
+    return change
+
+
+DAMAGE: list[tuple[Callable[[Any], None], str]] = [
+    (harm_a_corner, "scene.version: got '"),
+    (harm_a_radius, "scene.version: got '"),
+    (swap_two, "scene.version: got '"),
+    (of_one("version", ""), "scene.version: got '', expected '"),
+    (of_one("version", "x" * 10_000), "scene.version: got 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx', expected '"),
+    (of_one("dish_diameter", 0.051), "scene.version: got '"),
+    (of_one("dish_diameter", 50.0), "scene.dish.diameter: got 50.0, expected a number from 0.005 to 0.5 m"),
+    (of_one("dish_diameter", float("nan")), "scene.dish.diameter: got nan, expected a number"),
+    (of_one("header.frame_id", "map"), "scene.header.frame_id: got 'map', expected 'dish'"),
+    (of_one("shapes.0.kind", "bone"), "scene.post.kind: got 'bone', expected one of tissue"),
+    (of_one("shapes.0.kind", "b" * 10_000), "scene.shapes[0].kind: got 10000, expected at most 64"),
+    (of_one("shapes.0.name", "p" * 10_000), "scene.shapes[0].name: got 10000, expected at most 64"),
+    (of_one("shapes.0.name", "a\nb"), r"scene.shape.name: got 'a\nb', expected 1 to 64 printable characters"),
+    (of_one("shapes.0.name", "ring"), "scene.ring: got 'a name given twice', expected a name of its own"),
+    (of_one("shapes.0.disc", []), "scene.shapes[0]: got 0 discs and 0 polygons, expected one disc or one polygon"),
+    (of_one("shapes.0.disc.0.radius", float("inf")), "scene.post.disc: got [0.0077, 0.0039, inf], expected finite"),
+    (of_one("shapes.0.disc.0.radius", 5e-7), "scene.post.disc.radius: got 5e-07, expected a number from 1e-06"),
+    (of_one("shapes.0.disc.0.x", 0.5), "scene.post: got 'a shape outside of the dish"),
+    (of_one("shapes.1.polygon.0.outline.corners", []), "scene.ring.polygon.outline: got '0 distinct points', expected"),
+    (of_one("shapes.1.polygon.0.outline.corners.0.x", float("nan")), "scene.ring.polygon.outline[0]: got (nan"),
+    (of_one("shapes.1.polygon.0.outline.corners.5.y", -0.01), "scene.ring.polygon.outline: got 'Self-inter"),
+]
+
+
+@WAYS
+@pytest.mark.parametrize(("harm", "words"), DAMAGE, ids=[words for _, words in DAMAGE])
+def test_a_damaged_message_is_refused_in_one_line(way: Callable[[Scene], Any], harm: Callable[[Any], None], words: str):
+    message = way(every_shape())
+    harm(message)
+    with pytest.raises(InvalidInputError) as caught:
+        messages.scene_of(message)
+    assert str(caught.value).startswith(words)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+@WAYS
+def test_more_than_a_scene_may_have_is_refused_before_anything_is_made_of_it(way: Callable[[Scene], Any]):
+    message = way(every_shape())
+    ring = message.shapes[1].polygon[0]
+    ring.holes = [ring.holes[0]] * 101
+    with pytest.raises(InvalidInputError, match=r"^scene\.shapes\[1\]\.polygon\.holes: got 101, expected at most 100$"):
+        messages.scene_of(message)
+    ring.holes = []
+    ring.outline.corners = [ring.outline.corners[0]] * 10_001
+    with pytest.raises(
+        InvalidInputError, match=r"^scene\.shapes\.polygon\.corners: got 10\d\d\d, expected at most 10000$"
+    ):
+        messages.scene_of(message)
+    message.shapes = [message.shapes[0]] * 201
+    with pytest.raises(InvalidInputError, match=r"^scene\.shapes: got 201, expected at most 200$"):
+        messages.scene_of(message)

@@ -1,0 +1,166 @@
+"""A scene: its version, its changes, its bounds."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, shape_from_mapping
+from test.scene.scenes import every_shape
+
+POST = SceneShape("post", "instrument", Disc((0.001, 0.002), 0.003))
+BLOCK = SceneShape(
+    "block", "tissue", Polygon(((0.0, 0.0), (0.01, 0.0), (0.0, 0.01)), (((1e-3, 1e-3), (2e-3, 1e-3), (1e-3, 2e-3)),))
+)
+SCENE = Scene(Dish(0.035, 0.003), (POST, BLOCK))
+
+
+def altered(shape: SceneShape, **changes: Any) -> Scene:
+    """Return the scene with something else of a shape."""
+    return Scene(SCENE.dish, tuple(dataclasses.replace(s, **changes) if s is shape else s for s in SCENE.shapes))
+
+
+def test_the_version_is_sixteen_digits_and_the_same_for_the_same_content():
+    again = Scene(Dish(0.035, 0.003), (dataclasses.replace(POST, definition={"disc": {}}), BLOCK))
+    assert again.version == SCENE.version
+    assert len(SCENE.version) == 16
+    assert int(SCENE.version, 16)
+
+
+def test_any_change_gives_another_version():
+    less = 0.002 - 1e-15
+    changed = [
+        SCENE,
+        Scene(Dish(0.035 + 1e-15, 0.003), SCENE.shapes),
+        Scene(Dish(0.035, 0.003 + 1e-15), SCENE.shapes),
+        Scene(SCENE.dish, (POST,)),
+        Scene(SCENE.dish, ()),
+        Scene(SCENE.dish, (BLOCK, POST)),
+        altered(POST, name="pos"),
+        altered(POST, kind="wall"),
+        altered(POST, geometry=Disc((0.001, less), 0.003)),
+        altered(POST, geometry=Disc((0.001, 0.002), 0.003 + 1e-15)),
+        altered(BLOCK, geometry=Polygon(BLOCK.geometry.outline)),  # type: ignore[union-attr]
+        altered(
+            BLOCK,
+            geometry=Polygon(((0.0, 0.0), (0.01, 0.0), (0.0, 0.01)), (((1e-3, 1e-3), (2e-3, 1e-3), (1e-3, less)),)),
+        ),
+    ]
+    versions = [scene.version for scene in changed]
+    assert len(set(versions)) == len(versions)
+
+
+def test_names_that_run_into_each_other_make_different_versions():
+    """Of a hash over the bare texts, `ab` + `c` would be `a` + `bc`."""
+    geometry = Disc((0.0, 0.0), 0.001)
+    one = Scene(Dish(), (SceneShape("atissue", "tissue", geometry),))
+    other = Scene(Dish(), (SceneShape("a", "tissue", geometry),))
+    assert one.version != other.version
+
+
+def test_shapes_are_added_at_the_end_replaced_in_their_place_and_removed():
+    extra = SceneShape("extra", "wall", Disc((0.0, 0.0), 0.001))
+    more = SCENE.add(extra)
+    assert more.names == ("post", "block", "extra")
+    assert more.obstacles == (POST.geometry, BLOCK.geometry, extra.geometry)
+    moved = more.replace(SceneShape("post", "wall", Disc((0.0, 0.0), 0.002)))
+    assert moved.names == more.names
+    assert moved.obstacles[0] == Disc((0.0, 0.0), 0.002)
+    assert more.remove("extra") == SCENE
+    assert SCENE.names == ("post", "block")
+    for change in (lambda: SCENE.remove("none"), lambda: SCENE.replace(extra), lambda: SCENE.remove("x" * 10_000)):
+        with pytest.raises(ConfigurationError, match=r"^shape\.name: got '[\w.]{1,80}', expected one of post, block$"):
+            change()
+    with pytest.raises(ConfigurationError, match=r"^post: got 'a name given twice'"):
+        SCENE.add(POST)
+    with pytest.raises(ConfigurationError, match="expected one of none: the scene has no shapes"):
+        Scene().remove("post")
+
+
+@pytest.mark.parametrize(
+    ("dish", "words"),
+    [
+        ((35.0, 0.003), "dish.diameter: got 35.0, expected a number from 0.005 to 0.5 m"),
+        ((float("nan"), 0.003), "dish.diameter: got nan"),
+        ((True, 0.003), "dish.diameter: got True"),
+        ((0.035, 3.0), "dish.depth: got 3.0, expected a number from 1e-05 to 0.1 m"),
+        ((10**400, 0.003), "dish.diameter: got 1000000"),
+    ],
+)
+def test_a_dish_out_of_bounds_is_refused(dish: tuple[float, float], words: str):
+    with pytest.raises(ConfigurationError) as caught:
+        Dish(*dish)
+    assert str(caught.value).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "words"),
+    [
+        (
+            Disc((0.02, 0.0), 0.002),
+            "it: got 'a shape outside of the dish, 0.018 m from its centre', expected a part of",
+        ),
+        (
+            Disc((0.01, 0.0), 0.03),
+            "it: got 'a shape that covers the whole dish', expected room in the dish; lengths in",
+        ),
+        (Polygon(((-0.1, -0.1), (0.1, -0.1), (0.0, 0.2))), "it: got 'a shape that covers the whole dish'"),
+        (Polygon(((0.1, 0.1), (0.2, 0.1), (0.1, 0.2))), "it: got 'a shape outside of the dish"),
+        (
+            Polygon(((0.0, 0.0), (2.0, 0.0), (0.0, 2.0))),
+            "it.polygon.outline: got 2.0, expected coordinates of at most 1",
+        ),
+        (Disc((0.0, 0.0, 0.0), 0.001), "it.disc: got [0.0, 0.0, 0.0, ...], expected finite x, y and radius"),
+        (Disc((0.0, float("nan")), 0.001), "it.disc: got [0.0, nan, 0.001], expected finite"),
+        (Disc((0.0, 1.5), 0.001), "it.disc.center: got [0.0, 1.5], expected two coordinates"),
+        (Disc((0.0, 0.0), -0.001), "it.disc.radius: got -0.001, expected a number from 1e-06 to 1 m"),
+    ],
+)
+def test_a_shape_that_cannot_be_in_the_dish_is_refused(geometry: Disc | Polygon, words: str):
+    with pytest.raises(ConfigurationError) as caught:
+        Scene(Dish(0.035), (SceneShape("it", "tissue", geometry),))
+    assert str(caught.value).startswith(words)
+
+
+def test_a_shape_may_lie_across_the_wall_and_a_ring_around_the_dish():
+    across = SceneShape("across", "wall", Disc((0.0175, 0.0), 0.002))
+    around = shape_from_mapping("around", {"annulus": {"center": [0, 0], "inner_radius": 0.015, "outer_radius": 0.03}})
+    assert Scene(Dish(0.035), (across, around)).names == ("across", "around")
+
+
+def test_too_many_shapes_and_too_many_vertices_are_refused():
+    def disc(index: int) -> SceneShape:
+        return SceneShape(f"disc {index}", "tissue", Disc((0.0, 0.0), 0.001))
+
+    assert len(Scene(Dish(), tuple(map(disc, range(200)))).shapes) == 200
+    with pytest.raises(ConfigurationError, match=r"^shapes: got '201 shapes', expected at most 200$"):
+        Scene(Dish(), tuple(map(disc, range(201))))
+    comb = [(1e-6 * x, 1e-3 * (x % 2)) for x in range(2001)]
+    polygon = Polygon(((0.0, -0.001), *comb, (0.002, -0.001)))
+    with pytest.raises(ConfigurationError, match=r"^shapes: got '10015 vertices', expected at most 10000 in all$"):
+        Scene(Dish(), tuple(SceneShape(f"comb {i}", "tissue", polygon) for i in range(5)))
+
+
+@pytest.mark.parametrize("name", ["", " a", "a\nb", "\x1b[31m", "x" * 65])
+def test_a_name_that_cannot_be_printed_is_refused(name: str):
+    with pytest.raises(ConfigurationError, match=r"^shape\.name: got .*, expected 1 to 64 printable characters$"):
+        SceneShape(name, "tissue", Disc((0.0, 0.0), 0.001))
+
+
+@pytest.mark.parametrize("name", ["hernia_ring", "dish_35mm", "dish_35mm_post", "dish_150mm"])
+def test_the_scenes_that_ship_can_be_read(name: str):
+    scene = read_scene(name)
+    assert scene.dish.diameter in (0.035, 0.05, 0.15)
+    assert scene.names == {"hernia_ring": ("ring", "left_tissue", "right_tissue"), "dish_35mm_post": ("post",)}.get(
+        name, ()
+    )
+
+
+def test_the_solid_of_every_shape_has_its_area():
+    for shape in every_shape().shapes:
+        exact = shape.geometry.area if isinstance(shape.geometry, Polygon) else 3.14159265 * shape.geometry.radius**2
+        assert shape.solid.area == pytest.approx(exact, rel=2e-4)

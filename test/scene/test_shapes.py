@@ -1,0 +1,232 @@
+"""Every shape of a scene file: its area, how far it reaches, and what it refuses."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from scipy.integrate import quad
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.scene import shape_from_mapping
+from magnetosuture_thread.scene.definitions import ARC_TOLERANCE
+
+HALF_PI = 0.5 * math.pi
+
+
+def polygon(**description: Any) -> Polygon:
+    """Return the polygon that a description stands for."""
+    geometry = shape_from_mapping("shape", description).geometry
+    assert isinstance(geometry, Polygon)
+    return geometry
+
+
+def solid(shape: Polygon) -> shapely.Polygon:
+    """Return a polygon as shapely has it."""
+    return shapely.Polygon(shape.outline, shape.holes)
+
+
+def bounds(shape: Polygon) -> list[float]:
+    """Return least x and y, greatest x and y [m]."""
+    return list(solid(shape).bounds)
+
+
+def test_a_disc_is_a_disc():
+    shape = shape_from_mapping("post", {"disc": {"center": [0.0077, 0.0039], "radius": 0.0015}, "kind": "instrument"})
+    assert shape.geometry == Disc((0.0077, 0.0039), 0.0015)
+    assert (shape.name, shape.kind) == ("post", "instrument")
+    assert shape.solid.area == pytest.approx(math.pi * 0.0015**2, rel=2e-4)
+
+
+@pytest.mark.parametrize(("inner", "outer"), [(0.0045, 0.006), (0.0001, 0.0002), (0.02, 0.05)])
+def test_an_annulus_is_within_a_tolerance_of_its_circles(inner: float, outer: float):
+    shape = polygon(annulus={"center": [0.001, 0.005], "inner_radius": inner, "outer_radius": outer})
+    assert bounds(shape) == pytest.approx([0.001 - outer, 0.005 - outer, 0.001 + outer, 0.005 + outer], abs=1e-12)
+    exact = math.pi * (outer**2 - inner**2)
+    assert abs(shape.area - exact) <= ARC_TOLERANCE * 2.0 * math.pi * (inner + outer)
+    for ring, radius in zip(shape.rings, (outer, inner), strict=True):
+        away = np.hypot(*(ring - [0.001, 0.005]).T)
+        np.testing.assert_allclose(away, radius, atol=1e-11)
+        middles = np.hypot(*(0.5 * (ring + np.roll(ring, -1, axis=0)) - [0.001, 0.005]).T)
+        assert radius - middles.min() <= ARC_TOLERANCE
+
+
+def sector_area(inner: float, outer: float, turn: float, inset: float) -> float:
+    """Return the exact area of a sector of an annulus less a strip along both straight sides [m^2]."""
+    return float(quad(lambda radius: radius * (turn - 2.0 * math.asin(inset / radius)), inner, outer)[0])
+
+
+@pytest.mark.parametrize("inset", [0.0, 0.0005, 0.00085])
+def test_an_annular_sector_leaves_a_strip_free(inset: float):
+    fields = {"center": [0.0, 0.005], "inner_radius": 0.0077, "outer_radius": 0.0111, "inset": inset}
+    shape = polygon(annular_sector={**fields, "start_angle": -HALF_PI, "end_angle": HALF_PI})
+    low, bottom, right, top = bounds(shape)
+    straight = math.sqrt(0.0111**2 - inset**2)
+    assert (low, right) == pytest.approx((inset, 0.0111), abs=ARC_TOLERANCE)
+    assert (bottom, top) == pytest.approx((0.005 - straight, 0.005 + straight), abs=1e-11)
+    exact = sector_area(0.0077, 0.0111, math.pi, inset)
+    assert abs(shape.area - exact) <= ARC_TOLERANCE * math.pi * (0.0077 + 0.0111)
+
+
+def test_a_corner_radius_takes_the_four_corners_off_a_sector():
+    """A right corner loses (1 - pi/4) r^2; those at arcs are right to some degrees."""
+    fields = {"center": [0.0, 0.0], "inner_radius": 0.01, "outer_radius": 0.02, "start_angle": 0.0, "end_angle": 2.0}
+    sharp, soft = polygon(annular_sector=fields), polygon(annular_sector=fields, corner_radius=0.001)
+    lost = sharp.area - soft.area
+    assert lost == pytest.approx(4.0 * (1.0 - 0.25 * math.pi) * 1e-6, rel=0.06)
+    assert solid(sharp).buffer(0.2 * ARC_TOLERANCE).contains(solid(soft))
+    assert soft.has_room_for(0.001)
+
+
+def test_the_sides_of_the_hernia_are_mirrored():
+    fields = {"center": [0.0, 0.005], "inner_radius": 0.0077, "outer_radius": 0.0111, "inset": 0.00085}
+    right = polygon(annular_sector={**fields, "start_angle": -HALF_PI, "end_angle": HALF_PI}, corner_radius=0.0012)
+    left = polygon(annular_sector={**fields, "start_angle": HALF_PI, "end_angle": 3 * HALF_PI}, corner_radius=0.0012)
+    mirrored = shapely.Polygon([(-x, y) for x, y in right.outline])
+    assert solid(left).symmetric_difference(mirrored).area < 1e-10  # 0.1 mm^2 would be a strip of 2 um all around
+    assert bounds(right)[0] == pytest.approx(0.00085, abs=ARC_TOLERANCE)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6, HALF_PI, -2.0])
+def test_a_capsule_reaches_a_radius_around_its_segment(angle: float):
+    length, radius = 0.006, 0.001
+    start, along = np.array([0.002, -0.001]), np.array([math.cos(angle), math.sin(angle)])
+    end = start + length * along
+    shape = polygon(capsule={"start": start.tolist(), "end": end.tolist(), "radius": radius})
+    exact = 2.0 * radius * length + math.pi * radius**2
+    assert abs(shape.area - exact) <= ARC_TOLERANCE * 2.0 * math.pi * radius
+    segment = shapely.LineString([start, end])
+    away = [segment.distance(shapely.Point(corner)) for corner in shape.outline]
+    np.testing.assert_allclose(away, radius, atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, -1.2])
+def test_a_rectangle_is_turned_about_its_centre(angle: float):
+    shape = polygon(rectangle={"center": [0.001, 0.002], "width": 0.004, "height": 0.002, "angle": angle})
+    assert shape.area == pytest.approx(8e-6, rel=1e-9)
+    c, s = abs(math.cos(angle)), abs(math.sin(angle))
+    half = 0.5 * np.array([0.004 * c + 0.002 * s, 0.004 * s + 0.002 * c])
+    assert bounds(shape) == pytest.approx([0.001 - half[0], 0.002 - half[1], 0.001 + half[0], 0.002 + half[1]])
+    soft = polygon(
+        rectangle={"center": [0.001, 0.002], "width": 0.004, "height": 0.002, "angle": angle}, corner_radius=0.0005
+    )
+    exact = 8e-6 - (4.0 - math.pi) * 0.0005**2
+    assert soft.area == pytest.approx(exact, abs=ARC_TOLERANCE * 2.0 * math.pi * 0.0005)
+
+
+def test_a_polygon_keeps_its_points_bit_for_bit_and_its_holes():
+    outline = [[0.0, 0.0], [0.01, 1e-5 / 3.0], [0.01, 0.01], [0.0, 0.01]]
+    hole = [[0.004, 0.004], [0.006, 0.004], [0.006, 0.006], [0.004, 0.006]]
+    shape = polygon(polygon={"outline": outline, "holes": [hole]})
+    assert shape.outline == tuple(map(tuple, outline))
+    assert shape.area == pytest.approx(1e-4 - 0.5 * 0.01 * 1e-5 / 3.0 - 4e-6, rel=1e-12)
+    soft = polygon(polygon={"outline": outline, "holes": [hole]}, corner_radius=0.0005)
+    lost = (4.0 - math.pi) * 0.0005**2  # of the outline's corners; those of the hole give as much back
+    assert soft.area == pytest.approx(shape.area, abs=0.1 * lost)
+    assert len(soft.outline) > 20
+
+
+RING = {"center": [0.0, 0.0], "inner_radius": 0.001, "outer_radius": 0.002}
+SECTOR = {**RING, "start_angle": 0.0, "end_angle": 1.0}
+SQUARE = [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01]]
+DISC = {"center": [0.0, 0.0], "radius": 0.001}
+
+BAD: list[tuple[Any, str]] = [
+    (None, "post: got None, expected a shape, one of disc, annulus"),
+    ([], "post: got [], expected a shape"),
+    ({}, "post: got 'no shape', expected kind, corner_radius and one of disc"),
+    ({"disk": DISC}, "post: got 'disk', expected kind, corner_radius and one of disc"),
+    ({"disc": DISC, "annulus": RING}, "post: got ['disc', 'annulus'], expected"),
+    ({"disc": DISC, "color": "red"}, "post: got 'color', expected"),
+    ({"disc": DISC, "kind": "bone"}, "post.kind: got 'bone', expected one of tissue, instrument, wall"),
+    ({"disc": DISC, "kind": ["wall"]}, "post.kind: got ['wall'], expected one of"),
+    ({"disc": 0.001}, "post.disc: got 0.001, expected fields by name"),
+    ({"disc": {"center": [0.0, 0.0]}}, "post.disc.radius: got None, expected a value"),
+    ({"disc": {**DISC, "angle": 1.0}}, "post.disc.angle: got 1.0, expected one of center, radius"),
+    ({"disc": {"center": [0.0, 0.0], "raduis": 0.1}}, "post.disc.radius: got None, expected a value; what is left"),
+    ({"disc": {**DISC, "radius": 1.5}}, "post.disc.radius: got 1.5, expected a number from 1e-06 to 1 m"),
+    ({"disc": {**DISC, "radius": "1.5 mm"}}, "post.disc.radius: got '1.5 mm', expected a number from 1e-06 to 1 m"),
+    ({"disc": {**DISC, "radius": math.nan}}, "post.disc.radius: got nan"),
+    ({"disc": {**DISC, "radius": math.inf}}, "post.disc.radius: got inf"),
+    ({"disc": {**DISC, "radius": True}}, "post.disc.radius: got True"),
+    ({"disc": {**DISC, "radius": 0.0}}, "post.disc.radius: got 0.0"),
+    ({"disc": {**DISC, "radius": 10**400}}, "post.disc.radius: got 1000000000"),
+    ({"disc": {**DISC, "radius": {}}}, "post.disc.radius: got {}"),
+    ({"disc": {**DISC, "center": [7.7, 3.9]}}, "post.disc.center: got [7.7, 3.9], expected two coordinates x, y of at"),
+    ({"disc": {**DISC, "center": [0.0]}}, "post.disc.center: got [0.0], expected two coordinates"),
+    ({"disc": {**DISC, "center": "00"}}, "post.disc.center: got '00', expected two coordinates"),
+    ({"disc": {**DISC, "center": [0.0, math.nan]}}, "post.disc.center: got [0.0, nan]"),
+    ({"disc": {**DISC, "center": [True, 0.0]}}, "post.disc.center: got [True, 0.0]"),
+    ({"disc": DISC, "corner_radius": 0.001}, "post.corner_radius: got 0.001, expected 0 m: a disc has no corners"),
+    ({"annulus": {**RING, "inner_radius": 0.002}}, "post.annulus.inner_radius: got 0.002, expected less than outer"),
+    ({"annular_sector": {**SECTOR, "end_angle": 0.0}}, "post.annular_sector.end_angle: got 0.0, expected more than"),
+    ({"annular_sector": {**SECTOR, "end_angle": 90.0}}, "post.annular_sector.end_angle: got 90.0, expected a number"),
+    ({"annular_sector": {**SECTOR, "end_angle": 6.5}}, "post.annular_sector.end_angle: got 6.5, expected more than"),
+    ({"annular_sector": {**SECTOR, "inset": 0.001}}, "post.annular_sector.inset: got 0.001, expected less than inner"),
+    ({"annular_sector": {**SECTOR, "inset": 0.0006}}, "post.annular_sector.inset: got 0.0006, expected less than half"),
+    ({"annular_sector": {**SECTOR, "inset": -0.1}}, "post.annular_sector.inset: got -0.1, expected a number from 0"),
+    ({"annular_sector": SECTOR, "corner_radius": 0.0006}, "post.corner_radius: got 0.0006, expected a radius with"),
+    (
+        {"capsule": {"start": [0, 0], "end": [0, 0], "radius": 0.001}},
+        "post.capsule.end: got [0.0, 0.0], expected anoth",
+    ),
+    ({"rectangle": {"center": [0, 0], "width": 0.01, "height": 0}}, "post.rectangle.height: got 0, expected a number"),
+    (
+        {"rectangle": {"center": [0, 0], "width": 0.01, "height": 0.002}, "corner_radius": 0.001},
+        "post.corner_radius: got 0.001, expected at most 0.49 of the shorter side, 0.00098 m",
+    ),
+    (
+        {"rectangle": {"center": [0, 0], "width": 0.01, "height": 0.002}, "corner_radius": 2.0},
+        "post.corner_radius: got",
+    ),
+    ({"polygon": {"outline": SQUARE[:2]}}, "post.polygon.outline: got [[0.0, 0.0], [0.01, 0.0]], expected at least 3"),
+    ({"polygon": {"outline": "square"}}, "post.polygon.outline: got 'square', expected at least 3 points"),
+    ({"polygon": {"outline": [[0, 0], [1, 1], [1, 0], [0, 1]]}}, "post.polygon.outline: got 'Self-intersection"),
+    ({"polygon": {"outline": [[0, 0], [0.1, 0.1], [0.2, 0.2]]}}, "post.polygon.outline: got 'zero area'"),
+    ({"polygon": {"outline": [[0, 0], [1e-8, 0], [0, 1e-8]]}}, "post.polygon.outline: got 1e-08, expected an extent"),
+    ({"polygon": {"outline": [*SQUARE, [0.0]]}}, "post.polygon.outline[4]: got [0.0], expected two coordinates"),
+    ({"polygon": {"outline": SQUARE, "holes": [SQUARE]}}, "post.polygon.holes[0]: got 'a hole"),
+    ({"polygon": {"outline": SQUARE, "holes": [[[0.1, 0.1], [0.2, 0.1], [0.1, 0.2]]]}}, "post.polygon.holes[0]: got"),
+    (
+        {"polygon": {"outline": SQUARE, "holes": [SQUARE] * 101}},
+        "post.polygon.holes: got '101 outlines', expected at m",
+    ),
+    ({"polygon": {"outline": SQUARE * 2501}}, "post.polygon.outline: got '10004 points', expected at most 10000"),
+    ({"polygon": {"outline": SQUARE}, "corner_radius": 0.006}, "post.corner_radius: got 0.006, expected a radius of"),
+]
+
+
+@pytest.mark.parametrize(("description", "words"), BAD, ids=lambda value: value if isinstance(value, str) else "")
+def test_a_bad_shape_is_refused_in_one_line_that_names_file_shape_and_field(description: Any, words: str):
+    with pytest.raises(ConfigurationError) as caught:
+        shape_from_mapping("post", description, "lab.yaml")
+    text = str(caught.value)
+    assert text.startswith(f"lab.yaml: {words}")
+    assert "\n" not in text
+    assert len(text) < 500
+
+
+@pytest.mark.parametrize("name", ["", "x" * 65, "a\nb", " post", 3, None, "\ud800"])
+def test_a_bad_name_is_refused(name: Any):
+    with pytest.raises(ConfigurationError, match=r"^lab\.yaml: shapes: got .*expected names of 1 to 64 printable"):
+        shape_from_mapping(name, {"disc": DISC}, "lab.yaml")
+
+
+def test_the_error_for_something_huge_is_short():
+    nested: list[Any] = []
+    for _ in range(300):
+        nested = [nested, nested]  # 2^300 lists, if anybody wrote them out
+    for description in ({"disc": nested}, {"disc": {"center": nested, "radius": 1}}, "x" * 10**6, {"y" * 10**6: 1}):
+        with pytest.raises(ConfigurationError) as caught:
+            shape_from_mapping("post", description, "lab.yaml")
+        assert len(str(caught.value)) < 500
+
+
+def test_numpys_numbers_and_tuples_are_taken_and_kept_as_plain_ones():
+    shape = shape_from_mapping("post", {"disc": {"center": (np.float64(0.001), 0.0), "radius": np.float64(0.002)}})
+    assert shape.definition == {"disc": {"center": [0.001, 0.0], "radius": 0.002}}
+    assert type(shape.definition["disc"]["radius"]) is float
