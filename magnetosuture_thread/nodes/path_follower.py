@@ -12,6 +12,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 
@@ -20,7 +21,7 @@ class PathFollowerNode(Node):
     """Asks for a velocity at every needle pose; without a pose it is silent, and the coil bridge stops."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("path_follower", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("path_follower", **node_options("path_follower", options))
         settings = declare(self, PathFollowerSettings)
         self._follower = settings.follower()
         self._audience = settings.audience

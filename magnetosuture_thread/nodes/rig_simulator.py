@@ -18,6 +18,7 @@ from std_msgs.msg import String
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.rig_currents import RigCurrents
 from magnetosuture_thread.nodes.rig_frames import FramePublisher
@@ -36,7 +37,7 @@ class RigSimulatorNode(Node):
     """Stands in for coils, dish and camera."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("rig_simulator", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("rig_simulator", **node_options("rig_simulator", options))
         self._settings = settings = declare(self, RigSettings)
         # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
         simulated = bool(self.get_parameter("use_sim_time").value)

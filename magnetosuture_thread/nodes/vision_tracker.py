@@ -16,6 +16,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -31,7 +32,7 @@ class VisionTrackerNode(Node):
     """Tracks the needle in every camera frame; when it is lost, no pose is published."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("vision_tracker", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("vision_tracker", **node_options("vision_tracker", options))
         settings = declare(self, VisionTrackerSettings)
         self.get_logger().info("loading the tracker's kernels; the first start on a machine compiles them")
         warm_up()
