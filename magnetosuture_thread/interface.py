@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
+SCENE_SERVER = "scene_server"  # besides, where the scene changes while the others run
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"
@@ -49,6 +50,8 @@ SEEN_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
 PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
 MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
 THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
+SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene")  # dish and shapes from now on
+SCENE_MARKERS = Channel("scene/markers", "visualization_msgs/msg/MarkerArray")
 OBSTACLE_MARKERS = Channel("thread/obstacles", "visualization_msgs/msg/MarkerArray")
 OBSTACLE_SET = Channel("thread/obstacle_set", "magnetosuture_msgs/msg/ObstacleSet")  # around the thread, from now on
 MATERIAL = Channel("thread/material", "magnetosuture_msgs/msg/ThreadMaterial")

@@ -15,6 +15,7 @@ from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.limits import approached
 from magnetosuture_thread.coils.needle import NeedleWatch, Pose
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
 
@@ -67,13 +68,13 @@ class Bridge:
         needle: where it is.
     """
 
-    def __init__(self, settings: CoilBridgeSettings, latch: ArmingLatch) -> None:
+    def __init__(self, settings: CoilBridgeSettings, latch: ArmingLatch, scene: Scene | None = None) -> None:
         self.latch = latch
         self.gate = CommandGate(settings.command_timeout, settings.max_speed)
         self.needle = NeedleWatch(settings.needle(), settings.pose_timeout, settings.reach)
         self._settings = settings
         self._coils = settings.allocation()
-        self._workspace = settings.workspace()
+        self._workspace = settings.workspace(scene or Scene())
         self._losses = 0
         self._before = self._coils.zero()
         self._velocity = np.zeros(2)

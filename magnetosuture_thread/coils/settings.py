@@ -16,8 +16,8 @@ from magnetosuture_thread.coils.workspace import Workspace
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import require_needle
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.shared_parameters import shared
 
 INSIDE = 0.9  # of the distance to the coils
 FEWEST = 4.0  # periods of the loop in a timeout; two of them are given away so that no current outlives it
@@ -72,7 +72,7 @@ class CoilBridgeSettings(Configuration):
         1000.0, "greatest change of a coil's current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
     )
 
-    dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
+    scene: str = shared("scene")
     keep_out: float = quantity(
         0.0005,
         "clearance that the needle's axis keeps of the wall and of obstacles; half of its width is within",
@@ -87,19 +87,6 @@ class CoilBridgeSettings(Configuration):
         minimum=0.1,
         maximum=1e3,
     )
-    disc_obstacles: tuple[float, ...] = quantity(
-        (), "x, y and radius of each round obstacle", unit="m", minimum=-0.5, maximum=0.5, multiple=3
-    )
-    polygon_obstacles: tuple[float, ...] = quantity(
-        (), "x and y of each corner of all polygons", unit="m", minimum=-0.5, maximum=0.5, multiple=2
-    )
-    polygon_sizes: tuple[int, ...] = quantity(
-        (),
-        "number of corners of each polygon; negative for a hole in the polygon before it",
-        minimum=-10000,
-        maximum=10000,
-    )
-
     calibration: str = quantity(
         "",
         "file of the coils' calibration, from the working directory; it replaces what the parameters say of the coils",
@@ -121,10 +108,8 @@ class CoilBridgeSettings(Configuration):
     aligning_field: float = quantity(
         0.008, "field along the needle that holds its direction", unit="T", minimum=1e-4, maximum=1.0
     )
-    needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
-    needle_curvature: float = quantity(
-        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
-    )
+    needle_length: float = shared("needle_length")
+    needle_curvature: float = shared("needle_curvature")
     needle_moment: float = quantity(
         8.8e-4, "magnetic moment of the needle, were it straight", unit="A m^2", minimum=1e-6, maximum=1.0
     )
@@ -157,9 +142,7 @@ class CoilBridgeSettings(Configuration):
     roboclaw_ports: tuple[str, ...] = quantity((), "serial port of each board, which has two coils in a row")
     roboclaw_addresses: tuple[int, ...] = quantity((), "address of each board, 128 if empty", minimum=128, maximum=135)
     roboclaw_baud_rate: int = quantity(115200, "of the serial lines; USB has none", minimum=2400, maximum=1000000)
-    roboclaw_timeout: float = quantity(
-        0.2, "without a packet for this long a board stops by itself; whole tenths", unit="s", minimum=0.1, maximum=1.0
-    )
+    driver_timeout: float = shared("driver_timeout")
     roboclaw_answer_timeout: float = quantity(
         0.03,
         "that a board has for an answer, of which it needs 1 or 2 ms over USB; it may miss one",
@@ -212,15 +195,10 @@ class CoilBridgeSettings(Configuration):
         coils = make_coils(model, self.coils_properties())
         return CoilAllocation(coils, self.needle(), self.aligning_field, self.max_current)
 
-    def obstacles(self) -> tuple[Disc | Polygon, ...]:
-        """Return all obstacles: the discs, then the polygons."""
-        discs = discs_from(self.disc_obstacles)
-        return (*discs, *polygons_from(self.GROUP, self.polygon_obstacles, self.polygon_sizes))
-
-    def workspace(self) -> Workspace:
+    def workspace(self, scene: Scene) -> Workspace:
         """Return what keeps the needle off the wall and off the obstacles."""
-        radius, needle = 0.5 * self.dish_diameter, self.needle()
-        return Workspace(radius, self.obstacles(), self.keep_out, self.approach_rate, needle, self.max_speed)
+        radius, needle = scene.dish.radius, self.needle()
+        return Workspace(radius, scene.obstacles, self.keep_out, self.approach_rate, needle, self.max_speed)
 
     def check(self) -> None:
         """Refuse too few coils, a coiled needle, obstacles that are none, and limits that cannot hold."""
@@ -233,15 +211,6 @@ class CoilBridgeSettings(Configuration):
             if count != known:
                 name = f"{self.GROUP}.calibration"
                 raise ConfigurationError(name, f"{count} coils in {self.calibration}", f"{known}, as in coil_angles")
-        for obstacle in self.obstacles():
-            if isinstance(obstacle, Disc) and obstacle.radius <= 0.0:
-                name = f"{self.GROUP}.disc_obstacles"
-                raise ConfigurationError(name, obstacle.radius, "as every third number a positive radius [m]")
-        if 0.5 * self.dish_diameter - self.keep_out < 0.5 * self.needle_length:
-            room = 0.5 * (self.dish_diameter - self.needle_length)
-            raise ConfigurationError(
-                f"{self.GROUP}.keep_out", self.keep_out, f"less than {room:g} m, room for the needle"
-            )
         if self.autostart == "armed" and self.driver == "roboclaw":
             name = f"{self.GROUP}.autostart"
             raise ConfigurationError(name, self.autostart, "active at most: hardware is armed by a person")

@@ -20,6 +20,7 @@ from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scheduling import take_priority
 from magnetosuture_thread.nodes.switches import Switches
+from magnetosuture_thread.scene import Scene, read_scene
 
 UNUSABLE = (InvalidInputError, ArithmeticError, ValueError)  # the last two where a check has been forgotten
 
@@ -45,7 +46,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def begin(self, settings: CoilBridgeSettings) -> None:
         """Open the driver; from now on it is told zero again and again."""
-        bridge = Bridge(settings, self.station.latch)
+        bridge = Bridge(settings, self.station.latch, read_scene(settings.scene) if settings.scene else Scene())
         driver = make_driver(settings, len(bridge.coils), self._report.to_rig, self._report.rigs)
         self.station.open(settings, bridge, driver)
         self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)

@@ -191,7 +191,7 @@ class Objective:
         settings = self.settings(x)
         passages = [self._replays.passages[index] for index in self.which]
         pairs = zip(self._replays.of([settings], self.which)[0], passages, strict=True)
-        return float(np.mean([mean_error(errors(v, p.targets, settings.length)) for v, p in pairs]))
+        return float(np.mean([mean_error(errors(v, p.targets, settings.thread_length)) for v, p in pairs]))
 
     def _solution(self, x: Array, cost: float, scale: float) -> Solution:
         return Solution(self.settings(x), self.parameters, x, self.residuals(x), self.jacobian(x), scale, cost)
