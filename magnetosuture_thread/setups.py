@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -54,6 +54,12 @@ class Setup:
     follower: PathFollowerSettings
     console: ConsoleSettings
 
+    def within(self, scene: Scene) -> Setup:
+        """Return the set-up with another scene than its file names, as a bag has its own."""
+        other = replace(self)
+        other.__dict__["scene"] = scene  # where the cached property looks first
+        return other
+
     @property
     def has_scene(self) -> bool:
         """Whether it names a scene."""
@@ -90,8 +96,12 @@ def _check_agreement(path: Path, settings: Mapping[str, Configuration]) -> None:
                     raise ConfigurationError(f"{group}.{name}", getattr(values, name), words, str(path))
 
 
-def read_setup(name: str) -> Setup:
+def read_setup(name: str, scene: Scene | None = None) -> Setup:
     """Read a set-up, given as a path or as the name of one that ships with the package.
+
+    Args:
+        name: of the set-up, or the path of its file.
+        scene: in place of the one that the file names.
 
     Raises:
         ConfigurationError: there is no such file, or it holds anything invalid.
@@ -100,7 +110,9 @@ def read_setup(name: str) -> Setup:
     settings = load_setup(path, CLASSES)
     _check_agreement(path, settings)
     setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))
-    if setup.has_scene:
+    if scene is not None:
+        setup = setup.within(scene)
+    if scene is not None or setup.has_scene:
         try:
             setup.follower.check_path(setup.scene)
         except ConfigurationError as error:

@@ -100,7 +100,8 @@ def predictions(given: Iterable[Sight], settings: ThreadModelSettings, scene: Sc
 
     Args:
         given: by time.
-        settings: of thread, liquid and obstacles.
+        settings: of thread and liquid.
+        scene: in which the thread is.
 
     Raises:
         ConfigurationError: an obstacle cannot be used.

@@ -119,7 +119,7 @@ class Objective:
         settings = [self.settings(x) for x in points]
         found = self._replays.of(settings, self.which)
         passages = [self._replays.passages[index] for index in self.which]
-        length = self.base.length
+        length = self.base.thread_length
         return [[self._distance(v, p, length) for v, p in zip(vertices, passages, strict=True)] for vertices in found]
 
     def fit(self, start: Array | None = None, scale: float = np.inf) -> Solution:

@@ -151,7 +151,7 @@ class _Search:
                 for index, (verdict, status) in enumerate(zip(verdicts, statuses, strict=True))
             ),
             attachment,
-            scores_of(courses, self.start.length, held_out),
+            scores_of(courses, self.start.thread_length, held_out),
             tuple(passage.simulated for passage in passages),
             self.replays.best.replays,
         )
