@@ -8,8 +8,9 @@ from typing import ClassVar
 
 import pytest
 
-from magnetosuture_thread.configuration import Configuration, described, from_mapping, load_setup, quantity, to_mapping
+from magnetosuture_thread.configuration import Configuration, described, from_mapping, quantity, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.parameter_files import load_setup
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,10 @@ def test_mapping_goes_there_and_back():
     ("text", "words"),
     [
         ("oven: [", "valid YAML"),
-        ("- oven", "sections oven"),
+        ("- oven", "sections by node"),
         ("oven: {temperature: 400.0}", "one key, ros__parameters"),
         ("oven: {ros__parameters: 3}", "parameters by name"),
-        ("ofen: {ros__parameters: {}}", "one of oven (did you mean oven?)"),
+        ("ofen: {ros__parameters: {}}", "one of /**, oven (did you mean oven?)"),
         ("oven: {ros__parameters: {temperature: 4.0}}", "oven.temperature: got 4.0"),
         ("oven: {ros__parameters: {1: 4.0}}", "oven.1: got 4.0"),
         ("oven: {ros__parameters: {temperature: 2026-13-45}}", "oven.temperature: got '2026-13-45'"),

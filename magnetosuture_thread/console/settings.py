@@ -9,6 +9,7 @@ from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.console.access import is_loopback
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.shared_parameters import shared
 
 FEWEST = 2.0  # commands within a hold timeout
 LEAST_TOKEN = 16  # characters of a token where others can reach the page
@@ -28,11 +29,9 @@ class ConsoleSettings(Configuration):
     image_transport: str = quantity(
         "compressed", "which of the camera's topics is shown", choices=("compressed", "raw")
     )
-    dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
-    needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
-    needle_curvature: float = quantity(
-        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
-    )
+    scene: str = shared("scene")
+    needle_length: float = shared("needle_length")
+    needle_curvature: float = shared("needle_curvature")
     frame_rate: float = quantity(30.0, "of what the page is told", unit="Hz", minimum=1.0, maximum=120.0)
     speed: float = quantity(
         0.003, "of the needle's tip at first, until the operator sets another", unit="m/s", minimum=1e-5, maximum=0.5

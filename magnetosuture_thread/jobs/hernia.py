@@ -67,10 +67,10 @@ def hernia(
         summary = run.summary(setup.name)
         figures = json.dumps(summary.to_json(), indent=2, allow_nan=False)
         (folder / "hernia.json").write_text(figures + "\n", encoding="utf-8")
-        draw_hernia(folder / "hernia.png", run, setup.vision.dish_diameter)
+        draw_hernia(folder / "hernia.png", run, setup.scene.dish.diameter)
         if animation:
             say("drawing the animation")
-            draw_animation(folder / "hernia.gif", run, setup.vision.dish_diameter)
+            draw_animation(folder / "hernia.gif", run, setup.scene.dish.diameter)
     return summary
 
 

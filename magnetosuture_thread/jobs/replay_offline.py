@@ -13,7 +13,7 @@ from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, TRACKER_STATE, Channel
-from magnetosuture_thread.jobs.judge import Given, opened, write_results
+from magnetosuture_thread.jobs.judge import Given, begin_with_scene, opened, write_results
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.offline import messages
@@ -87,9 +87,10 @@ def replay_offline(
             duration=given.duration,
             progress=progress,
         )
-        tally, refused = Tally(given.setup.model.length), Counter[str]()
+        tally, refused = Tally(given.setup.model.thread_length), Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
-            steps, made = predictions(seen, given.setup.model), _Output(bag, seen)
+            begin_with_scene(bag, given)
+            steps, made = predictions(seen, given.setup.model, given.setup.scene), _Output(bag, seen)
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)

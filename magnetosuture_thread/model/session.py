@@ -19,6 +19,7 @@ from magnetosuture_thread.model.predictor import FARTHEST, NeedlePose, Predictio
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.steering import Steered, at_rest, steered
 from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.scene import Scene
 
 EARLY = 30  # poses that may wait for the centreline of their frame
 REPLAYED = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
@@ -87,15 +88,15 @@ class ThreadSession:
         ConfigurationError: an obstacle cannot be used.
     """
 
-    def __init__(self, settings: ThreadModelSettings) -> None:
-        self.settings = settings
-        self._predictor = settings.predictor()
+    def __init__(self, settings: ThreadModelSettings, scene: Scene | None = None) -> None:
+        self.settings, self.scene = settings, scene
+        self._predictor = settings.predictor(scene)
         # Obstacles may come later, and no callback shall wait for the compiler of what they need.
         Surroundings(_OBSTACLES, settings.margin_range)
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=EARLY)
         self._last: int | None = None
-        self._needle, self._motion = settings.needle_filter(), settings.node_motion()
+        self._needle, self._motion = settings.needle_filter(scene), settings.node_motion()
         self._proven: tuple[Outcome, NeedlePose] | None = None
         self._needle.safe_velocity(np.zeros(2), np.array([1.0, 0.0]), np.zeros(2))  # compiled now
 
@@ -115,7 +116,11 @@ class ThreadSession:
         """
         if settings == self.settings:
             return lambda: None
-        predictor, needle, motion = settings.predictor(), settings.needle_filter(), settings.node_motion()
+        predictor, needle, motion = (
+            settings.predictor(self.scene),
+            settings.needle_filter(self.scene),
+            settings.node_motion(),
+        )
 
         def put_in_force() -> None:
             predictor.follow_on(self._predictor)

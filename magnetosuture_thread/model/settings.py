@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from magnetosuture_thread.configuration import described, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
-from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
+from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
@@ -20,6 +18,8 @@ from magnetosuture_thread.model.needle import NeedleFilter
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.steering_settings import SteeringSettings
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.shared_parameters import shared
 
 MEDIA = ("liquid", "air")
 OF_MEDIUM = {
@@ -50,7 +50,8 @@ class ThreadModelSettings(SteeringSettings):
     elastic_modulus: float = quantity(
         0.0, "effective modulus of the thread in bending; 0 takes the material's", unit="Pa", minimum=0.0, maximum=1e12
     )
-    length: float = quantity(0.019, "rest length of the thread", unit="m", minimum=0.001, maximum=2.0)
+    scene: str = shared("scene")
+    thread_length: float = shared("thread_length")
     segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
     attachment: str = quantity(
         Attachment.PINNED.value,
@@ -72,13 +73,7 @@ class ThreadModelSettings(SteeringSettings):
         "what the thread moves in: liquid drags it, in air its inertia and weight count; for rod",
         choices=MEDIA,
     )
-    viscosity: float = quantity(
-        1.0,
-        "dynamic viscosity of the liquid; glycerin at room temperature is about 1",
-        unit="Pa s",
-        minimum=1e-4,
-        maximum=1e2,
-    )
+    viscosity: float = shared("viscosity")
     wetted_fraction: float = quantity(
         0.5, "part of the thread's surface in the liquid; half for a floating thread", minimum=0.05, maximum=1.0
     )
@@ -135,38 +130,6 @@ class ThreadModelSettings(SteeringSettings):
         minimum=1e-4,
         maximum=0.1,
     )
-    disc_obstacles: tuple[float, ...] = quantity(
-        (),
-        "round obstacles in the dish frame: x, y, radius of each in turn",
-        unit="m",
-        minimum=-1.0,
-        maximum=1.0,
-        multiple=3,
-    )
-    polygon_obstacles: tuple[float, ...] = quantity(
-        (),
-        "corners of polygons in the dish frame: x, y of each in turn, one outline after the other",
-        unit="m",
-        minimum=-1.0,
-        maximum=1.0,
-        multiple=2,
-    )
-    polygon_sizes: tuple[int, ...] = quantity(
-        (),
-        "number of corners of each outline in polygon_obstacles; negative for a hole in the polygon before it",
-        minimum=-10000,
-        maximum=10000,
-    )
-    corner_radius: float = quantity(
-        2e-4, "sharp corners of polygons are rounded by this; 0 leaves them", unit="m", minimum=0.0, maximum=0.1
-    )
-    corner_angle: float = quantity(
-        math.pi / 6.0,
-        "a corner is sharp where the outline turns by more than this",
-        unit="rad",
-        minimum=0.05,
-        maximum=3.1,
-    )
     margin_range: float = quantity(
         5e-3,
         "margins are published of nodes and obstacles that are closer than this",
@@ -187,18 +150,9 @@ class ThreadModelSettings(SteeringSettings):
         A segment could lie across such an obstacle with both of its nodes outside.
         """
         self.check_steering(self.GROUP, self.margin_range)
-        least = 0.5 * self.length / self.segments
-        for disc in self._discs:
-            if disc.radius < least:
-                name, words = f"{self.GROUP}.disc_obstacles", "as every third number a radius of at least"
-                raise ConfigurationError(name, disc.radius, f"{words} {least:g} m, half of a segment")
-        for index, polygon in enumerate(self._polygons):
-            if not polygon.has_room_for(least):
-                name, words = f"{self.GROUP}.polygon_obstacles", "polygons with room for a disc of a radius of at least"
-                raise ConfigurationError(name, f"polygon {index}", f"{words} {least:g} m, half of a segment")
         diameter = self._material().diameter
-        if self.length / self.segments <= diameter:
-            most = math.ceil(self.length / diameter) - 1
+        if self.thread_length / self.segments <= diameter:
+            most = math.ceil(self.thread_length / diameter) - 1
             raise ConfigurationError(
                 f"{self.GROUP}.segments", self.segments, f"at most {most}, so that a segment is longer than thick"
             )
@@ -212,9 +166,9 @@ class ThreadModelSettings(SteeringSettings):
             raise ConfigurationError(
                 f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
             )
-        turn = abs(self.rest_curvature) * self.length / self.segments
+        turn = abs(self.rest_curvature) * self.thread_length / self.segments
         if turn > SHARPEST_TURN:
-            sharpest = SHARPEST_TURN * self.segments / self.length
+            sharpest = SHARPEST_TURN * self.segments / self.thread_length
             words = f"at most {sharpest:.0f} 1/m with {self.segments} segments, which turn by half a radian then"
             raise ConfigurationError(f"{self.GROUP}.rest_curvature", self.rest_curvature, words)
         for about in described(type(self)):
@@ -228,20 +182,6 @@ class ThreadModelSettings(SteeringSettings):
             if node > self.segments:
                 raise ConfigurationError(f"{self.GROUP}.held_nodes", node, f"nodes from 1 to {self.segments}")
 
-    def obstacles(self) -> tuple[Disc | Polygon, ...]:
-        """Return all obstacles: the discs, then the polygons, in the order in which margins number them."""
-        return (*self._discs, *self._polygons)
-
-    @cached_property
-    def _discs(self) -> tuple[Disc, ...]:
-        return discs_from(self.disc_obstacles)
-
-    @cached_property
-    def _polygons(self) -> tuple[Polygon, ...]:
-        return polygons_from(
-            self.GROUP, self.polygon_obstacles, self.polygon_sizes, self.corner_radius, self.corner_angle
-        )
-
     def _material(self) -> Material:
         material = MATERIALS[self.material]
         return replace(
@@ -254,7 +194,7 @@ class ThreadModelSettings(SteeringSettings):
         """Return the thread."""
         thread = Thread.of(
             self._material(),
-            length=self.length,
+            length=self.thread_length,
             segments=self.segments,
             attachment=Attachment(self.attachment),
             viscosity=self.viscosity,
@@ -275,13 +215,13 @@ class ThreadModelSettings(SteeringSettings):
         x, y = pose.heading
         return replace(pose, tail=pose.tail + np.array([along * x - left * y, along * y + left * x]))
 
-    def predictor(self) -> ThreadPredictor:
+    def predictor(self, scene: Scene | None = None) -> ThreadPredictor:
         """Return a predictor of this thread among these obstacles, its kernels compiled.
 
         Raises:
             ConfigurationError: an obstacle cannot be used; the message says why.
         """
-        thread, surroundings = self.thread(), Surroundings(self.obstacles(), self.margin_range)
+        thread, surroundings = self.thread(), Surroundings(scene.obstacles if scene else (), self.margin_range)
         tolerance = self.residual_tolerance
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
         paper = replace(PaperOptions.tuned(weight), damping=self.paper_damping)
@@ -292,7 +232,7 @@ class ThreadModelSettings(SteeringSettings):
         predictor.warm_up()
         return predictor
 
-    def needle_filter(self) -> NeedleFilter:
+    def needle_filter(self, scene: Scene | None = None) -> NeedleFilter:
         """Return the steered needle's own barriers; raises as `predictor` does."""
-        surroundings = Surroundings(self.obstacles(), self.margin_range)
+        surroundings = Surroundings(scene.obstacles if scene else (), self.margin_range)
         return self.filter_among(surroundings, make_solver(self.solver, self.residual_tolerance))

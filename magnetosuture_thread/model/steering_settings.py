@@ -38,7 +38,7 @@ class SteeringSettings(Configuration):
         maximum=10.0,
     )
     needle_length: float = quantity(
-        0.0,
+        0.007,
         "of the needle that an operator steers by its tip; 0: the needle is the point where the thread begins",
         unit="m",
         minimum=0.0,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,13 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import console_messages, messages, topics
 from magnetosuture_thread.nodes.console_inbox import Inbox, Latest
 from magnetosuture_thread.nodes.console_switches import ACTIONS, ConsoleSwitches
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.scene import Scene, read_scene
+from magnetosuture_thread.scene.messages import scene_of
 from magnetosuture_thread.vision.images import unpack_image
 
 SILENT = 3.0  # s, after which a node that says nothing of itself any more is silent
@@ -28,7 +32,7 @@ READERS = {
     "seen": (topics.SEEN_THREAD, console_messages.seen, SEEN_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, console_messages.predicted, 0.0),
     "margins": (topics.MARGINS, console_messages.margins, 0.0),
-    "obstacles": (topics.OBSTACLE_MARKERS, console_messages.obstacles, 0.0),
+    "obstacles": (topics.SCENE_MARKERS, console_messages.obstacles, 0.0),
     "filter": (topics.FILTER_STATE, console_messages.filter_state, 0.0),
     "bridge": (topics.BRIDGE_STATE, console_messages.bridge, 0.0),
 }
@@ -57,6 +61,7 @@ class ConsoleGraph:
     Attributes:
         node: as given.
         settings: in force.
+        scene: as it is known now.
         held: why nothing may be steered or switched on now; empty if it may.
     """
 
@@ -75,6 +80,7 @@ class ConsoleGraph:
             latest.close()
         self._camera.close()
         self._reports.close()
+        self._scenes.close()
         self._open(settings)
 
     def steer(self, velocity: tuple[float, float]) -> None:
@@ -98,6 +104,9 @@ class ConsoleGraph:
         for latest in self._latest.values():
             latest.look()
         settings = self.settings
+        for message, _ in self._scenes.read():
+            with suppress(InvalidInputError):
+                self.scene = scene_of(message)
         parts: dict[str, Any] = {
             name: latest.aged() if name in AGED else latest.value or ([] if name in ("seen", "obstacles") else None)
             for name, latest in self._latest.items()
@@ -106,7 +115,7 @@ class ConsoleGraph:
             parts["filter"] = {**AT_REST, "reason": self.held}
         return {
             "time": self.now().nanoseconds * 1e-9,
-            "dish_diameter": settings.dish_diameter,
+            "dish_diameter": self.scene.dish.diameter,
             "needle_length": settings.needle_length,
             "needle_curvature": settings.needle_curvature,
             **parts,
@@ -139,7 +148,9 @@ class ConsoleGraph:
 
     def _open(self, settings: ConsoleSettings) -> None:
         self.settings = settings
-        self._latest = {name: Latest(self.node, *reader) for name, reader in READERS.items()}
+        self.scene = read_scene(settings.scene) if settings.scene else Scene()
+        self._scenes: Inbox = Inbox(self.node, topics.SCENE, 1)
+        self._latest: dict[str, Latest] = {name: Latest(self.node, *reader) for name, reader in READERS.items()}
         self._reports = Inbox(self.node, topics.DIAGNOSTICS, REPORTS)
         self._said: dict[str, tuple[dict[str, Any], int]] = {}
         raw = settings.image_transport == "raw"

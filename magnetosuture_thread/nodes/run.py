@@ -16,6 +16,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.nodes.parameter_files import init
 
 N = TypeVar("N", bound=Node)
 
@@ -44,7 +45,7 @@ def run(
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, interrupt)
     try:
-        rclpy.init(args=list(arguments) if arguments is not None else None)
+        init(arguments)
     except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
         print(f"error: {_one_line(error)}", file=sys.stderr)
         return 1

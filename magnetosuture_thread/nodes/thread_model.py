@@ -19,20 +19,22 @@ from magnetosuture_thread.model.session import WAITING, Outcome, ThreadSession
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes import messages, thread_messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
 from magnetosuture_thread.nodes.thread_steering import ThreadSteering
+from magnetosuture_thread.scene import read_scene
 
 
 class ThreadModelNode(Node):
     """Predicts the thread at every needle pose."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("thread_model", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("thread_model", **node_options("thread_model", options))
         settings = declare(self, ThreadModelSettings, read_only=False, fixed=FIXED)
         self.get_logger().info("loading the model's kernels; the first start on a machine compiles them")
-        self._session = ThreadSession(settings)
+        self._session = ThreadSession(settings, read_scene(settings.scene) if settings.scene else None)
         self._health = Health(self)
         self._settings = ThreadSettings(self, self._session, self._health)
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
@@ -44,7 +46,7 @@ class ThreadModelNode(Node):
         self._health.warn("no needle pose yet")
         self.get_logger().info(
             f"ready: {settings.segments} segments of {settings.material}, "
-            f"{len(settings.obstacles())} obstacles, {settings.formulation} by {settings.solver}"
+            f"scene {settings.scene or 'unknown'}, {settings.formulation} by {settings.solver}"
         )
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:

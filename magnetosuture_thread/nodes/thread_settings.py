@@ -33,14 +33,7 @@ class ThreadSettings:
         self._node, self._session, self._health = node, session, health
         self._names = [about.name for about in described(ThreadModelSettings)]
         self._parameters = Changeable(node, session.settings, self._prepare)
-        self._obstacles = topics.OBSTACLE_MARKERS.publisher(node)
-        self._show_obstacles()
-        for topic, take in ((topics.OBSTACLE_SET, self.on_obstacles), (topics.MATERIAL, self.on_material)):
-            topic.subscribe(node, take, raw=True, unheard=health.refuse)
-
-    def on_obstacles(self, data: bytes) -> None:
-        """Take another set of obstacles."""
-        self._set(topics.OBSTACLE_SET, data, thread_messages.obstacle_values)
+        topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
 
     def on_material(self, data: bytes) -> None:
         """Take what is newly known of the thread and the liquid."""
@@ -61,14 +54,8 @@ class ThreadSettings:
         def change() -> None:
             before = self._session.settings
             put_in_force()
-            if settings.obstacles() != before.obstacles():
-                self._show_obstacles()
             changed = [name for name in self._names if getattr(settings, name) != getattr(before, name)]
             if changed:
                 self._node.get_logger().info(f"changed: {', '.join(changed)}")
 
         return change
-
-    def _show_obstacles(self) -> None:
-        now = self._node.get_clock().now().to_msg()
-        self._obstacles.publish(thread_messages.obstacle_markers(now, self._session.settings.obstacles()))

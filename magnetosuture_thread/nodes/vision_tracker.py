@@ -16,14 +16,18 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.images import decode_image, unpack_image
-from magnetosuture_thread.vision.look import no_pose
+from magnetosuture_thread.vision.look import State, no_pose
 from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.warm_up import warm_up
 
+NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
 
 
@@ -31,12 +35,15 @@ class VisionTrackerNode(Node):
     """Tracks the needle in every camera frame; when it is lost, no pose is published."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("vision_tracker", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("vision_tracker", **node_options("vision_tracker", options))
         settings = declare(self, VisionTrackerSettings)
         self.get_logger().info("loading the tracker's kernels; the first start on a machine compiles them")
         warm_up()
-        self._session = TrackerSession(settings)
+        scene = initial_scene(settings.scene)
+        self._settings = settings
+        self._session = TrackerSession(settings, scene) if scene is not None else None
         self._health = Health(self)
+        self._scene = SceneFollower(self, scene, self.on_scene, self._health)
         self._words = "nothing seen"
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -50,8 +57,15 @@ class VisionTrackerNode(Node):
         else:
             topics.IMAGE.subscribe(self, self.on_image)
         self.create_timer(0.5 * SILENCE, self.on_watch, clock=self._steady)
-        self._health.warn("no camera frame yet")
+        self._health.warn("no camera frame yet" if scene is not None else NO_SCENE)
         self.get_logger().info(f"ready: frames from {self.resolve_topic_name(CAMERA[settings.image_transport].name)}")
+
+    def on_scene(self, scene: Scene) -> None:
+        """Look for the needle in another scene."""
+        if self._session is None:
+            self._session = TrackerSession(self._settings, scene)
+        else:
+            self._session.set_scene(scene)
 
     def on_compressed(self, message: CompressedImage) -> None:
         """Take a JPEG or PNG frame."""
@@ -67,7 +81,7 @@ class VisionTrackerNode(Node):
     def on_watch(self) -> None:
         """Say so when no frame has come for too long."""
         waited = self._arrival() - self._last_frame
-        if self._session.frames and waited > SILENCE:
+        if self._session is not None and self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
             self._states.publish(messages.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
@@ -79,6 +93,10 @@ class VisionTrackerNode(Node):
     def _take(self, message: Image | CompressedImage, decode: Callable[[], Any]) -> None:
         self._last_frame = self._arrival()
         stamp, taken = message.header.stamp, 0.0
+        if self._session is None:
+            self._states.publish(messages.tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
+            self._health.warn(NO_SCENE)
+            return
         try:
             image = np.asarray(decode())
         except InvalidInputError as error:

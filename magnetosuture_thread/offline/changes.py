@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.configuration import from_mapping, to_mapping
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.interface import DISH_FRAME, MATERIAL, OBSTACLE_SET
+from magnetosuture_thread.interface import MATERIAL
 from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.settings import ThreadModelSettings
 
-CHANGING = (OBSTACLE_SET, MATERIAL)
+CHANGING = (MATERIAL,)
 
 
 def changed(settings: ThreadModelSettings, record: Record) -> ThreadModelSettings:
@@ -18,14 +17,7 @@ def changed(settings: ThreadModelSettings, record: Record) -> ThreadModelSetting
     Raises:
         BagError: it cannot be decoded.
         ConfigurationError: it cannot be used.
-        InvalidInputError: it is of another frame.
     """
     message = record.decode()
-    if record.topic == OBSTACLE_SET.recorded:
-        frame = message.header.frame_id
-        if frame != DISH_FRAME:
-            raise InvalidInputError(f"{OBSTACLE_SET.name}.header.frame_id", repr(frame), repr(DISH_FRAME))
-        values = changes.told_obstacles(message)
-    else:
-        values = changes.told_material(message)
+    values = changes.told_material(message)
     return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values})

@@ -19,6 +19,7 @@ from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.changes import changed
 from magnetosuture_thread.offline.sights import Sights
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.sight import Sight
 
@@ -90,7 +91,7 @@ class Step:
     settings: ThreadModelSettings
 
 
-def predictions(given: Iterable[Sight], settings: ThreadModelSettings) -> Iterator[Step]:
+def predictions(given: Iterable[Sight], settings: ThreadModelSettings, scene: Scene | None = None) -> Iterator[Step]:
     """Predict the thread over one run, as `thread_model` does.
 
     What the bag of `sights` says of obstacles and thread is taken as it comes. A pose before the thread is first seen
@@ -99,12 +100,13 @@ def predictions(given: Iterable[Sight], settings: ThreadModelSettings) -> Iterat
 
     Args:
         given: by time.
-        settings: of thread, liquid and obstacles.
+        settings: of thread and liquid.
+        scene: in which the thread is.
 
     Raises:
         ConfigurationError: an obstacle cannot be used.
     """
-    return _steps(given, ThreadSession(settings))
+    return _steps(given, ThreadSession(settings, scene))
 
 
 def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:

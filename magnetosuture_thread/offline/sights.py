@@ -64,13 +64,13 @@ class Sights(Iterator[Sight]):
         self.refused: Counter[str] = Counter()
         self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
         self.on_record: Callable[[int, Record], None] = lambda stamp, record: None
-        self._dish = setup.vision.dish_diameter
-        self._length = setup.model.length
+        self._dish = setup.scene.dish.diameter
+        self._length = setup.model.thread_length
         self._threads = self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
         if source == "camera":
             warm_up()
-            self._tracker = TrackerSession(setup.vision)
+            self._tracker = TrackerSession(setup.vision, setup.scene)
         self._recording = recording
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)

@@ -138,7 +138,7 @@ def passage_of(
         against,
         simulated,
     )
-    _check_motion(passage, settings.length)
+    _check_motion(passage, settings.thread_length)
     return passage
 
 
@@ -193,7 +193,7 @@ def _share_known(curve: Points) -> float:
 
 def at_nodes(curve: Points, settings: ThreadModelSettings) -> Points:
     """Return X(s_i) at s_i = i L / n for i = 1 ... n, shape (n, 2); not a number past the curve's end."""
-    at = settings.length * np.arange(1, settings.segments + 1) / settings.segments
+    at = settings.thread_length * np.arange(1, settings.segments + 1) / settings.segments
     if len(curve) < 2 or not np.isfinite(curve).all():
         return np.full((len(at), 2), np.nan)
     points = points_at(curve, at)

@@ -166,7 +166,7 @@ class Replays:
             for settings, vertices in zip(many, result, strict=True):
                 if settings not in self._errors:
                     pairs = zip(vertices, self.passages, strict=True)
-                    means = [mean_error(errors(v, passage.targets, settings.length)) for v, passage in pairs]
+                    means = [mean_error(errors(v, passage.targets, settings.thread_length)) for v, passage in pairs]
                     self._errors[settings] = float(np.mean(means))
                     self.best.offer(settings, self._errors[settings], vertices)
         self._told(len(missing))
