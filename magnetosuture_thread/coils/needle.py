@@ -15,7 +15,10 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
+Motion = tuple[float, float]
+"""Velocity of the tip along the chord and across it [m/s]."""
 
+REST: Motion = (0.0, 0.0)
 TOPIC = "needle/measured_cp"
 CONSISTENT = 5  # poses in a row that agree with each other, until poses are believed again
 SIGMAS = 3.0
@@ -91,9 +94,9 @@ class NeedleWatch:
         self._unknown = -math.inf  # poses stamped before this time are of no use
         self._carried: Pose | None = None
         self._until = -math.inf  # the time to which it has been carried
-        self._velocity = np.zeros(2)
+        self._motion = REST
         self._given = -math.inf  # monotonic time at which it was given to the coils
-        self._past: deque[tuple[float, Vector]] = deque()  # velocities, and since when
+        self._past: deque[tuple[float, Motion]] = deque()  # motions, and since when
 
     def see(
         self,
@@ -141,8 +144,8 @@ class NeedleWatch:
         if self._past:  # before the first that is remembered the needle was at rest
             self._until = max(self._until, min(self._past[0][0], now))
         times = [since for since, _ in self._past][1:]
-        for (_, velocity), end in zip(self._past, times, strict=False):
-            self._carry(velocity, end)
+        for (_, motion), end in zip(self._past, times, strict=False):
+            self._carry(motion, end)
 
     def lost(self, now: float, arrival: float) -> str:
         """Say why the pose is not to be used at a time of the stamps' clock and a monotonic time [s]; empty if it is.
@@ -160,7 +163,9 @@ class NeedleWatch:
         return "no needle pose since the loop stalled" if self._carried is None else ""
 
     def move(self, velocity: Vector, now: float, arrival: float) -> None:
-        """Say which tip velocity the coils give from a time on.
+        """Say which tip velocity the coils give from a time on, to a needle that is where it is believed to be.
+
+        The needle keeps it as seen from itself until the next is given: what pulls and turns it goes with it.
 
         Args:
             velocity: shape (2,) [m/s].
@@ -170,9 +175,11 @@ class NeedleWatch:
         self._note_gap(arrival)
         if self._past and now < self._past[-1][0]:
             self._past.clear()  # time was set back
-        self._carry(self._velocity, now)
-        self._velocity, self._given = velocity, arrival
-        self._past.append((now, velocity))
+        self._carry(self._motion, now)
+        self._motion, self._given = REST, arrival
+        if velocity.any() and self._carried is not None:
+            self._motion = self._needle.body_velocity(self._carried.heading, velocity)
+        self._past.append((now, self._motion))
         while len(self._past) > 1 and self._past[1][0] < now - self._timeout:
             self._past.popleft()
 
@@ -181,7 +188,7 @@ class NeedleWatch:
         self._note_gap(arrival)
         if self._carried is None or self.lost(now, arrival):
             return None
-        self._carry(self._velocity, now)
+        self._carry(self._motion, now)
         return self._carried
 
     def _judge(self, measured: _Measured) -> None:
@@ -236,19 +243,19 @@ class NeedleWatch:
 
     def _note_gap(self, arrival: float) -> None:
         """Forget the pose where the coils were given nothing for longer than they certainly hold their currents."""
-        if not self._velocity.any() or arrival - self._given <= self._holds:
+        if self._motion == REST or arrival - self._given <= self._holds:
             return
         self._unknown = self._past[-1][0] + self._stops if self._past else -math.inf
-        self._velocity = np.zeros(2)
+        self._motion = REST
         self._past.clear()
         if self._believed is not None and self._believed.stamp < self._unknown:
             self._carried = None
 
-    def _carry(self, velocity: Vector, now: float) -> None:
-        """Carry the pose on to a time, by a tip velocity of shape (2,) [m/s]."""
+    def _carry(self, motion: Motion, now: float) -> None:
+        """Carry the pose on to a time, by velocities along the chord and across it [m/s]."""
         ahead = now - self._until
         if self._carried is None or ahead <= 0.0:
             return
         self._until = now
-        if velocity.any():
-            self._carried = Pose(*self._needle.moved(self._carried.tail, self._carried.heading, velocity, ahead))
+        if motion != REST:
+            self._carried = Pose(*self._needle.moved(self._carried.tail, self._carried.heading, *motion, ahead))

@@ -50,19 +50,27 @@ class NeedleKinematics:
         """Return where the tip is, shape (2,) [m]."""
         return np.asarray(tail + self.chord * self.chord_direction(heading))
 
-    def moved(self, tail: Vector, heading: Vector, velocity: Vector, duration: float) -> tuple[Vector, Vector]:
+    def body_velocity(self, heading: Vector, velocity: Vector) -> tuple[float, float]:
+        """Return the components of a tip velocity along the chord and across it, to its left [m/s]."""
+        e = self.chord_direction(heading)
+        x, y = float(velocity[0]), float(velocity[1])
+        return float(e[0]) * x + float(e[1]) * y, float(e[0]) * y - float(e[1]) * x
+
+    def moved(
+        self, tail: Vector, heading: Vector, along: float, across: float, duration: float
+    ) -> tuple[Vector, Vector]:
         """Return tail and heading after a motion.
 
         Args:
             tail: shape (2,) [m].
             heading: unit vector at the tail, shape (2,).
-            velocity: of the tip as the motion begins, shape (2,) [m/s].
+            along: of the tip's velocity, the part along the chord [m/s].
+            across: the part across it, to its left [m/s].
             duration: of the motion [s].
         """
-        if self.length == 0.0:
-            return tail + duration * velocity, heading
         e = self.chord_direction(heading)
-        along, across = float(velocity @ e), float(e[0] * velocity[1] - e[1] * velocity[0])
+        if self.length == 0.0:
+            return tail + duration * np.array([along * e[0] - across * e[1], along * e[1] + across * e[0]]), heading
         lever = 0.5 * self.chord
         half = 0.5 * across / lever * duration
         reach = along * duration * (math.sin(half) / half if half else 1.0)
