@@ -13,7 +13,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = "magnetosuture_thread"
-NODES = ("vision_tracker", "thread_model")
+NODES = ("scene_server", "vision_tracker", "thread_model")
 RIG_NODES = ("rig_simulator", "path_follower")
 
 

@@ -1,0 +1,72 @@
+"""Follows the scene: at first that of a file, then whatever comes on the topic `scene`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rclpy.node import Node
+
+from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.thread_messages import decoded
+from magnetosuture_thread.scene import Scene, read_scene
+from magnetosuture_thread.scene.messages import scene_of
+
+MAX_MESSAGE_BYTES = 1 << 19  # of 10,000 vertices; what is larger is not even read
+
+
+class SceneFollower:
+    """The scene that a node goes by.
+
+    A message that is damaged, or whose scene the node cannot use, is reported to the node's health with the reason;
+    the scene before stays in force.
+
+    Args:
+        node: that subscribes.
+        health: of the node.
+        scene: the node's parameter: a path or the name of a scene that ships with the package; empty for none.
+        changed: called with a scene of the topic that is another than the one in force, before it is; raises a
+            `MagnetosutureError`, for example a `ConfigurationError`, where the node cannot use it.
+
+    Attributes:
+        scene: in force; None until one is known.
+
+    Raises:
+        ConfigurationError: the file of the parameter cannot be used.
+    """
+
+    def __init__(
+        self, node: Node, health: Health, scene: str, changed: Callable[[Scene], None] = lambda scene: None
+    ) -> None:
+        self.scene: Scene | None = read_scene(scene) if scene else None
+        self._health, self._changed = health, changed
+        topics.SCENE.subscribe(node, self.on_scene, raw=True, unheard=health.refuse)
+
+    @property
+    def version(self) -> str:
+        """Version of the scene in force; empty for none."""
+        return "" if self.scene is None else self.scene.version
+
+    def on_scene(self, data: bytes) -> None:
+        """Take a scene that was published."""
+        try:
+            scene = received_scene(data)
+            if scene.version == self.version:
+                return
+            self._changed(scene)
+        except MagnetosutureError as error:
+            self._health.refuse(error)
+            return
+        self.scene = scene
+
+
+def received_scene(data: bytes) -> Scene:
+    """Return the scene of a message's bytes.
+
+    Raises:
+        InvalidInputError: they are too many, cut off, or say no scene as it was sent.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise InvalidInputError(topics.SCENE.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}")
+    return scene_of(decoded(topics.SCENE, data))
