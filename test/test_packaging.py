@@ -31,6 +31,8 @@ def test_the_version_is_the_same_everywhere():
 def test_every_message_is_built():
     listed = set(re.findall(r'"msg/(\w+)\.msg"', (ROOT / "msg_defs" / "CMakeLists.txt").read_text()))
     assert listed == {path.stem for path in (ROOT / "msg_defs" / "msg").glob("*.msg")}
+    listed = set(re.findall(r'"srv/(\w+)\.srv"', (ROOT / "msg_defs" / "CMakeLists.txt").read_text()))
+    assert listed == {path.stem for path in (ROOT / "msg_defs" / "srv").glob("*.srv")}
 
 
 def test_every_message_package_that_the_nodes_import_is_declared():
@@ -43,7 +45,7 @@ def test_every_message_package_that_the_nodes_import_is_declared():
     assert used <= declared
 
 
-@pytest.mark.parametrize("name", ["vision_tracker", "thread_model", "coil_bridge", "console"])
+@pytest.mark.parametrize("name", ["scene_server", "vision_tracker", "thread_model", "coil_bridge", "console"])
 def test_every_node_is_an_executable_and_launched(name: str):
     assert f'{name} = "magnetosuture_thread.nodes.{name}:main"' in PYPROJECT
     launch = ast.parse((ROOT / "launch" / "magnetosuture.launch.py").read_text())

@@ -44,7 +44,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._watchdog: Timer | None = None
         self._report = CoilReport(self, self.station, self._steady)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
-        self._scene = SceneFollower(self, self._report.health, "", self.on_scene)
+        self._scene = SceneFollower(self, self._report.health, None, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
         topics.OPERATOR_COMMAND.subscribe_numbered(self, lambda message, number: self.on_command(OPERATOR, message, number))
         topics.NEEDLE_COMMAND.subscribe_numbered(self, lambda message, number: self.on_command(NEEDLE, message, number))

@@ -31,7 +31,7 @@ class PathFollowerNode(Node):
             settings.check_path(scene)
         self._blocked = ""  # why the path cannot be followed
         self._health = Health(self)
-        self._scene = SceneFollower(self, scene, self.on_scene, self._health)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         self._commands = topics.NEEDLE_COMMAND.publisher(self)
         self._setpoints = topics.TIP_SETPOINT.publisher(self)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)

@@ -60,7 +60,7 @@ class RigSimulatorNode(Node):
         self._late: deque[tuple[float, int, Frame]] = deque()
         self._publisher = FramePublisher(self, self.rig.camera, settings)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
-        self._scene = SceneFollower(self, scene, self.on_scene, self._health)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         if simulated:
             self._clocks = topics.CLOCK.publisher(self)
             self.create_timer(CLOCK_PERIOD / pace, self.on_clock, clock=self._steady)

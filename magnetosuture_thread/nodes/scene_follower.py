@@ -1,21 +1,23 @@
-"""Follows the scene: from a file at first, then from the topic `scene`."""
+"""Follows the scene: at first that of a file, then whatever comes on the topic `scene`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.node import Node
 
-from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.thread_messages import decoded
 from magnetosuture_thread.scene import Scene, read_scene
 from magnetosuture_thread.scene.messages import scene_of
 
+MAX_MESSAGE_BYTES = 1 << 19  # of 10,000 vertices; what is larger is not even read
+
 
 def initial_scene(name: str) -> Scene | None:
-    """Return the scene of a parameter `scene`; None where it is empty.
+    """Return the scene of a node's parameter `scene`; None where it is empty.
 
     Raises:
         ConfigurationError: there is no such file, or it holds anything invalid.
@@ -24,31 +26,64 @@ def initial_scene(name: str) -> Scene | None:
 
 
 class SceneFollower:
-    """Keeps the scene that is in force for a node.
+    """The scene that a node goes by.
+
+    A message that is damaged, or whose scene the node cannot use, is reported to the node's health with the reason;
+    the scene before stays in force.
 
     Args:
-        node: that follows.
-        scene: at first; None if it is not known yet.
-        on_change: called with every other scene, before it is in force; raises a `MagnetosutureError` where it cannot
-            be used, and the one before stays.
-        health: where a message that is refused is reported.
+        node: that subscribes.
+        health: of the node.
+        scene: in force at first; None if it is not known yet.
+        changed: called with a scene of the topic that is another than the one in force, before it is; raises a
+            `MagnetosutureError`, for example a `ConfigurationError`, where the node cannot use it.
 
     Attributes:
-        scene: in force; None if none is known.
+        scene: in force; None until one is known.
     """
 
-    def __init__(self, node: Node, scene: Scene | None, on_change: Callable[[Scene], None], health: Health) -> None:
+    def __init__(
+        self, node: Node, health: Health, scene: Scene | None, changed: Callable[[Scene], None] = lambda scene: None
+    ) -> None:
         self.scene = scene
-        self._on_change, self._health = on_change, health
-        topics.SCENE.subscribe(node, self._take, unheard=health.refuse)
+        self._heard = False
+        self._health, self._changed = health, changed
+        topics.SCENE.subscribe(node, self.on_scene, raw=True, unheard=health.refuse)
 
-    def _take(self, message: Any) -> None:
+    @property
+    def version(self) -> str:
+        """Version of the scene in force; empty for none."""
+        return "" if self.scene is None else self.scene.version
+
+    def load(self, name: str) -> Scene | None:
+        """Return the scene for a node that is configured now: the topic's if one has come, else that of a parameter.
+
+        Raises:
+            ConfigurationError: there is no such file, or it holds anything invalid.
+        """
+        if not self._heard:
+            self.scene = initial_scene(name)
+        return self.scene
+
+    def on_scene(self, data: bytes) -> None:
+        """Take a scene that was published."""
         try:
-            if self.scene is not None and message.version == self.scene.version:
+            scene = received_scene(data)
+            if scene.version == self.version:
                 return
-            scene = scene_of(message)
-            self._on_change(scene)
+            self._changed(scene)
         except MagnetosutureError as error:
             self._health.refuse(error)
-        else:
-            self.scene = scene
+            return
+        self.scene, self._heard = scene, True
+
+
+def received_scene(data: bytes) -> Scene:
+    """Return the scene of a message's bytes.
+
+    Raises:
+        InvalidInputError: they are too many, cut off, or say no scene as it was sent.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise InvalidInputError(topics.SCENE.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}")
+    return scene_of(decoded(topics.SCENE, data))

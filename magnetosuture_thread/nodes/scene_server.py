@@ -1,52 +1,73 @@
-"""Publishes the scene of a file: a stand-in for the real server, which has services besides."""
+"""The scene server node: publishes the scene in force, and changes it by services."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
-from importlib import import_module
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any
 
+from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 from rclpy.node import Node
-from std_msgs.msg import Header
 
-from magnetosuture_thread.configuration import Configuration
-from magnetosuture_thread.interface import DISH_FRAME
+from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
-from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
-from magnetosuture_thread.scene import read_scene
-from magnetosuture_thread.scene.messages import scene_message
-from magnetosuture_thread.shared_parameters import shared
-
-
-@dataclass(frozen=True)
-class SceneServerSettings(Configuration):
-    """Which scene is published."""
-
-    GROUP: ClassVar[str] = "scene_server"
-
-    scene: str = shared("scene")
-
-
-def make(type_name: str, **fields: Any) -> Any:
-    """Return a message of a type."""
-    package, _, name = type_name.split("/")
-    return getattr(import_module(f"{package}.msg"), name)(**fields)
+from magnetosuture_thread.nodes.scene_messages import scene_markers, scene_message
+from magnetosuture_thread.scene import Scene, read_scene
+from magnetosuture_thread.scene.editing import SceneEditor
+from magnetosuture_thread.scene.settings import SceneServerSettings
 
 
 class SceneServerNode(Node):
-    """Publishes the scene once."""
+    """Publishes a scene whenever it changes; a change that is refused changes nothing, and its caller is told why."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("scene_server", **node_options("scene_server", options))
+        super().__init__(SCENE_SERVER, automatically_declare_parameters_from_overrides=True, **options)
         settings = declare(self, SceneServerSettings)
-        self._scenes, self._markers = topics.SCENE.publisher(self), topics.SCENE_MARKERS.publisher(self)
-        header = Header(frame_id=DISH_FRAME, stamp=self.get_clock().now().to_msg())
-        self._scenes.publish(scene_message(read_scene(settings.scene), header, make))
-        Health(self).ok("serving")
+        self._editor = SceneEditor(read_scene(settings.scene) if settings.scene else None)
+        self._health = Health(self)
+        self._scenes = topics.SCENE.publisher(self)
+        self._markers = topics.SCENE_MARKERS.publisher(self)
+        self._offer(LoadScene, LOAD_SCENE, lambda asked: self._editor.load(asked.file))
+        self._offer(EditShape, ADD_SHAPE, lambda asked: self._editor.add(asked.name, asked.shape))
+        self._offer(EditShape, REPLACE_SHAPE, lambda asked: self._editor.replace(asked.name, asked.shape))
+        self._offer(RemoveShape, REMOVE_SHAPE, lambda asked: self._editor.remove(asked.name))
+        if self._editor.scene is None:
+            self._health.warn(f"no scene yet: the parameter scene is empty, and nobody has called {LOAD_SCENE}")
+        else:
+            self._publish(self._editor.scene)
+
+    def _offer(self, service: Any, name: str, change: Callable[[Any], None]) -> None:
+        self.create_service(service, name, lambda asked, answer: self._change(answer, lambda: change(asked)))
+
+    def _change(self, answer: Any, change: Callable[[], None]) -> Any:
+        """Change the scene, and say what became of it."""
+        before = self._editor.scene
+        try:
+            change()
+        except MagnetosutureError as error:
+            answer.success, answer.message = False, str(error)
+            self._health.refuse(error)
+        else:
+            answer.success = True
+        after = self._editor.scene
+        if after is not None:
+            answer.version = after.version
+            if answer.success and (before is None or before.version != after.version):
+                self._publish(after)
+        return answer
+
+    def _publish(self, scene: Scene) -> None:
+        stamp = self.get_clock().now().to_msg()
+        self._scenes.publish(scene_message(stamp, scene))
+        self._markers.publish(scene_markers(stamp, scene))
+        count = len(scene.shapes)
+        text = f"scene {scene.version}: dish of {1e3 * scene.dish.diameter:g} mm, {count} shape{'s' * (count != 1)}"
+        self._health.ok(text, version=scene.version, shapes=", ".join(scene.names) or "none")
+        self.get_logger().info(text)
 
 
 def main(arguments: list[str] | None = None) -> int:

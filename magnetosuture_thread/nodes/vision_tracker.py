@@ -43,7 +43,7 @@ class VisionTrackerNode(Node):
         self._settings = settings
         self._session = TrackerSession(settings, scene) if scene is not None else None
         self._health = Health(self)
-        self._scene = SceneFollower(self, scene, self.on_scene, self._health)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         self._words = "nothing seen"
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)

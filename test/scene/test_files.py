@@ -127,8 +127,8 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: s
 
 
 def test_many_names_take_no_time_to_compare():
-    text = "\n".join(f"name{index}: 1" for index in range(60_000))
-    assert len(parse_yaml(text)) == 60_000
+    text = "\n".join(f"name{index}: 1" for index in range(20_000))
+    assert len(parse_yaml(text)) == 20_000
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path):

@@ -1,0 +1,138 @@
+"""A node that follows the scene: from its file, then from the topic, whatever comes on it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from magnetosuture_msgs.msg import Scene as SceneMessage
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.messages import stamp_of
+from magnetosuture_thread.nodes.scene_follower import MAX_MESSAGE_BYTES, SceneFollower, initial_scene, received_scene
+from magnetosuture_thread.nodes.scene_messages import scene_message
+from magnetosuture_thread.scene import Scene, read_scene, shape_from_mapping, write_scene
+from test.scene.scenes import every_shape
+
+POST, HERNIA = read_scene("dish_35mm_post"), read_scene("hernia_ring")
+
+
+class FollowerNode(Node):
+    """A node that only follows, and may refuse a scene."""
+
+    def __init__(self, file: str = "", **options: Any) -> None:
+        super().__init__("follower", **options)
+        self.health = Health(self)
+        self.changes: list[Scene] = []
+        self.refusal: ConfigurationError | None = None
+        self.follower = SceneFollower(self, self.health, initial_scene(file), self.take)
+
+    def take(self, scene: Scene) -> None:
+        """Take a scene, or refuse it."""
+        if self.refusal is not None:
+            raise self.refusal
+        self.changes.append(scene)
+
+
+@pytest.fixture
+def node(graph) -> FollowerNode:
+    """A node that has read the scene with a post."""
+    return graph.add(lambda **options: FollowerNode("dish_35mm_post", **options))
+
+
+def publish(graph: Any, scene: Scene) -> None:
+    """Publish a scene."""
+    graph.publish(topics.SCENE, scene_message(graph.now(), scene))
+
+
+def refused(graph: Any, reports: list[Any], words: str) -> None:
+    """Wait until the node's health has a refusal with these words."""
+    graph.wait(lambda: any(words in report.status[0].message for report in reports), f"the refusal: {words}")
+
+
+def test_without_a_file_there_is_no_scene_until_one_comes(graph):
+    node = graph.add(FollowerNode)
+    assert (node.follower.scene, node.follower.version) == (None, "")
+    publish(graph, HERNIA)
+    graph.wait(lambda: node.follower.version == HERNIA.version, "the scene")
+    assert node.changes == [node.follower.scene] == [HERNIA]
+
+
+def test_the_scene_of_the_file_is_in_force_until_another_comes(graph, node):
+    assert node.follower.scene == POST
+    publish(graph, POST)  # the scene server has read the same file
+    publish(graph, HERNIA)
+    publish(graph, every_shape())
+    graph.wait(lambda: node.follower.version == every_shape().version, "the last scene")
+    assert node.changes == [HERNIA, every_shape()]
+
+
+def test_a_damaged_message_is_reported_and_the_scene_before_stays(graph, node):
+    reports = graph.listen(topics.DIAGNOSTICS)
+    message = scene_message(graph.now(), HERNIA)
+    message.shapes[0].polygon[0].outline.corners[7].y += 1e-9
+    graph.publish(topics.SCENE, message)
+    refused(graph, reports, "refused: scene.version: got ")
+    assert (node.follower.scene, node.changes) == (POST, [])
+    publish(graph, HERNIA)
+    graph.wait(lambda: node.follower.scene == HERNIA, "a good one")
+
+
+def test_a_scene_that_the_node_cannot_use_is_reported_and_the_one_before_stays(graph, node):
+    reports = graph.listen(topics.DIAGNOSTICS)
+    node.refusal = ConfigurationError("coil_bridge.keep_out", 0.02, "at most 0.01 m in this dish")
+    publish(graph, HERNIA)
+    refused(graph, reports, "refused: coil_bridge.keep_out: got 0.02, expected at most 0.01 m in this dish")
+    assert node.follower.scene == POST
+    node.refusal = None
+    publish(graph, HERNIA)  # again, as it is not in force
+    graph.wait(lambda: node.follower.scene == HERNIA, "the scene")
+
+
+def test_a_publisher_whose_messages_cannot_come_is_reported(graph, node):
+    reports = graph.listen(topics.DIAGNOSTICS)
+    graph.probe.create_publisher(SceneMessage, "scene", QoSProfile(depth=1))
+    refused(graph, reports, "publisher of scene: got another durability, expected transient_local")
+
+
+def test_a_file_that_cannot_be_read_is_refused_at_once(graph, tmp_path: Path):
+    (tmp_path / "bad.yaml").write_text("dish: {diameter: 35}")
+    with pytest.raises(ConfigurationError, match=r"bad\.yaml: dish\.diameter: got 35\.0"):
+        FollowerNode(str(tmp_path / "bad.yaml"), context=graph.context)
+    write_scene(every_shape(), tmp_path / "good.geojson")
+    node = graph.add(lambda **options: FollowerNode(str(tmp_path / "good.geojson"), **options))
+    assert node.follower.scene == every_shape()
+
+
+def test_bytes_that_are_no_scene_are_refused():
+    whole = serialize_message(scene_message(stamp_of(0), every_shape()))
+    assert received_scene(whole) == every_shape()
+    assert len(whole) < MAX_MESSAGE_BYTES
+    for length in (0, 4, 40, 100, len(whole) // 2, len(whole) - 9):
+        with pytest.raises(InvalidInputError, match=r"^scene"):
+            received_scene(whole[:length])
+    with pytest.raises(InvalidInputError, match=r"^scene: got 524289 bytes, expected at most 524288"):
+        received_scene(bytes(MAX_MESSAGE_BYTES + 1))
+    with pytest.raises(InvalidInputError, match=r"^scene\.version: got"):  # ROS replaces what is no UTF-8
+        received_scene(whole.replace(b"gripper", b"grip\xff\xfe\xfd"))
+
+
+def test_a_flipped_bit_is_refused_wherever_it_is():
+    """All but the stamp, the heights of corners and what fills gaps is under the hash."""
+    square = {"polygon": {"outline": [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01]]}}
+    scene = POST.add(shape_from_mapping("square", square))
+    whole = serialize_message(scene_message(stamp_of(0), scene))
+    for place in range(4, len(whole)):
+        harmed = bytearray(whole)
+        harmed[place] ^= 1 << (place % 8)
+        try:
+            received = received_scene(bytes(harmed))
+        except InvalidInputError:
+            continue
+        assert received == scene, f"byte {place}"

@@ -1,0 +1,192 @@
+"""The scene server on a graph: what it publishes, what its services change and refuse."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
+from visualization_msgs.msg import Marker
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.processes import graph_environment
+from magnetosuture_thread.nodes.scene_server import SceneServerNode
+from magnetosuture_thread.scene import read_scene, shape_from_mapping, write_scene
+from magnetosuture_thread.scene.editing import MAX_SHAPE_CHARS
+from magnetosuture_thread.scene.messages import scene_of
+from test.scene.scenes import every_shape
+
+SERVICES = {
+    "load": (LOAD_SCENE, LoadScene),
+    "add": (ADD_SHAPE, EditShape),
+    "replace": (REPLACE_SHAPE, EditShape),
+    "remove": (REMOVE_SHAPE, RemoveShape),
+}
+DISC = "{disc: {center: [0.001, 0.002], radius: 0.001}, kind: instrument}"
+WIDER = "{disc: {center: [0.001, 0.002], radius: 0.002}, kind: instrument}"
+POST = read_scene("dish_35mm_post")
+
+
+class Server:
+    """A scene server and who listens to it."""
+
+    def __init__(self, graph: Any, **parameters: Any) -> None:
+        self.graph = graph
+        self.node = graph.add(SceneServerNode, **parameters)
+        self.scenes = graph.listen(topics.SCENE)
+        self.markers = graph.listen(topics.SCENE_MARKERS)
+        self.reports = graph.listen(topics.DIAGNOSTICS)
+        self.clients = {name: graph.probe.create_client(kind, service) for name, (service, kind) in SERVICES.items()}
+
+    def ask(self, name: str, /, **fields: str) -> Any:
+        """Call a service and return its answer."""
+        client = self.clients[name]
+        self.graph.wait(client.service_is_ready, f"the service {name}")
+        answer = client.call_async(SERVICES[name][1].Request(**fields))
+        self.graph.wait(answer.done, f"the answer of {name}")
+        return answer.result()
+
+    def change(self, name: str, /, **fields: str) -> Any:
+        """Call a service that shall succeed, and return the scene that is then published."""
+        before = len(self.scenes)
+        answer = self.ask(name, **fields)
+        assert (answer.success, answer.message) == (True, "")
+        self.graph.wait(lambda: len(self.scenes) > before, "another scene")
+        scene = scene_of(self.scenes[-1])
+        assert answer.version == scene.version
+        return scene
+
+    def said(self, words: str) -> bool:
+        """Return whether it has said so of itself."""
+        return any(words in report.status[0].message for report in self.reports)
+
+
+def test_the_scene_of_the_parameter_is_latched(graph):
+    server = Server(graph, scene="dish_35mm_post")
+    graph.wait(lambda: bool(server.scenes and server.markers), "the scene, published before anybody listened")
+    assert scene_of(server.scenes[0]) == POST
+    assert server.scenes[0].header.frame_id == "dish"
+    assert server.scenes[0].header.stamp.sec > 0
+    graph.wait(lambda: server.said(f"scene {POST.version}: dish of 35 mm, 1 shape"), "its report")
+
+
+def test_shapes_are_added_replaced_and_removed_and_scenes_loaded(graph, tmp_path: Path):
+    server = Server(graph, scene="dish_35mm_post")
+    graph.wait(lambda: bool(server.scenes), "the scene")
+    shape, wider = ({"disc": {"center": [0.001, 0.002], "radius": r}, "kind": "instrument"} for r in (0.001, 0.002))
+    added = POST.add(shape_from_mapping("pin", shape))
+    assert server.change("add", name="pin", shape=DISC) == added
+    assert server.change("replace", name="pin", shape=WIDER) == added.replace(shape_from_mapping("pin", wider))
+    assert server.change("remove", name="post").names == ("pin",)
+    write_scene(every_shape(), tmp_path / "lab.geojson")
+    assert server.change("load", file=str(tmp_path / "lab.geojson")) == every_shape()
+    assert server.change("load", file="dish_35mm_post").version == POST.version
+    graph.wait(lambda: len(server.markers) == len(server.scenes) == 6, "as many markers as scenes")
+
+
+def test_markers_show_dish_shapes_and_names_in_place_of_those_before(graph):
+    server = Server(graph, scene="hernia_ring")
+    graph.wait(lambda: bool(server.markers), "the markers")
+    first, rim, *others = server.markers[0].markers
+    assert first.action == Marker.DELETEALL
+    assert (rim.ns, rim.type, len(rim.points)) == ("dish", Marker.LINE_STRIP, 181)
+    scene = read_scene("hernia_ring")
+    for shape, drawn, name in zip(scene.shapes, others[::2], others[1::2], strict=True):
+        assert (drawn.ns, drawn.type) == ("shapes", Marker.TRIANGLE_LIST)
+        corners = [(corner.x, corner.y) for corner in drawn.points]
+        triangles = list(zip(corners[::3], corners[1::3], corners[2::3], strict=True))
+        doubled = sum((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) for a, b, c in triangles)
+        assert 0.5 * doubled == pytest.approx(shape.solid.area, rel=1e-9)
+        assert (name.ns, name.type, name.text) == ("names", Marker.TEXT_VIEW_FACING, shape.name)
+        place = name.pose.position
+        assert shape.solid.covers(type(shape.solid.centroid)(place.x, place.y))
+    assert {drawn.header.frame_id for drawn in server.markers[0].markers} == {"dish"}
+    assert len({(drawn.ns, drawn.id) for drawn in server.markers[0].markers[1:]}) == 7
+
+
+def test_without_a_scene_only_loading_one_is_possible(graph):
+    server = Server(graph)
+    graph.wait(lambda: server.said("no scene yet"), "its report")
+    for name, fields in (("add", {"name": "a", "shape": DISC}), ("remove", {"name": "a"})):
+        answer = server.ask(name, **fields)
+        assert not answer.success
+        assert answer.message == (
+            "scene: got 'a change of a shape', expected a scene that is loaded first, of which the dish is known"
+        )
+        assert answer.version == ""
+    assert server.scenes == []
+    assert server.change("load", file="dish_35mm_post") == POST
+    graph.wait(lambda: server.said("dish of 35 mm, 1 shape"), "that all is well")
+
+
+HOSTILE: list[tuple[str, dict[str, str], str]] = [
+    ("load", {"file": ""}, "scene: got '', expected a YAML or GeoJSON file, or one of dish_150mm"),
+    ("load", {"file": "/dev/zero"}, "scene: got '/dev/zero', expected a YAML or GeoJSON file"),
+    ("load", {"file": "FIFO"}, "scene: got '"),
+    ("load", {"file": "x" * 100_000}, "file: got '100000 characters', expected at most 4096"),
+    ("load", {"file": "../../etc/passwd"}, "scene: got '../../etc/passwd', expected a YAML or GeoJSON file"),
+    ("add", {"name": "", "shape": DISC}, "shapes: got '', expected names of 1 to 64 printable characters"),
+    ("add", {"name": "x" * 65, "shape": DISC}, "name: got '65 characters', expected at most 64"),
+    ("add", {"name": "a\nb", "shape": DISC}, "shapes: got 'a\\nb', expected names of"),
+    ("add", {"name": "post", "shape": DISC}, "post: got 'a name given twice', expected a name of its own"),
+    ("add", {"name": "a", "shape": ""}, "a: got None, expected a shape, one of disc"),
+    (
+        "add",
+        {"name": "a", "shape": "{disc: {center: [1, 2], radius: 0.5}"},
+        "shape: got \"did not find expected ',' or",
+    ),
+    ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 1.5}}"}, "a.disc.radius: got 1.5, expected"),
+    ("add", {"name": "a", "shape": "{disc: {center: [1, 1], radius: 0.1}}"}, "a: got 'a shape outside of the dish"),
+    ("add", {"name": "a", "shape": "&a [*a]"}, "shape: got 'an anchor or alias"),
+    ("add", {"name": "a", "shape": "[" * 100_000}, "shape: got 'lists and mappings 21 deep"),
+    (
+        "add",
+        {"name": "a", "shape": "#" * (MAX_SHAPE_CHARS + 1)},
+        "shape: got '300001 characters', expected at most 300",
+    ),
+    ("replace", {"name": "none", "shape": DISC}, "shape.name: got 'none', expected one of post"),
+    ("remove", {"name": "none"}, "shape.name: got 'none', expected one of post"),
+    ("remove", {"name": "x" * 100_000}, "shape.name: got 'xxxxxxxx"),
+]
+
+
+def test_hostile_requests_are_answered_in_one_line_and_change_nothing(graph, tmp_path: Path):
+    server = Server(graph, scene="dish_35mm_post")
+    graph.wait(lambda: bool(server.scenes), "the scene")
+    os.mkfifo(tmp_path / "fifo.yaml")
+    for name, fields, words in HOSTILE:
+        given = {field: str(tmp_path / "fifo.yaml") if value == "FIFO" else value for field, value in fields.items()}
+        answer = server.ask(name, **given)
+        assert not answer.success
+        assert answer.message.startswith(words), answer.message
+        assert len(answer.message) < 600
+        assert "\n" not in answer.message
+        assert answer.version == POST.version
+    graph.wait(lambda: server.said("refused: shape.name: got 'xxx"), "the last refusal on /diagnostics")
+    assert server.change("remove", name="post").names == ()
+    assert len(server.scenes) == 2
+
+
+def test_a_change_that_changes_nothing_is_not_published_again(graph):
+    server = Server(graph, scene="dish_35mm_post")
+    graph.wait(lambda: bool(server.scenes), "the scene")
+    assert server.ask("load", file="dish_35mm_post").success
+    assert server.change("add", name="pin", shape=DISC).names == ("post", "pin")
+    assert len(server.scenes) == 2
+
+
+def test_a_scene_that_cannot_be_read_does_not_start_the_node(graph):
+    with pytest.raises(ConfigurationError, match="scene: got 'nowhere'"):
+        graph.add(SceneServerNode, scene="nowhere")
+    command = [sys.executable, "-m", "magnetosuture_thread.nodes.scene_server", "--ros-args", "-p", "scene:=nowhere"]
+    environment = graph_environment(graph.domain)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, check=False)
+    assert ended.returncode == 1
+    assert "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dish_150mm" in ended.stderr
+    assert ended.stderr.count("\n") == 1
