@@ -285,8 +285,7 @@ def test_what_a_shape_is_says_how_it_looks_where_nobody_says_otherwise():
     settings = RigSettings(needle_start=(0.003, 0.0, 0.0))
     tissue, post = (scene(Disc((0.0, 0.009), 0.002), kind=kind) for kind in ("tissue", "instrument"))
     u, v = settings.view(post).to_pixels(np.array([0.0002, 0.0087])).round().astype(int)
-    images = [
-        settings.camera(one).render(np.zeros(2), 0.0, np.array([[0.0, 0.0], [-0.01, 0.0]])) for one in (tissue, post)
-    ]
+    behind = np.array([[0.0, 0.0], [-0.01, 0.0]])
+    images = [settings.camera(one).render(np.zeros(2), 0.0, behind) for one in (tissue, post)]
     pink, pale = (image[v - 4 : v + 5, u - 4 : u + 5].reshape(-1, 3).mean(axis=0) for image in images)
     assert pink[2] / pink[1] > pale[2] / pale[1] + 0.05
