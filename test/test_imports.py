@@ -13,11 +13,14 @@ from magnetosuture_thread.interface import NODES, RIG_NODES
 HOUSE = Path(magnetosuture_thread.__file__).parent
 
 # What each room may import of the house, itself aside.
-BASE = {"errors", "configuration", "resources"}
+BASE = {"errors", "configuration", "resources", "shared_parameters", "parameter_files", "scene"}
 ALLOWED = {
     "errors": set(),
     "configuration": {"errors"},
     "resources": {"errors"},
+    "shared_parameters": {"configuration"},
+    "parameter_files": {"errors", "configuration", "shared_parameters"},
+    "scene": {"errors", "configuration", "resources", "geometry", "interface"},
     "interface": set(),
     "compiled": set(),
     "geometry": {"errors", "compiled"},
