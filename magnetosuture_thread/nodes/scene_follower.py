@@ -70,6 +70,7 @@ class SceneFollower:
         try:
             scene = received_scene(data)
             if scene.version == self.version:
+                self._heard = True
                 return
             self._changed(scene)
         except MagnetosutureError as error:
