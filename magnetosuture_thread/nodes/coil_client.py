@@ -13,13 +13,13 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.msg import CoilBridgeState
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_report import LOOP, SCHEDULING
+from magnetosuture_thread.nodes.executor import LeanExecutor
 
 TIMEOUT = 10.0  # s for the bridge to be found and to answer
 FOUND = 0.5  # s after we have heard the bridge, for it to have found us
@@ -52,7 +52,7 @@ class CoilClient:
         """Join the graph."""
         rclpy.init(context=self._context, args=[])
         self._node = rclpy.create_node("coil_client", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = LeanExecutor(context=self._context)
         self._executor.add_node(self._node)
         topics.BRIDGE_STATE.subscribe(self._node, self._take)
         topics.DIAGNOSTICS.subscribe(self._node, self._hear)

@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import rclpy
 import rclpy.time
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
@@ -19,6 +18,7 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, PAUSE_REPLAY
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.coil_messages import command_stamp
+from magnetosuture_thread.nodes.executor import LeanExecutor
 from magnetosuture_thread.nodes.replay_losses import Losses
 from magnetosuture_thread.nodes.replay_time import Timeline
 
@@ -98,7 +98,7 @@ class LiveReplay:
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain, args=[])
         self._node = rclpy.create_node("replay", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = LeanExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._node.create_service(SetBool, PAUSE_REPLAY, self._on_pause)
         self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)

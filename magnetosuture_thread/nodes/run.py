@@ -11,11 +11,12 @@ from typing import TypeVar
 
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.nodes.executor import LeanExecutor
 
 N = TypeVar("N", bound=Node)
 
@@ -48,12 +49,12 @@ def run(
     except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
         print(f"error: {_one_line(error)}", file=sys.stderr)
         return 1
-    node = None
+    node = executor = None
     try:
         node = make()
         made(node)
         # The multi-threaded executor loses messages in the wheels of Jazzy.
-        executor = SingleThreadedExecutor()
+        executor = LeanExecutor()
         executor.add_node(node)
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
@@ -75,6 +76,8 @@ def run(
         print(f"error: a parameter cannot be declared: {_one_line(error)}", file=sys.stderr)
         return 1
     finally:
+        if executor is not None:
+            executor.shutdown()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from magnetosuture_thread.nodes.executor import LeanExecutor
 from magnetosuture_thread.nodes.processes import is_empty, reserved_domain
 from magnetosuture_thread.nodes.topics import Topic
 
@@ -25,7 +25,7 @@ class Graph:
         self.domain = domain
         self.context = Context()
         rclpy.init(context=self.context, domain_id=self.domain, args=[])
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = LeanExecutor(context=self.context)
         self.nodes: list[Node] = []
         self.probe = rclpy.create_node("probe", context=self.context)
         self.nodes.append(self.probe)
