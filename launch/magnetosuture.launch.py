@@ -13,7 +13,6 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = "magnetosuture_thread"
-NODES = ("vision_tracker", "thread_model")
 RIG_NODES = ("rig_simulator", "path_follower")
 
 
@@ -31,13 +30,15 @@ def generate_launch_description() -> LaunchDescription:
         given = [*parameters, *more]
         return Node(package=PACKAGE, executable=name, name=name, parameters=given, output="screen", **options)
 
+    # Two nodes in one process: a name given here would be that of both.
+    perception = Node(package=PACKAGE, executable="perception", parameters=parameters, output="screen")
     return LaunchDescription(
         [
             DeclareLaunchArgument("setup", default_value="petri_35mm_polyamide", description="name of a set-up"),
             DeclareLaunchArgument("use_sim_time", default_value="false", description="take the time from /clock"),
             DeclareLaunchArgument("simulated", default_value="false", description="with a rig in software"),
             DeclareLaunchArgument("console", default_value="false", description="with the operator's page"),
-            *(node(name) for name in NODES),
+            perception,
             node("coil_bridge", condition=without),
             node("coil_bridge", {"driver": "simulated", "autostart": "armed"}, condition=with_rig),
             *(node(name, condition=with_rig) for name in RIG_NODES),

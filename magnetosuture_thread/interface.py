@@ -12,6 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
+# As they run here: tracker and model in one process, so that a prediction waits for no message; the bridge alone.
+PROCESSES = ("perception", "coil_bridge")
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"

@@ -28,8 +28,9 @@ ALLOWED = {
     "console": {*BASE, "geometry"},
     "rig": {*BASE, "compiled", "geometry"},
     "bags": {*BASE, "interface"},
+    "packing": {"interface", "geometry", "model"},
     "study": {"errors", "compiled", "geometry", "interface", "model"},
-    "nodes": {*BASE, "interface", "geometry", "model", "vision", "coils", "guidance", "rig", "console"},
+    "nodes": {*BASE, "interface", "packing", "geometry", "model", "vision", "coils", "guidance", "rig", "console"},
     "offline": {*BASE, "interface", "geometry", "model", "vision", "bags", "study", "setups"},
     "setups": {*BASE, "model", "vision", "coils", "guidance", "rig", "console"},
     "jobs": {
@@ -48,6 +49,7 @@ ALLOWED = {
             "nodes",
             "setups",
             "offline",
+            "packing",
         ),
     },
     "cli": {"errors", "setups", "jobs", "study"},

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING
 import yaml
 
 from magnetosuture_thread.bags.reader import Record
-from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, NEEDLE_COMMAND, NEEDLE_POSE, NODES, SEEN_THREAD, Channel
+from magnetosuture_thread.interface import (
+    CAMERA,
+    CAMERA_INFO,
+    NEEDLE_COMMAND,
+    NEEDLE_POSE,
+    NODES,
+    PROCESSES,
+    SEEN_THREAD,
+    Channel,
+)
 from magnetosuture_thread.jobs.judge import Given
 from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
 from magnetosuture_thread.offline.changes import CHANGING
@@ -49,6 +58,11 @@ class Playing:
     def nodes(self) -> tuple[str, ...]:
         """Return the nodes of the graph."""
         return NODES if self.given.source == "camera" else tuple(name for name in NODES if name != "vision_tracker")
+
+    @property
+    def processes(self) -> tuple[str, ...]:
+        """Return the programs that these nodes run as."""
+        return PROCESSES if self.given.source == "camera" else self.nodes
 
     @property
     def transport(self) -> str:

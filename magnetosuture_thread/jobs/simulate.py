@@ -15,7 +15,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.interface import CAMERA, NODES, OBSTACLE_MARKERS, TIP_SETPOINT
+from magnetosuture_thread.interface import CAMERA, NODES, OBSTACLE_MARKERS, PROCESSES, TIP_SETPOINT
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.loop import LoopCollector, LoopSummary
@@ -156,7 +156,7 @@ def _run(
         say(f"starting rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
         with (
             environment_of(environment),
-            NodeProcesses(("rig_simulator", *NODES), arguments, environment, folder / "logs") as nodes,
+            NodeProcesses(("rig_simulator", *PROCESSES), arguments, environment, folder / "logs") as nodes,
         ):
             running, interruption = False, Interruption()
             early: dict[str, bytes] = {}

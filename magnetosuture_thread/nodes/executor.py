@@ -104,6 +104,8 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def _collect(self) -> None:
         """Collect what there is to wait for, and hold it, so that nothing is destroyed that is waited for."""
+        if not self._context.ok():
+            raise ExternalShutdownException
         self._changed = False
         self._ready.clear()
         self._held.close()

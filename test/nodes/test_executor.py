@@ -174,5 +174,4 @@ def test_a_wait_ends_at_its_time_or_with_the_context(spun):
         spun.executor.spin_once(timeout_sec=kind)
     spun.node.create_timer(0.01, spun.context.try_shutdown)
     with pytest.raises(ExternalShutdownException):
-        while True:
-            spun.executor.spin_once()
+        spun.until(lambda: False)
