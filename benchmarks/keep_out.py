@@ -133,7 +133,9 @@ def random_settings(random: np.random.Generator) -> CoilBridgeSettings:
                 max_acceleration=float(10.0 ** random.uniform(-1.0, 2.0)),
                 max_current_slew=float(10.0 ** random.uniform(2.0, 5.0)),
                 max_current=float(random.uniform(2.0, 30.0)),
-                keep_out=float(max(0.5 * width, random.choice([random.uniform(5e-5, 3e-4), random.uniform(3e-4, 1e-3)]))),
+                keep_out=float(
+                    max(0.5 * width, random.choice([random.uniform(5e-5, 3e-4), random.uniform(3e-4, 1e-3)]))
+                ),
                 approach_rate=float(min(rate, 10.0 ** random.uniform(-0.5, 2.5))),
                 needle_length=length,
                 needle_width=width,
@@ -168,7 +170,9 @@ def random_scene(random: np.random.Generator) -> Scene:
         elif kind == 2:  # a star
             count = int(random.integers(3, 9))
             radii = [size, 0.35 * size] * count
-            corners = [(r * math.cos(math.pi * k / count), r * math.sin(math.pi * k / count)) for k, r in enumerate(radii)]
+            corners = [
+                (r * math.cos(math.pi * k / count), r * math.sin(math.pi * k / count)) for k, r in enumerate(radii)
+            ]
             add({"polygon": {"outline": _turned(corners, angle, centre)}})
         elif kind == 3:
             inner = float(random.uniform(0.3, 0.8)) * radius
@@ -181,7 +185,14 @@ def random_scene(random: np.random.Generator) -> Scene:
                 add({"polygon": {"outline": _turned(corners, angle, 0.3 * centre)}})
         elif kind == 5:  # a U
             gap, thick = float(random.uniform(1e-3, 4e-3)), 0.2 * size
-            corners = [(0.0, 0.0), (size, 0.0), (size, thick), (thick, thick), (thick, thick + gap), (size, thick + gap)]
+            corners = [
+                (0.0, 0.0),
+                (size, 0.0),
+                (size, thick),
+                (thick, thick),
+                (thick, thick + gap),
+                (size, thick + gap),
+            ]
             corners += [(size, 2.0 * thick + gap), (0.0, 2.0 * thick + gap)]
             add({"polygon": {"outline": _turned(corners, angle, 0.5 * centre)}})
         else:  # rough
@@ -262,8 +273,10 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
                     raise
         if now >= until:
             mode, until = int(random.integers(0, 6)), now + float(random.uniform(0.05, 1.0))
-            command = settings.max_speed * float(random.choice([1.0, 2.0, random.uniform()])) * np.array(
-                _unit(random.uniform(-math.pi, math.pi))
+            command = (
+                settings.max_speed
+                * float(random.choice([1.0, 2.0, random.uniform()]))
+                * np.array(_unit(random.uniform(-math.pi, math.pi)))
             )
         if mode in (1, 2, 3):
             command = _towards(needle, world, settings.max_speed, mode, random)
@@ -284,7 +297,10 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
         # The coils hold their currents; when nobody asks for any, they stop at some time from `holds` on.
         moving = gap
         if gap > holds:
-            moving = min(gap, float(random.choice([holds, settings.driver_timeout, random.uniform(holds, settings.driver_timeout)])))
+            moving = min(
+                gap,
+                float(random.choice([holds, settings.driver_timeout, random.uniform(holds, settings.driver_timeout)])),
+            )
         way = abs(velocity) * moving
         if way > 0.0:
             if clearance - way * _swing(needle) < keep:
@@ -320,16 +336,17 @@ def _start(random: np.random.Generator, settings: CoilBridgeSettings, world: Wor
     for _ in range(60):
         r, a = world.radius * math.sqrt(random.uniform()), random.uniform(-math.pi, math.pi)
         needle = Needle(
-            settings.needle_length, settings.needle_curvature, cmath.rect(r, a), float(random.uniform(-math.pi, math.pi))
+            settings.needle_length,
+            settings.needle_curvature,
+            cmath.rect(r, a),
+            float(random.uniform(-math.pi, math.pi)),
         )
         if world.clearance([needle.points()]) > 1.2 * settings.keep_out + 0.01 * settings.needle_length:
             return needle
     return None
 
 
-def _towards(
-    needle: Needle, world: World, speed: float, mode: int, random: np.random.Generator
-) -> np.ndarray:
+def _towards(needle: Needle, world: World, speed: float, mode: int, random: np.random.Generator) -> np.ndarray:
     """Return a tip velocity that takes the needle's nearest point towards what it is near to, or along it."""
     where, way = world.nearest(needle.points())
     if mode == 2:

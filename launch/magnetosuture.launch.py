@@ -17,7 +17,6 @@ from launch_ros.actions import Node
 
 PACKAGE = "magnetosuture_thread"
 DEFAULT_SETUP = "petri_35mm_polyamide"
-NODES = ("scene_server", "vision_tracker", "thread_model")
 RIG_NODES = ("rig_simulator", "path_follower")
 
 
@@ -58,11 +57,11 @@ def started(file: str) -> list[Node]:
     with_console = IfCondition(LaunchConfiguration("console"))
     with_rig, without = (condition(LaunchConfiguration("simulated")) for condition in (IfCondition, UnlessCondition))
 
-    def node(name: str, *more: dict[str, str], **options: object) -> Node:
+    def node(name: str, *more: dict[str, str], named: bool = True, **options: object) -> Node:
         return Node(
             package=PACKAGE,
             executable=name,
-            name=name,
+            name=name if named else None,
             namespace=LaunchConfiguration("namespace"),
             parameters=[file, {"use_sim_time": LaunchConfiguration("use_sim_time")}, *more],
             output="screen",
@@ -70,7 +69,9 @@ def started(file: str) -> list[Node]:
         )
 
     return [
-        *(node(name) for name in NODES),
+        node("scene_server"),
+        # Two nodes in one process: a name given here would be that of both.
+        node("perception", named=False),
         node("coil_bridge", condition=without),
         node("coil_bridge", {"driver": "simulated", "autostart": "armed"}, condition=with_rig),
         *(node(name, condition=with_rig) for name in RIG_NODES),

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
 SCENE_SERVER = "scene_server"  # besides, where the scene changes while the others run
+# As they run here: tracker and model in one process, so that a prediction waits for no message; the bridge alone.
+PROCESSES = ("perception", "coil_bridge")
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"

@@ -34,8 +34,12 @@ ALLOWED = {
     "console": {*BASE, "geometry", "scene", "shared_parameters"},
     "rig": {*BASE, "compiled", "geometry"},
     "bags": {*BASE, "interface"},
-    "study": {"errors", "compiled", "geometry", "interface", "model", "scene"},
-    "nodes": {*BASE, "interface", "geometry", "model", "vision", "coils", "guidance", "rig", "console", "scene"},
+    "packing": {"interface", "geometry", "model"},
+    "study": {"errors", "compiled", "geometry", "interface", "model", "safety", "scene"},
+    "nodes": {
+        *BASE,
+        *("interface", "packing", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
+    },
     "offline": {*BASE, "interface", "geometry", "model", "vision", "bags", "study", "setups"},
     "setups": {*BASE, "model", "vision", "coils", "guidance", "rig", "console"},
     "jobs": {
@@ -55,6 +59,7 @@ ALLOWED = {
             "nodes",
             "setups",
             "offline",
+            "packing",
         ),
     },
     "cli": {"errors", "setups", "jobs", "study"},

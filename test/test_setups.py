@@ -162,7 +162,9 @@ def test_a_setup_without_a_scene_says_so_once_it_is_needed(tmp_path: Path):
 def test_a_scene_that_is_none_is_refused_with_the_setup(tmp_path: Path):
     path = tmp_path / "odd.yaml"
     path.write_text("/**: {ros__parameters: {scene: hernia}}\n")
-    with pytest.raises(ConfigurationError, match=r"scene: got 'hernia', expected a YAML or GeoJSON file, or one of .*hernia_ring"):
+    with pytest.raises(
+        ConfigurationError, match=r"scene: got 'hernia', expected a YAML or GeoJSON file, or one of .*hernia_ring"
+    ):
         read_setup(str(path))
 
 

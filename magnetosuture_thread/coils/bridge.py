@@ -161,9 +161,7 @@ class Bridge:
         self._filter = None if scene is None else self._settings.safety_filter(scene)
         self.needle.radius = math.inf if scene is None else scene.dish.radius
 
-    def command(
-        self, source: str, velocity: Vector, stamp: float, number: int, now: float, arrival: float
-    ) -> None:
+    def command(self, source: str, velocity: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
         """Take a command of an input; see `CommandGate.accept`.
 
         Args:

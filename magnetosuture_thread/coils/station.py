@@ -30,7 +30,9 @@ class CoilStation:
 
     def __init__(self) -> None:
         self.latch = ArmingLatch()
-        Bridge(CoilBridgeSettings(), self.latch, Scene())  # loads its kernels: no step and no transition waits for a compiler
+        Bridge(
+            CoilBridgeSettings(), self.latch, Scene()
+        )  # loads its kernels: no step and no transition waits for a compiler
         self.bridge: Bridge | None = None
         self.driver: CoilDriver | None = None
         self.outcome: Outcome | None = None

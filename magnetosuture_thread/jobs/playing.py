@@ -17,6 +17,7 @@ from magnetosuture_thread.interface import (
     NEEDLE_COMMAND,
     NEEDLE_POSE,
     NODES,
+    PROCESSES,
     SCENE,
     SEEN_THREAD,
     Channel,
@@ -63,6 +64,11 @@ class Playing:
     def nodes(self) -> tuple[str, ...]:
         """Return the nodes of the graph."""
         return NODES if self.given.source == "camera" else tuple(name for name in NODES if name != "vision_tracker")
+
+    @property
+    def processes(self) -> tuple[str, ...]:
+        """Return the programs that these nodes run as."""
+        return PROCESSES if self.given.source == "camera" else self.nodes
 
     @property
     def transport(self) -> str:

@@ -152,7 +152,7 @@ class _Replay:
             self.say(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
             with (
                 environment_of(environment),
-                NodeProcesses(playing.nodes, playing.arguments(qos), environment, self.folder / "logs") as nodes,
+                NodeProcesses(playing.processes, playing.arguments(qos), environment, self.folder / "logs") as nodes,
             ):
                 outputs = BagWriter(self.folder / "bag", self.given.notes)
                 for topic in (topics.SCENE, *topics.OUTPUTS):

@@ -15,7 +15,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.interface import CAMERA, NODES, SCENE, SCENE_MARKERS, SCENE_SERVER, TIP_SETPOINT
+from magnetosuture_thread.interface import CAMERA, NODES, PROCESSES, SCENE, SCENE_MARKERS, SCENE_SERVER, TIP_SETPOINT
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.loop import LoopCollector, LoopSummary
@@ -157,7 +157,9 @@ def _run(
         say(f"starting {SCENE_SERVER}, rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
         with (
             environment_of(environment),
-            NodeProcesses((SCENE_SERVER, "rig_simulator", *NODES), arguments, environment, folder / "logs") as nodes,
+            NodeProcesses(
+                (SCENE_SERVER, "rig_simulator", *PROCESSES), arguments, environment, folder / "logs"
+            ) as nodes,
         ):
             running, interruption = False, Interruption()
             early: dict[str, bytes] = {}

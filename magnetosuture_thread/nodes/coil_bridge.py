@@ -46,7 +46,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
         self._scene = SceneFollower(self, self._report.health, None, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
-        topics.OPERATOR_COMMAND.subscribe_numbered(self, lambda message, number: self.on_command(OPERATOR, message, number))
+        topics.OPERATOR_COMMAND.subscribe_numbered(
+            self, lambda message, number: self.on_command(OPERATOR, message, number)
+        )
         topics.NEEDLE_COMMAND.subscribe_numbered(self, lambda message, number: self.on_command(NEEDLE, message, number))
         Switches(self, self.arm, self.stop, self.reset)
         self.start()

@@ -100,7 +100,9 @@ class CoilReport:
         self._health.note(
             **{key: round(value, 3) for key, value in zip(LOOP, station.rhythm.milliseconds, strict=True)}
         )
-        self._health.note(driver=station.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"})
+        self._health.note(
+            driver=station.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"}
+        )
         self._told = now
         self._log(latch.condition.value if outcome else "unconfigured", driver)
         if latch.latched:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
@@ -20,6 +21,7 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.packing.needle import packed_path, packed_pose
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.look import State, no_pose
@@ -29,6 +31,16 @@ from magnetosuture_thread.vision.warm_up import warm_up
 
 NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
+
+
+class Follower(Protocol):
+    """Who gets poses and seen threads directly, being in the same process."""
+
+    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
+        """Take what is published on the topic of needle poses."""
+
+    def on_seen(self, stamp: Time, centreline: np.ndarray) -> None:
+        """Take what is published on the topic of seen threads."""
 
 
 class VisionTrackerNode(Node):
@@ -50,7 +62,7 @@ class VisionTrackerNode(Node):
         self._last_frame = self._arrival()
         self._poses = topics.NEEDLE_POSE.publisher(self)
         self._states = topics.TRACKER_STATE.publisher(self)
-        self._path = messages.PathMaker()
+        self._followers: list[Follower] = []
         self._threads = topics.SEEN_THREAD.publisher(self)
         if settings.image_transport == "compressed":
             topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
@@ -66,6 +78,10 @@ class VisionTrackerNode(Node):
             self._session = TrackerSession(self._settings, scene)
         else:
             self._session.set_scene(scene)
+
+    def hand_to(self, follower: Follower) -> None:
+        """Hand every pose and seen thread to a follower as well, right after it is published."""
+        self._followers.append(follower)
 
     def on_compressed(self, message: CompressedImage) -> None:
         """Take a JPEG or PNG frame."""
@@ -107,10 +123,15 @@ class VisionTrackerNode(Node):
             taken = time.perf_counter() - began
         track = seen.track
         if seen.tracked:
-            # The pose first: the prediction waits for it, and a path of many poses takes some milliseconds.
-            self._poses.publish(messages.pose_message(stamp, track.tail, track.heading, track.covariance))
+            # The pose first: the prediction waits for it, and all else can wait.
+            when = stamp.sec, stamp.nanosec
+            self._poses.publish(packed_pose(when, track.tail, track.heading, track.covariance))
+            for follower in self._followers:
+                follower.on_tracked(stamp, track.tail, track.heading)
             if len(seen.centreline):
-                self._threads.publish(self._path.message(stamp, seen.centreline))
+                self._threads.publish(packed_path(when, seen.centreline))
+                for follower in self._followers:
+                    follower.on_seen(stamp, seen.centreline)
         self._states.publish(messages.tracker_state(stamp, track, 0.0 if seen.problem else taken))
         values = {"frames": self._session.frames, "tracked": self._session.tracked}
         if seen.problem is not None:

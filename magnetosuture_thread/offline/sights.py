@@ -12,7 +12,7 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.geometry.orientation import angle_of, heading_of, turned
+from magnetosuture_thread.geometry.orientation import as_told
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SEEN_THREAD, TRUE_THREAD, Channel
 from magnetosuture_thread.model.session import EARLY
@@ -194,9 +194,7 @@ class Sights(Iterator[Sight]):
             self.refused[kind] += 1
             return Sight(stamp, reason=seen.track.reason, processing=taken)
         self.found += 1
-        # A message says the heading as a quaternion, which costs the last bits.
-        z, w = turned(angle_of(seen.track.heading))
-        heading = heading_of(0.0, 0.0, z, w, NEEDLE_POSE.name)
+        heading = as_told(seen.track.heading, NEEDLE_POSE.name)
         return Sight(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
 
     def _check_place(self, topic: str, points: Points) -> None:

@@ -302,4 +302,3 @@ def _speed(velocity: Vector) -> float:
     if not (math.isfinite(x) and math.isfinite(y)):
         raise InvalidInputError("velocity", [x, y], "finite numbers [m/s]")
     return math.hypot(x, y)
-

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from magnetosuture_thread.coils.workspace import Workspace
 
 from magnetosuture_thread.coils.allocation import NeedleMechanics
 from magnetosuture_thread.coils.needle import NeedleWatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.workspace import Workspace
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon

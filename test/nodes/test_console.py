@@ -33,6 +33,7 @@ from magnetosuture_thread.nodes.console_host import GraphHost, joined
 from magnetosuture_thread.nodes.console_tap import ConsoleTap
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
+from test.nodes.margins import no_margins
 
 SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
@@ -155,7 +156,7 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     discs = thread_messages.obstacle_markers(stamp, [Disc((0.001, 0.002), 0.003)])
     pose = messages.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
     path = messages.PathMaker().message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
-    margins = thread_messages.invalid_margins(stamp, "no pose")
+    margins = no_margins(stamp, "no pose")
     tell(graph, topics.OBSTACLE_MARKERS, discs, lambda: console.state()["obstacles"], "the obstacles")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
     tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["seen"], "the seen thread")

@@ -22,6 +22,7 @@ from magnetosuture_msgs.msg import (
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.nodes import console_messages, messages, thread_messages
+from test.nodes.margins import no_margins
 
 STAMP = Time(sec=12)
 
@@ -92,7 +93,7 @@ def test_of_each_node_the_least_clearance_of_any_obstacle():
 
 
 def test_margins_that_are_not_valid_have_no_number():
-    told = plain(console_messages.margins(thread_messages.invalid_margins(STAMP, "no pose")))
+    told = plain(console_messages.margins(no_margins(STAMP, "no pose")))
     assert (told["valid"], told["reason"], told["clearance"], told["least"]) == (False, "no pose", [], {})
     assert told["friction"]["state"] == "unknown"
 
