@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import cmath
+import contextlib
 import dataclasses
 import json
 import math
@@ -154,10 +155,8 @@ def random_scene(random: np.random.Generator) -> Scene:
         return share * radius * math.sqrt(random.uniform()) * np.array(_unit(random.uniform(-math.pi, math.pi)))
 
     def add(description: dict[str, object]) -> None:
-        try:
+        with contextlib.suppress(ConfigurationError):
             shapes.append(shape_from_mapping(f"shape_{len(shapes)}", description))
-        except ConfigurationError:
-            pass
 
     for _ in range(int(random.integers(0, 5))):
         kind = int(random.integers(0, 7))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
@@ -46,10 +47,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
         self._scene = SceneFollower(self, self._report.health, None, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
-        topics.OPERATOR_COMMAND.subscribe_numbered(
-            self, lambda message, number: self.on_command(OPERATOR, message, number)
-        )
-        topics.NEEDLE_COMMAND.subscribe_numbered(self, lambda message, number: self.on_command(NEEDLE, message, number))
+        for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
+            topic.subscribe_numbered(self, partial(self.on_command, source))
         Switches(self, self.arm, self.stop, self.reset)
         self.start()
         if self.settings is not None and self.settings.autostart == "armed":
