@@ -9,6 +9,7 @@ from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.console.access import is_loopback
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.shared_parameters import shared
 
 FEWEST = 2.0  # commands within a hold timeout
 LEAST_TOKEN = 16  # characters of a token where others can reach the page
@@ -28,6 +29,7 @@ class ConsoleSettings(Configuration):
     image_transport: str = quantity(
         "compressed", "which of the camera's topics is shown", choices=("compressed", "raw")
     )
+    scene: str = shared("scene")
     dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
     needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
     needle_curvature: float = quantity(

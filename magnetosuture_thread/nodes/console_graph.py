@@ -16,6 +16,7 @@ from magnetosuture_thread.nodes import console_messages, messages, topics
 from magnetosuture_thread.nodes.console_inbox import Inbox, Latest
 from magnetosuture_thread.nodes.console_switches import ACTIONS, ConsoleSwitches
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.vision.images import unpack_image
 
 SILENT = 3.0  # s, after which a node that says nothing of itself any more is silent
@@ -28,7 +29,7 @@ READERS = {
     "seen": (topics.SEEN_THREAD, console_messages.seen, SEEN_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, console_messages.predicted, 0.0),
     "margins": (topics.MARGINS, console_messages.margins, 0.0),
-    "obstacles": (topics.OBSTACLE_MARKERS, console_messages.obstacles, 0.0),
+    "scene": (topics.SCENE, console_messages.scene, 0.0),
     "steering": (topics.STEERING_STATE, console_messages.steering, 0.0),
     "bridge": (topics.BRIDGE_STATE, console_messages.bridge, 0.0),
 }
@@ -49,6 +50,9 @@ class ConsoleGraph:
         node: as given.
         settings: in force.
         held: why nothing may be steered or switched on now; empty if it may.
+
+    Raises:
+        ConfigurationError: the settings' scene cannot be read.
     """
 
     def __init__(self, node: Node, settings: ConsoleSettings) -> None:
@@ -58,15 +62,20 @@ class ConsoleGraph:
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
-        self._open(settings)
+        self._open(settings, _file_scene(settings))
 
     def begin(self, settings: ConsoleSettings) -> None:
-        """Begin anew: forget all that was heard, for a graph whose nodes were started anew."""
+        """Begin anew: forget all that was heard, for a graph whose nodes were started anew.
+
+        Raises:
+            ConfigurationError: the settings' scene cannot be read; nothing has changed.
+        """
+        scene = _file_scene(settings)
         for latest in self._latest.values():
             latest.close()
         self._camera.close()
         self._reports.close()
-        self._open(settings)
+        self._open(settings, scene)
 
     def steer(self, velocity: tuple[float, float]) -> None:
         """Publish the operator's wish now; while the graph is held, nothing."""
@@ -90,17 +99,17 @@ class ConsoleGraph:
             latest.look()
         settings = self.settings
         parts: dict[str, Any] = {
-            name: latest.aged() if name in AGED else latest.value or ([] if name in ("seen", "obstacles") else None)
+            name: latest.aged() if name in AGED else latest.value or ([] if name == "seen" else None)
             for name, latest in self._latest.items()
         }
         if self.held:
             parts["steering"] = {**AT_REST, "reason": self.held}
         return {
             "time": self.now().nanoseconds * 1e-9,
-            "dish_diameter": settings.dish_diameter,
             "needle_length": settings.needle_length,
             "needle_curvature": settings.needle_curvature,
             **parts,
+            "scene": parts["scene"] or self._scene,
             "nodes": self.nodes(),
         }
 
@@ -128,8 +137,8 @@ class ConsoleGraph:
             clock.set_ros_time_override(Time.from_msg(told.clock, clock_type=clock.clock_type))
         return clock.now()
 
-    def _open(self, settings: ConsoleSettings) -> None:
-        self.settings = settings
+    def _open(self, settings: ConsoleSettings, scene: dict[str, Any] | None) -> None:
+        self.settings, self._scene = settings, scene
         self._latest = {name: Latest(self.node, *reader) for name, reader in READERS.items()}
         self._reports = Inbox(self.node, topics.DIAGNOSTICS, REPORTS)
         self._said: dict[str, tuple[dict[str, Any], int]] = {}
@@ -141,6 +150,11 @@ class ConsoleGraph:
         for name, (said, arrived) in sorted(self._said.items()):
             age = max(0.0, time.time() - arrived * 1e-9)
             yield name, {**said, "level": "silent" if age > SILENT else said["level"], "age": age}
+
+
+def _file_scene(settings: ConsoleSettings) -> dict[str, Any] | None:
+    """Return the scene to show until one is heard; None where the settings name none."""
+    return console_messages.shown_scene(read_scene(settings.scene)) if settings.scene else None
 
 
 def _compressed(message: CompressedImage) -> bytes:
