@@ -18,7 +18,7 @@ from magnetosuture_thread.nodes import topics
 VIEWERS = Path(__file__).parent.parent / "config" / "viewers"
 RVIZ = yaml.safe_load((VIEWERS / "magnetosuture.rviz").read_text())["Visualization Manager"]
 FOXGLOVE: dict[str, Any] = json.loads((VIEWERS / "foxglove.json").read_text())
-KNOWN = {topic.channel.recorded: topic for topic in (*topics.INPUTS, *topics.OUTPUTS)}
+KNOWN = {topic.channel.recorded: topic for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS)}
 
 SHOWN_BY = {
     "rviz_default_plugins/MarkerArray": "visualization_msgs/msg/MarkerArray",

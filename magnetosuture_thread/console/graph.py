@@ -4,18 +4,21 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
 
     {
       "time": float,                   # the graph's time [s]
-      "dish_diameter": float, "needle_length": float, "needle_curvature": float,   # of the console's settings
+      "needle_length": float, "needle_curvature": float,   # of the console's settings
+      "scene": {"version": str, "dish_diameter": m, "dish_depth": m,
+                "shapes": [{"name": str, "kind": "tissue|instrument|wall", "label": [x, y],   # where its name can stand
+                            "disc": [x, y, r]}   # or, in place of the disc,
+                           | {..., "outline": [[x, y], ...], "holes": [[[x, y], ...], ...]}]} | None,
       "needle": {"tail": [x, y], "heading": rad, "age": s} | None,
       "tracker": {"state": "tracked|lost|searching", "reason": str, "confidence": float,
                   "view": {"centre": [u, v], "scale": m_per_px, "rotation": rad} | None} | None,
       "seen": [[x, y], ...],           # the seen centreline, may be empty
       "predicted": {"vertices": [[x, y], ...], "residual": float, "step_time": float, "status": str, "age": s} | None,
       "margins": {"valid": bool, "reason": str,
-                  "clearance": [float | None, ...],   # of each node, least over obstacles; None: none near
+                  "clearance": [float | None, ...],   # of each node, least over wall and shapes; None: none near
                   "least": {"connectivity": m, "compression": m, "obstacle": m, ...},   # of the kinds present
                   "contact": [node, ...],
                   "friction": {"state": "unknown|free|pulled|resting", "nodes": [int], "slowdown": float}} | None,
-      "obstacles": [{"disc": [x, y, r]} | {"triangles": [[x, y], ...]}],
       "filter": {"source": "operator|needle|", "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy],
                  "slowdown": float, "active": [str], "overridden": str, "reason": str, "age": s} | None,
       "bridge": {"state": "unconfigured|inactive|active|fault", "armed": bool, "emergency_stopped": bool,

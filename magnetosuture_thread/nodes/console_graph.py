@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,11 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import console_messages, messages, topics
 from magnetosuture_thread.nodes.console_inbox import Inbox, Latest
 from magnetosuture_thread.nodes.console_switches import ACTIONS, ConsoleSwitches
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
-from magnetosuture_thread.scene import Scene, read_scene
-from magnetosuture_thread.scene.messages import scene_of
+from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.vision.images import unpack_image
 
 SILENT = 3.0  # s, after which a node that says nothing of itself any more is silent
@@ -32,7 +29,7 @@ READERS = {
     "seen": (topics.SEEN_THREAD, console_messages.seen, SEEN_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, console_messages.predicted, 0.0),
     "margins": (topics.MARGINS, console_messages.margins, 0.0),
-    "obstacles": (topics.SCENE_MARKERS, console_messages.obstacles, 0.0),
+    "scene": (topics.SCENE, console_messages.scene, 0.0),
     "filter": (topics.FILTER_STATE, console_messages.filter_state, 0.0),
     "bridge": (topics.BRIDGE_STATE, console_messages.bridge, 0.0),
 }
@@ -61,8 +58,10 @@ class ConsoleGraph:
     Attributes:
         node: as given.
         settings: in force.
-        scene: as it is known now.
         held: why nothing may be steered or switched on now; empty if it may.
+
+    Raises:
+        ConfigurationError: the settings' scene cannot be read.
     """
 
     def __init__(self, node: Node, settings: ConsoleSettings) -> None:
@@ -72,16 +71,20 @@ class ConsoleGraph:
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
-        self._open(settings)
+        self._open(settings, _file_scene(settings))
 
     def begin(self, settings: ConsoleSettings) -> None:
-        """Begin anew: forget all that was heard, for a graph whose nodes were started anew."""
+        """Begin anew: forget all that was heard, for a graph whose nodes were started anew.
+
+        Raises:
+            ConfigurationError: the settings' scene cannot be read; nothing has changed.
+        """
+        scene = _file_scene(settings)
         for latest in self._latest.values():
             latest.close()
         self._camera.close()
         self._reports.close()
-        self._scenes.close()
-        self._open(settings)
+        self._open(settings, scene)
 
     def steer(self, velocity: tuple[float, float]) -> None:
         """Publish the operator's wish now; while the graph is held, nothing."""
@@ -104,21 +107,18 @@ class ConsoleGraph:
         for latest in self._latest.values():
             latest.look()
         settings = self.settings
-        for message, _ in self._scenes.read():
-            with suppress(InvalidInputError):
-                self.scene = scene_of(message)
         parts: dict[str, Any] = {
-            name: latest.aged() if name in AGED else latest.value or ([] if name in ("seen", "obstacles") else None)
+            name: latest.aged() if name in AGED else latest.value or ([] if name == "seen" else None)
             for name, latest in self._latest.items()
         }
         if self.held:
             parts["filter"] = {**AT_REST, "reason": self.held}
         return {
             "time": self.now().nanoseconds * 1e-9,
-            "dish_diameter": self.scene.dish.diameter,
             "needle_length": settings.needle_length,
             "needle_curvature": settings.needle_curvature,
             **parts,
+            "scene": parts["scene"] or self._scene,
             "nodes": self.nodes(),
         }
 
@@ -146,11 +146,9 @@ class ConsoleGraph:
             clock.set_ros_time_override(Time.from_msg(told.clock, clock_type=clock.clock_type))
         return clock.now()
 
-    def _open(self, settings: ConsoleSettings) -> None:
-        self.settings = settings
-        self.scene = read_scene(settings.scene) if settings.scene else Scene()
-        self._scenes: Inbox = Inbox(self.node, topics.SCENE, 1)
-        self._latest: dict[str, Latest] = {name: Latest(self.node, *reader) for name, reader in READERS.items()}
+    def _open(self, settings: ConsoleSettings, scene: dict[str, Any] | None) -> None:
+        self.settings, self._scene = settings, scene
+        self._latest = {name: Latest(self.node, *reader) for name, reader in READERS.items()}
         self._reports = Inbox(self.node, topics.DIAGNOSTICS, REPORTS)
         self._said: dict[str, tuple[dict[str, Any], int]] = {}
         raw = settings.image_transport == "raw"
@@ -161,6 +159,11 @@ class ConsoleGraph:
         for name, (said, arrived) in sorted(self._said.items()):
             age = max(0.0, time.time() - arrived * 1e-9)
             yield name, {**said, "level": "silent" if age > SILENT else said["level"], "age": age}
+
+
+def _file_scene(settings: ConsoleSettings) -> dict[str, Any] | None:
+    """Return the scene to show until one is heard; None where the settings name none."""
+    return console_messages.shown_scene(read_scene(settings.scene)) if settings.scene else None
 
 
 def _compressed(message: CompressedImage) -> bytes:

@@ -15,11 +15,16 @@ from magnetosuture_msgs.msg import (
     SafetyMargins,
     TrackerState,
 )
+from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
-from visualization_msgs.msg import Marker, MarkerArray
 
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.orientation import angle_of
 from magnetosuture_thread.nodes.messages import needle_pose
+from magnetosuture_thread.scene import Scene, SceneShape
+from magnetosuture_thread.scene.messages import scene_of
+
+DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
 
 TRACKER = {
     TrackerState.STATE_SEARCHING: "searching",
@@ -44,6 +49,7 @@ KINDS = {
     BarrierMargin.KIND_OBSTACLE: "obstacle",
     BarrierMargin.KIND_ENHANCED_CONNECTIVITY: "enhanced_connectivity",
     BarrierMargin.KIND_STIFFNESS: "stiffness",
+    BarrierMargin.KIND_WALL: "wall",
 }
 LEVELS = {
     DiagnosticStatus.OK: "ok",
@@ -109,28 +115,44 @@ def margins(message: SafetyMargins) -> dict[str, Any]:
 
 
 def clearances(message: SafetyMargins) -> list[float | None]:
-    """Return each node's least clearance of any obstacle [m]; None where none is near."""
+    """Return each node's least clearance of the wall and any shape [m]; None where none is near."""
     nodes = np.asarray(message.node, dtype=np.intp)
     if not nodes.size:
         return []
     least = np.full(int(nodes.max()) + 1, np.inf)
-    near = np.asarray(message.kind, dtype=np.uint8) == BarrierMargin.KIND_OBSTACLE
+    near = np.isin(np.asarray(message.kind, dtype=np.uint8), (BarrierMargin.KIND_OBSTACLE, BarrierMargin.KIND_WALL))
     np.minimum.at(least, nodes[near], np.asarray(message.clearance)[near])
     return [value if value < np.inf else None for value in least.tolist()]
 
 
-def obstacles(message: MarkerArray) -> list[dict[str, Any]]:
-    """Return the obstacles that markers show: discs as x, y and radius [m], others as the corners of triangles."""
-    shown: list[dict[str, Any]] = []
-    for marker in message.markers:
-        if marker.action != Marker.ADD:
-            continue
-        if marker.type == Marker.CYLINDER:
-            place = marker.pose.position
-            shown.append({"disc": [place.x, place.y, 0.5 * marker.scale.x]})
-        elif marker.type == Marker.TRIANGLE_LIST:
-            shown.append({"triangles": [[corner.x, corner.y] for corner in marker.points]})
-    return shown
+def scene(message: SceneMessage) -> dict[str, Any]:
+    """Return the scene of a message as the page draws it.
+
+    Raises:
+        InvalidInputError: the message is damaged.
+    """
+    return shown_scene(scene_of(message))
+
+
+def shown_scene(known: Scene) -> dict[str, Any]:
+    """Return a scene as the page draws it: discs as x, y and radius, others as outline and holes [m]."""
+    return {
+        "version": known.version,
+        "dish_diameter": known.dish.diameter,
+        "dish_depth": known.dish.depth,
+        "shapes": [_shown_shape(shape, DRAWN_WITHIN * known.dish.diameter) for shape in known.shapes],
+    }
+
+
+def _shown_shape(shape: SceneShape, tolerance: float) -> dict[str, Any]:
+    shown: dict[str, Any] = {"name": shape.name, "kind": shape.kind, "label": list(shape.label_point)}
+    if isinstance(shape.geometry, Disc):
+        return {**shown, "disc": [*shape.geometry.centre, shape.geometry.radius]}
+    outline, *holes = [
+        [[round(x, 7), round(y, 7)] for x, y in ring]  # 30 times a second, for every page: no digit too many
+        for ring in shape.outlines(tolerance)
+    ]
+    return {**shown, "outline": outline, "holes": holes}
 
 
 def filter_state(message: FilterState) -> dict[str, Any]:

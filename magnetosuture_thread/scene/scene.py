@@ -111,6 +111,15 @@ class SceneShape:
         x, y = line.coords[0]
         return float(x), float(y)
 
+    def outlines(self, tolerance: float) -> list[list[tuple[float, float]]]:
+        """Return the outline, then the holes, with no more vertices than it takes to draw them.
+
+        Args:
+            tolerance: by which the boundary may be off [m].
+        """
+        drawn = self.solid.simplify(tolerance)
+        return [[(x, y) for x, y in ring.coords[:-1]] for ring in (drawn.exterior, *drawn.interiors)]
+
 
 @dataclass(frozen=True)
 class Scene:

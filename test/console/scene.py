@@ -69,9 +69,11 @@ def clearances(line: np.ndarray) -> list[float]:
     return np.minimum(from_ring, np.min(from_blocks, axis=0)).tolist()
 
 
-def triangles(block: list[tuple[float, float]]) -> list[list[float]]:
-    """Return a rectangle as the corners of two triangles."""
-    return [list(block[corner]) for corner in (0, 1, 2, 0, 2, 3)]
+def block(name: str, corners: list[tuple[float, float]]) -> dict[str, Any]:
+    """Return a block of tissue as the page gets it."""
+    label = np.mean(corners, axis=0).tolist()
+    outline = [list(corner) for corner in corners]
+    return {"name": name, "kind": "tissue", "label": label, "outline": outline, "holes": []}
 
 
 def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[str, Any]:
@@ -80,7 +82,6 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
     factor = 0.9**count if friction == "pulled" else 1.0
     return {
         "time": time.monotonic(),
-        "dish_diameter": 0.035,
         "needle_length": 0.007,
         "needle_curvature": 0.0,
         "needle": {"tail": line[0].tolist(), "heading": heading(), "age": 0.02},
@@ -106,7 +107,15 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "contact": [],
             "friction": {"state": friction, "nodes": list(range(13, 13 + count)), "slowdown": factor},
         },
-        "obstacles": [{"disc": [0.0, 0.0, RING]}, *({"triangles": triangles(block)} for block in BLOCKS)],
+        "scene": {
+            "version": "0123456789abcdef",
+            "dish_diameter": 0.035,
+            "dish_depth": 0.003,
+            "shapes": [
+                {"name": "ring", "kind": "instrument", "label": [0.0, 0.0], "disc": [0.0, 0.0, RING]},
+                *(block(name, corners) for name, corners in zip(("left", "right"), BLOCKS, strict=True)),
+            ],
+        },
         "filter": {
             "source": "operator",
             "commanded": [0.0, 0.0],

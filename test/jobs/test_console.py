@@ -238,7 +238,7 @@ async def steer_and_stop(page: Page, currents: Inbox, recordings: Path) -> None:
     assert not page.host["recording"]
     await page.until(lambda: not page.host["busy"] and page.graph["predicted"], "the other scenario")
     assert f"starting {OTHER}" in page.busy
-    assert len(page.graph["obstacles"]) == 1
+    assert len(page.graph["scene"]["shapes"]) == 1
     assert not page.graph["bridge"]["emergency_stopped"]
     await record_a_second(page)
 
@@ -256,7 +256,7 @@ def check(path: Path) -> Bag:
     assert bag.damage is None
     assert "steered by a person" in bag.notes["simulated"]
     assert "thread_model" in bag.notes["scenario"]
-    for name in ("/operator/servo_cv", "/needle/servo_cv", "/camera/image_raw/compressed", "/thread/obstacles"):
+    for name in ("/operator/servo_cv", "/needle/servo_cv", "/camera/image_raw/compressed"):
         assert bag.counts[name] > 0, name
     wishes = [record.decode().twist.linear.x for record in bag.records({"/operator/servo_cv"})]
     assert 0.005 in wishes

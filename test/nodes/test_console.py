@@ -18,12 +18,13 @@ from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents
 from rclpy.node import Node
 
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.nodes import (
     camera_messages,
     console_graph,
     console_switches,
     messages,
+    scene_messages,
     thread_messages,
     topics,
 )
@@ -33,6 +34,7 @@ from magnetosuture_thread.nodes.console_host import GraphHost, joined
 from magnetosuture_thread.nodes.console_tap import ConsoleTap
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
+from magnetosuture_thread.scene import read_scene
 from test.nodes.margins import no_margins
 
 SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
@@ -152,12 +154,12 @@ def test_a_held_graph_is_told_nothing_but_a_stop(graph, console):
 def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console):
     stamp = graph.now()
     assert console.state()["needle"] is None
-    assert console.state()["obstacles"] == []
-    discs = thread_messages.obstacle_markers(stamp, [Disc((0.001, 0.002), 0.003)])
+    assert console.state()["scene"] is None
+    scene = scene_messages.scene_message(stamp, read_scene("dish_35mm_post"))
     pose = messages.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
     path = messages.PathMaker().message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
     margins = no_margins(stamp, "no pose")
-    tell(graph, topics.OBSTACLE_MARKERS, discs, lambda: console.state()["obstacles"], "the obstacles")
+    tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
     tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["seen"], "the seen thread")
     tell(graph, topics.MARGINS, margins, lambda: console.state()["margins"], "the margins")
@@ -167,13 +169,25 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     assert 0.0 <= state["needle"]["age"] < 60.0
     assert state["seen"] == [[0.0, 0.0], [0.001, 0.0]]
     assert state["margins"]["reason"] == "no pose"
-    assert state["obstacles"] == [{"disc": [0.001, 0.002, 0.003]}]
-    assert state["dish_diameter"] == 0.035
-    console.begin(ConsoleSettings(dish_diameter=0.15))
+    assert state["scene"]["dish_diameter"] == 0.035
+    assert [shape["disc"] for shape in state["scene"]["shapes"]] == [[0.0077, 0.0039, 0.0015]]
+    console.begin(ConsoleSettings(scene="dish_150mm"))
     state = console.state()
-    assert state["dish_diameter"] == 0.15
     assert (state["needle"], state["seen"]) == (None, [])
-    graph.wait(lambda: len(console.state()["obstacles"]) == 1, "what is said once and for all")
+    graph.wait(lambda: len(console.state()["scene"]["shapes"]) == 1, "what is said once and for all")
+
+
+def test_until_a_scene_is_heard_that_of_the_settings_is_shown(graph, node):
+    console = ConsoleGraph(node, ConsoleSettings(scene="dish_150mm"))
+    assert console.state()["scene"]["dish_diameter"] == 0.15
+    damaged = scene_messages.scene_message(graph.now(), read_scene("hernia_ring"))
+    damaged.dish_depth *= 1.5
+    graph.publish(topics.SCENE, damaged)
+    good = scene_messages.scene_message(graph.now(), read_scene("dish_35mm_post"))
+    tell(graph, topics.SCENE, good, lambda: console.state()["scene"]["dish_diameter"] == 0.035, "the scene")
+    with pytest.raises(ConfigurationError, match="scene: got 'nowhere'"):
+        console.begin(ConsoleSettings(scene="nowhere"))
+    assert console.state()["scene"]["dish_diameter"] == 0.035
 
 
 def test_a_node_that_says_no_more_is_silent(graph, console, monkeypatch):
@@ -242,14 +256,14 @@ def test_a_rig_is_paused_where_there_is_one(graph, console):
 
 
 def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_then_on(graph, node):
-    graph.listen_later(topics.OBSTACLE_MARKERS)
-    graph.publish(topics.OBSTACLE_MARKERS, thread_messages.obstacle_markers(graph.now(), []))
+    graph.listen_later(topics.SCENE)
+    graph.publish(topics.SCENE, scene_messages.scene_message(graph.now(), read_scene("dish_35mm_post")))
     taken: list[tuple[str, int, bytes]] = []
-    tap = ConsoleTap(node, [topics.OBSTACLE_MARKERS, topics.CURRENTS], None, lambda *message: taken.append(message))
+    tap = ConsoleTap(node, [topics.SCENE, topics.CURRENTS], None, lambda *message: taken.append(message))
 
     def taken_both() -> bool:
         tap.look()
-        return {topic for topic, _, _ in taken} == {"/thread/obstacles", "/coils/currents"}
+        return {topic for topic, _, _ in taken} == {"/scene", "/coils/currents"}
 
     try:
         tell(graph, topics.CURRENTS, CoilCurrents(current=[1.0, 2.0]), taken_both, "both")
@@ -281,7 +295,7 @@ def program(domain: int, *parameters: str) -> subprocess.Popen[str]:
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
 def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, which: signal.Signals):
     reports = graph.listen_later(topics.DIAGNOSTICS)
-    with program(graph.domain, "port:=0", "dish_diameter:=0.15") as process:
+    with program(graph.domain, "port:=0", "scene:=dish_150mm") as process:
         try:
             assert process.stdout is not None
             found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
@@ -298,7 +312,7 @@ def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, wh
 @pytest.mark.parametrize(
     ("parameter", "words"),
     [
-        ("dish_diameter:=35.0", "console.dish_diameter: got 35.0"),
+        ("scene:=nowhere", "scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dish_150mm"),
         ("dish:=0.035", "console.dish: got 0.035"),
         ("address:=0.0.0.0", "a token, as 0.0.0.0 can be reached"),
     ],

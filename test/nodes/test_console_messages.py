@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point
@@ -20,9 +21,10 @@ from magnetosuture_msgs.msg import (
 )
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.nodes import console_messages, messages, thread_messages
+from magnetosuture_thread.nodes import console_messages, messages, scene_messages
+from magnetosuture_thread.scene import read_scene
 from test.nodes.margins import no_margins
+from test.scene.scenes import every_shape
 
 STAMP = Time(sec=12)
 
@@ -69,15 +71,15 @@ def test_the_threads():
     }
 
 
-def test_of_each_node_the_least_clearance_of_any_obstacle():
+def test_of_each_node_the_least_clearance_of_wall_and_shapes():
     obstacle, connectivity = BarrierMargin.KIND_OBSTACLE, BarrierMargin.KIND_CONNECTIVITY
     message = SafetyMargins(
         valid=True,
-        kind=[connectivity, obstacle, obstacle, obstacle],
-        node=[3, 1, 1, 2],
-        obstacle=[-1, 0, 1, 1],
-        value=[0.0] * 4,
-        clearance=[0.0, 5e-4, 2e-4, 0.0],
+        kind=[connectivity, obstacle, obstacle, obstacle, BarrierMargin.KIND_WALL],
+        node=[3, 1, 1, 2, 4],
+        obstacle=[-1, 0, 1, 1, -1],
+        value=[0.0] * 5,
+        clearance=[0.0, 5e-4, 2e-4, 0.0, 3e-4],
         least=[BarrierMargin(kind=obstacle, node=2, clearance=0.0), BarrierMargin(kind=connectivity, clearance=1e-6)],
         contact_nodes=[2],
         friction_state=SafetyMargins.FRICTION_PULLED,
@@ -85,7 +87,7 @@ def test_of_each_node_the_least_clearance_of_any_obstacle():
         slowdown=0.81,
     )
     told = plain(console_messages.margins(message))
-    assert told["clearance"] == [None, 2e-4, 0.0, None]
+    assert told["clearance"] == [None, 2e-4, 0.0, None, 3e-4]
     assert told["least"] == {"obstacle": 0.0, "connectivity": 1e-6}
     assert told["contact"] == [2]
     assert told["friction"] == {"state": "pulled", "nodes": [1, 2], "slowdown": 0.81}
@@ -104,16 +106,33 @@ def test_every_kind_of_barrier_has_a_name():
     assert {f"KIND_{name.upper()}" for name in console_messages.KINDS.values()} == names
 
 
-def test_discs_are_discs_and_polygons_triangles_and_what_was_there_before_is_gone():
-    square = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
-    markers = thread_messages.obstacle_markers(STAMP, [Disc((0.001, 0.002), 0.003), square])
-    disc, triangles = plain(console_messages.obstacles(markers))
-    assert disc == {"disc": [0.001, 0.002, 0.003]}
-    corners = np.array(triangles["triangles"]).reshape(-1, 3, 2)
-    edges = corners[:, 1:] - corners[:, :1]
-    areas = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
-    assert areas.sum() == pytest.approx(1e-4)
-    assert console_messages.obstacles(thread_messages.obstacle_markers(STAMP, [])) == []
+def test_the_scene_has_discs_and_outlines_with_no_more_points_than_are_seen():
+    scene = every_shape()
+    told = plain(console_messages.scene(scene_messages.scene_message(STAMP, scene)))
+    assert (told["version"], told["dish_diameter"], told["dish_depth"]) == (scene.version, 0.05, 0.004)
+    assert [(shape["name"], shape["kind"]) for shape in told["shapes"]] == [(s.name, s.kind) for s in scene.shapes]
+    post, *others = told["shapes"]
+    assert (post["disc"], post["label"]) == ([0.0077, 0.0039, 0.0015], [0.0077, 0.0039])
+    for shape, known in zip(others, scene.shapes[1:], strict=True):
+        drawn = shapely.Polygon(shape["outline"], shape["holes"])
+        assert drawn.symmetric_difference(known.solid).area < 1e-5 * known.solid.length  # 10 um, a fifth of a pixel
+        assert len(shape["outline"]) <= 100
+        assert known.solid.contains(shapely.Point(shape["label"]))
+    assert len(others[0]["holes"]) == 1
+
+
+def test_a_damaged_scene_is_not_shown():
+    message = scene_messages.scene_message(STAMP, every_shape())
+    message.shapes[0].disc[0].x += 1e-9
+    with pytest.raises(InvalidInputError, match=r"scene\.version"):
+        console_messages.scene(message)
+
+
+def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
+    scene = read_scene("hernia_ring")
+    heard = console_messages.scene(scene_messages.scene_message(STAMP, scene))
+    assert console_messages.shown_scene(scene) == heard
+    assert len(json.dumps(heard)) < 10_000  # 30 times a second, for every page
 
 
 def test_the_filter_state():

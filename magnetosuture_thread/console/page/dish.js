@@ -4,8 +4,9 @@
 
 import { GREY, MIDDLING, SEEN, VELOCITY, nodeLook, onGround, threadLook } from "./colours.js";
 import { Placement, needleArc } from "./geometry.js";
-import { drawObstacles } from "./obstacles.js";
+import { drawShapes } from "./shapes.js";
 
+const DIAMETER = 0.035; // [m] of the dish that is drawn dashed while no scene is known
 const STALE = 0.5; // [s] a needle that is older is drawn grey
 const ARROW = 0.3; // of the dish's diameter, at the greatest speed
 const STEPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05];
@@ -14,7 +15,7 @@ export class Dish {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d", { alpha: false });
-    this.ground = document.createElement("canvas"); // image and obstacles, which change less often than the rest
+    this.ground = document.createElement("canvas"); // image and scene, which change less often than the rest
     this.under = []; // what the ground was drawn of
     this.image = null;
     this.placement = null; // in pixels of the page
@@ -34,7 +35,8 @@ export class Dish {
     if (!width || !height) return;
     const [wide, high] = [Math.round(width * ratio), Math.round(height * ratio)];
     if (canvas.width !== wide || canvas.height !== high) [canvas.width, canvas.height] = [wide, high];
-    this.placement = new Placement(width, height, graph?.dish_diameter ?? 0.035);
+    this.diameter = graph?.scene?.dish_diameter ?? DIAMETER;
+    this.placement = new Placement(width, height, this.diameter);
     this.ratio = ratio;
     const shown = Boolean(this.image && graph?.tracker?.view);
     const bright = shown || !this.dark.matches;
@@ -64,10 +66,10 @@ export class Dish {
 
   // Draw the ground anew where anything of it has changed.
   #drawGround(graph, view, width, height) {
-    const obstacles = graph?.obstacles ?? [];
+    const scene = graph?.scene;
     const under = [
-      view && this.image, this.canvas.width, this.canvas.height, this.ratio, this.dark.matches, graph?.dish_diameter,
-      JSON.stringify([view, obstacles]),
+      view && this.image, this.canvas.width, this.canvas.height, this.ratio, this.dark.matches, scene?.version,
+      JSON.stringify(view),
     ];
     if (under.every((entry, at) => entry === this.under[at])) return;
     this.under = under;
@@ -85,14 +87,16 @@ export class Dish {
       context.fillRect(0, 0, width, height);
     } else {
       context.beginPath();
-      context.arc(...placement.centre, (placement.scale * (graph?.dish_diameter ?? 0.035)) / 2, 0, 2 * Math.PI);
+      context.arc(...placement.centre, (placement.scale * this.diameter) / 2, 0, 2 * Math.PI);
       context.fillStyle = this.dark.matches ? "#232d36" : "#f7fafc";
       context.fill();
       context.strokeStyle = this.dark.matches ? "#5b6b78" : "#8fa2b2";
       context.lineWidth = 2;
+      if (!scene) context.setLineDash([6, 8]);
       context.stroke();
+      context.setLineDash([]);
     }
-    drawObstacles(context, placement, obstacles);
+    drawShapes(context, placement, scene?.shapes ?? [], this);
   }
 
   #trace(points) {
@@ -176,7 +180,7 @@ export class Dish {
     const points = this.needlePoints(graph);
     if (!points || !filter || filter.age + since > STALE) return;
     const tip = points[points.length - 1];
-    const scale = (ARROW * graph.dish_diameter * this.placement.scale) / maxSpeed;
+    const scale = (ARROW * this.diameter * this.placement.scale) / maxSpeed;
     this.#arrow(tip, filter.commanded, scale, 2, [6, 4]);
     this.#arrow(tip, filter.filtered, scale, 4.5, []);
   }

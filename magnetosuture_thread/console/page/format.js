@@ -9,7 +9,7 @@ export const length = (vector) => (Array.isArray(vector) ? Math.hypot(vector[0],
 export const capital = (text) => (text ? text[0].toUpperCase() + text.slice(1) : text);
 export const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 
-// Least clearance over the nodes [m], null where no obstacle is near any.
+// Least clearance over the nodes [m], null where neither wall nor shape is near any.
 export function leastClearance(margins) {
   const near = (margins?.clearance ?? []).filter(isNumber);
   return margins?.valid && near.length ? Math.min(...near) : null;
