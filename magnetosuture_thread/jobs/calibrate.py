@@ -10,12 +10,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
+from magnetosuture_thread.interface import SCENE
 from magnetosuture_thread.jobs.judge import Given, opened
 from magnetosuture_thread.jobs.output import whole_file
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import MATERIALS
+from magnetosuture_thread.offline.changes import scene_from
 from magnetosuture_thread.offline.predictions import sights
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.calibration.parameters import chosen
 from magnetosuture_thread.study.calibration.passage import Passage, passage_of
@@ -156,7 +159,7 @@ def _read(
             seen = sights(given.recording, given.setup, source=given.source, progress=share)
             simulated = given.recording.notes.get("simulated", "")
             try:
-                passages.append(passage_of(str(path), seen, own, request.against, simulated))
+                passages.append(passage_of(str(path), seen, own, request.against, simulated, initial_scene(given)))
             except BagError:
                 if problem := seen.thread_problem():
                     raise BagError(path, problem) from None
@@ -164,6 +167,20 @@ def _read(
         share(1.0)
     assert settings is not None
     return passages, settings
+
+
+def initial_scene(given: Given) -> Scene:
+    """Return the scene that a bag begins with: the first that it holds, or that of its set-up.
+
+    Raises:
+        BagError: the bag's message cannot be decoded.
+        ConfigurationError: it holds no scene.
+        InvalidInputError: it is damaged, or of another frame.
+    """
+    if given.recording.counts.get(SCENE.recorded):
+        for record in given.recording.records([SCENE]):
+            return scene_from(record)
+    return given.setup.scene
 
 
 def settings_of(setup: Setup, request: Request) -> ThreadModelSettings:
@@ -216,7 +233,7 @@ def _named(given: Given) -> Setup | None:
 def _check_same(before: Sequence[tuple[Path, Setup]], path: Path, setup: Setup) -> None:
     """Refuse a bag whose thread is another than that of the bags before."""
     for other, known in before:
-        for name in ("material", "length"):
+        for name in ("material", "thread_length"):
             value, expected = getattr(setup.model, name), getattr(known.model, name)
             if value != expected:
                 raise InvalidInputError(str(path), f"a thread with {name} {value}", f"{expected}, as in {other}")

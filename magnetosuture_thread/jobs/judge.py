@@ -145,7 +145,7 @@ def write_results(
         say("no picture: the dish is not found in any frame")
         return
     frame, view = found
-    obstacles = given.setup.model.obstacles()
+    obstacles = given.setup.scene.obstacles
     draw_summary(folder / "summary.png", frame, view, chosen, instants, obstacles, given.recording.start, summary)
 
 

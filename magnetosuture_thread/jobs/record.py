@@ -107,9 +107,9 @@ def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
     attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.GLUED}.get(str(metadata.get("boundary")))
     length = metadata.get("material", {}).get("L_m")
     for name, given, expected in (
-        ("length", setup.model.length, length),
+        ("thread_length", setup.model.thread_length, length),
         ("attachment", setup.model.attachment, attachment.value if attachment else None),
-        ("disc_obstacles", setup.model.obstacles(), reference.discs),
+        ("scene", setup.scene.obstacles, reference.discs),
     ):
         if expected is not None and not _same(given, expected):
             raise ConfigurationError(

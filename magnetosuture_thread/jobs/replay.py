@@ -206,7 +206,7 @@ class _Replay:
     def _judge(self, live: LiveReplay) -> Summary:
         """Put the outputs side by side; write summary.json and summary.png."""
         given = self.given
-        collector, recorded, replayed = Collector(given.setup.model.length), CurrentSeries(), CurrentSeries()
+        collector, recorded, replayed = Collector(given.setup.model.thread_length), CurrentSeries(), CurrentSeries()
         truth = [c for c in (TRUE_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
         for record in given.recording.records(truth, start=given.start, duration=given.duration):
             message = record.decode()

@@ -12,7 +12,15 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, TRACKER_STATE, Channel
+from magnetosuture_thread.interface import (
+    MARGINS,
+    NEEDLE_POSE,
+    PREDICTED_THREAD,
+    SCENE,
+    SEEN_THREAD,
+    TRACKER_STATE,
+    Channel,
+)
 from magnetosuture_thread.jobs.judge import Given, opened, write_results
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.session import WAITING
@@ -87,9 +95,9 @@ def replay_offline(
             duration=given.duration,
             progress=progress,
         )
-        tally, refused = Tally(given.setup.model.length), Counter[str]()
+        tally, refused = Tally(given.setup.model.thread_length), Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
-            steps, made = predictions(seen, given.setup.model), _Output(bag, seen)
+            steps, made = predictions(seen, given.setup.model, given.setup.scene), _Output(bag, seen)
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)
@@ -169,7 +177,7 @@ class _Output:
     def __init__(self, bag: BagWriter, seen: Sights) -> None:
         self._bag = bag
         states = [TRACKER_STATE] if seen.source == "camera" else []
-        for channel in (NEEDLE_POSE, *states, SEEN_THREAD, PREDICTED_THREAD, MARGINS):
+        for channel in (NEEDLE_POSE, *states, SEEN_THREAD, SCENE, PREDICTED_THREAD, MARGINS):
             bag.add_topic(channel.recorded, channel.type_name)
         seen.on_frame, seen.on_record = self._frame, self._record
 
@@ -183,7 +191,9 @@ class _Output:
         if isinstance(outcome.problem, InvalidInputError):
             return  # as live: a pose that is refused gets no answer
         reason = WAITING if outcome.waiting else str(outcome.problem) if prediction is None else prediction.status
-        self._bag.write(MARGINS.recorded, max(stamp, 0), packed_margins(stamp, step.margins, reason))
+        self._bag.write(
+            MARGINS.recorded, max(stamp, 0), packed_margins(stamp, step.margins, reason, outcome.scene_version)
+        )
 
     def _frame(self, stamp: int, seen: Seen) -> None:
         track = seen.track

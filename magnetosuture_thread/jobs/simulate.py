@@ -103,7 +103,7 @@ def simulate(
 def judge(bag: Bag, setup: Setup) -> LoopCollector:
     """Return all that a simulated run's bag says, put side by side."""
     collector = LoopCollector(
-        setup.model.length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
+        setup.model.thread_length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
     )
     camera = {channel.recorded for channel in CAMERA.values()}
     for record in bag.records(set(bag.topics) - camera):

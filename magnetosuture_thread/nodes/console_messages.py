@@ -44,6 +44,7 @@ KINDS = {
     BarrierMargin.KIND_OBSTACLE: "obstacle",
     BarrierMargin.KIND_ENHANCED_CONNECTIVITY: "enhanced_connectivity",
     BarrierMargin.KIND_STIFFNESS: "stiffness",
+    BarrierMargin.KIND_WALL: "wall",
 }
 LEVELS = {
     DiagnosticStatus.OK: "ok",
@@ -109,12 +110,12 @@ def margins(message: SafetyMargins) -> dict[str, Any]:
 
 
 def clearances(message: SafetyMargins) -> list[float | None]:
-    """Return each node's least clearance of any obstacle [m]; None where none is near."""
+    """Return each node's least clearance of any obstacle and the wall [m]; None where none is near."""
     nodes = np.asarray(message.node, dtype=np.intp)
     if not nodes.size:
         return []
     least = np.full(int(nodes.max()) + 1, np.inf)
-    near = np.asarray(message.kind, dtype=np.uint8) == BarrierMargin.KIND_OBSTACLE
+    near = np.isin(np.asarray(message.kind, dtype=np.uint8), (BarrierMargin.KIND_OBSTACLE, BarrierMargin.KIND_WALL))
     np.minimum.at(least, nodes[near], np.asarray(message.clearance)[near])
     return [value if value < np.inf else None for value in least.tolist()]
 

@@ -10,10 +10,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3
 from magnetosuture_msgs.msg import (
     BarrierMargin,
-    ObstacleSet,
     PredictedThread,
     SafetyMargins,
-    SteeringState,
     ThreadMaterial,
 )
 from rclpy.serialization import deserialize_message
@@ -22,13 +20,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, triangulate
-from magnetosuture_thread.interface import OBSTACLE_SET
 from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.friction import Friction, friction_colour
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import Prediction
-from magnetosuture_thread.model.steering import Steered
-from magnetosuture_thread.nodes.messages import flat_pose, header, point_list, require_dish_frame, vector
+from magnetosuture_thread.nodes.messages import flat_pose, header, point_list
 from magnetosuture_thread.nodes.topics import Topic
 
 
@@ -50,6 +46,7 @@ def prediction_message(stamp: Time, prediction: Prediction, material: str, step_
     return PredictedThread(
         header=header(stamp),
         formulation=prediction.formulation,
+        scene_version=prediction.scene_version,
         material=material,
         vertices=point_list(prediction.vertices),
         stretch=prediction.stretch.tolist(),
@@ -64,7 +61,12 @@ def prediction_message(stamp: Time, prediction: Prediction, material: str, step_
 
 def margins_message(stamp: Time, margins: Margins) -> SafetyMargins:
     """Return every barrier of a prediction, the least of each kind, and what touches."""
-    message = SafetyMargins(header=header(stamp), valid=True, contact_state=SafetyMargins.CONTACT_FREE)
+    message = SafetyMargins(
+        header=header(stamp),
+        scene_version=margins.scene_version,
+        valid=True,
+        contact_state=SafetyMargins.CONTACT_FREE,
+    )
     for name in ("kind", "node", "obstacle", "value", "clearance"):
         setattr(message, name, getattr(margins, name))
     message.least = [BarrierMargin(**vars(least)) for least in margins.least]
@@ -77,10 +79,11 @@ def margins_message(stamp: Time, margins: Margins) -> SafetyMargins:
     return message
 
 
-def invalid_margins(stamp: Time, reason: str) -> SafetyMargins:
-    """Return a margins message that says that there are none, and why."""
+def invalid_margins(stamp: Time, reason: str, scene_version: str = "") -> SafetyMargins:
+    """Return a margins message that says that there are none, and why, in the scene in force."""
     return SafetyMargins(
         header=header(stamp),
+        scene_version=scene_version,
         valid=False,
         reason=reason,
         contact_state=SafetyMargins.CONTACT_UNKNOWN,
@@ -109,18 +112,6 @@ def thread_markers(stamp: Time, prediction: Prediction, friction: Friction, diam
     return MarkerArray(markers=[line, balls])
 
 
-def steering_state(stamp: Time, what: Steered) -> SteeringState:
-    """Return what became of a velocity that was asked for; `stamp` is that of the asking."""
-    return SteeringState(
-        header=header(stamp),
-        asked=vector(what.asked),
-        passed=vector(what.passed),
-        slowdown=what.slowdown,
-        held_off=what.held_off,
-        reason=what.reason,
-    )
-
-
 def obstacle_markers(stamp: Time, obstacles: Sequence[Obstacle]) -> MarkerArray:
     """Return the obstacles, in place of those before: discs as flat cylinders, polygons as their triangles."""
     markers = [Marker(header=header(stamp), ns="obstacles", action=Marker.DELETEALL)]
@@ -139,16 +130,6 @@ def obstacle_markers(stamp: Time, obstacles: Sequence[Obstacle]) -> MarkerArray:
             marker.points = point_list(shape.vertices[shape.triangles].reshape(-1, 2))
         markers.append(marker)
     return MarkerArray(markers=markers)
-
-
-def obstacle_values(message: ObstacleSet) -> dict[str, Any]:
-    """Return the settings, by name, that a set of obstacles changes.
-
-    Raises:
-        InvalidInputError: wrong frame.
-    """
-    require_dish_frame(message.header.frame_id, OBSTACLE_SET.name)
-    return changes.told_obstacles(message)
 
 
 def material_values(message: ThreadMaterial) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The thread model node: needle poses in, predicted thread and safety margins out; an operator's wishes filtered."""
+"""The thread model node: needle poses in, predicted thread and safety margins out."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from magnetosuture_thread.nodes import messages, thread_messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
-from magnetosuture_thread.nodes.thread_steering import ThreadSteering
+from magnetosuture_thread.scene import Scene
 
 
 class ThreadModelNode(Node):
@@ -32,20 +33,27 @@ class ThreadModelNode(Node):
         super().__init__("thread_model", automatically_declare_parameters_from_overrides=True, **options)
         settings = declare(self, ThreadModelSettings, read_only=False, fixed=FIXED)
         self.get_logger().info("loading the model's kernels; the first start on a machine compiles them")
-        self._session = ThreadSession(settings)
         self._health = Health(self)
+        self._scene = SceneFollower(self, settings.scene, self._health)
+        self._session = ThreadSession(settings, self._scene.scene)
         self._settings = ThreadSettings(self, self._session, self._health)
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         topics.SEEN_THREAD.subscribe(self, self.on_seen_thread, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
-        self._steering = ThreadSteering(self, self._session, self._health)
+        self._scene.follow(self.on_scene)
         self._health.warn("no needle pose yet")
+        scene = self._session.scene
+        where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
         self.get_logger().info(
-            f"ready: {settings.segments} segments of {settings.material}, "
-            f"{len(settings.obstacles())} obstacles, {settings.formulation} by {settings.solver}"
+            f"ready: {settings.segments} segments of {settings.material}, {where}, "
+            f"{settings.formulation} by {settings.solver}"
         )
+
+    def on_scene(self, scene: Scene) -> None:
+        """Go on in another scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
+        self._session.change(self._session.settings, scene)
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Step the thread to a needle pose; where that cannot be done, say so.
@@ -89,16 +97,16 @@ class ThreadModelNode(Node):
             self._health.refuse(outcome.problem)
         elif outcome.problem is not None:
             self._health.error(str(outcome.problem))
-            self._margins.publish(thread_messages.invalid_margins(stamp, str(outcome.problem)))
+            self._margins.publish(thread_messages.invalid_margins(stamp, str(outcome.problem), outcome.scene_version))
         else:
             self._health.warn(WAITING)
-            self._margins.publish(thread_messages.invalid_margins(stamp, WAITING))
+            self._margins.publish(thread_messages.invalid_margins(stamp, WAITING, outcome.scene_version))
 
     def _publish(self, stamp: Time, prediction: Prediction, margins: Margins | None, step_time: float) -> None:
         settings = self._session.settings
         self._predicted.publish(thread_messages.prediction_message(stamp, prediction, settings.material, step_time))
         if margins is None:
-            self._margins.publish(thread_messages.invalid_margins(stamp, prediction.status))
+            self._margins.publish(thread_messages.invalid_margins(stamp, prediction.status, prediction.scene_version))
         else:
             self._margins.publish(thread_messages.margins_message(stamp, margins))
         friction = margins.friction if margins else UNKNOWN

@@ -131,7 +131,7 @@ PREDICTED_THREAD = Topic(interface.PREDICTED_THREAD, RELIABLE)
 MARGINS = Topic(interface.MARGINS, RELIABLE)
 THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE)
 OBSTACLE_MARKERS = Topic(interface.OBSTACLE_MARKERS, LATCHED)
-OBSTACLE_SET = Topic(interface.OBSTACLE_SET, LATCHED)
+SCENE = Topic(interface.SCENE, LATCHED)
 MATERIAL = Topic(interface.MATERIAL, LATCHED)
 CURRENTS = Topic(interface.CURRENTS, RELIABLE)
 BRIDGE_STATE = Topic(interface.BRIDGE_STATE, LATCHED)
@@ -156,7 +156,7 @@ OUTPUTS = (
     DIAGNOSTICS,
 )
 
-SETTINGS = (OBSTACLE_SET, MATERIAL)  # what may be told at any time, or never
+SETTINGS = (SCENE, MATERIAL)  # what may be told at any time, or never
 SIMULATED = (TRUE_NEEDLE, TRUE_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
 
 

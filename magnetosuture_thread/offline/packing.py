@@ -29,13 +29,14 @@ def packed_prediction(stamp: int, prediction: Prediction, material: str) -> byte
     """
     vertices = np.zeros((len(prediction.vertices), 3))
     vertices[:, :2] = prediction.vertices
-    words = (prediction.formulation, material, prediction.solver, prediction.status)
-    formulation, thread, solver, status = map(_text, words)
-    sizes = (formulation[0], thread[0], len(vertices), len(prediction.stretch), solver[0], status[0])
+    words = (prediction.formulation, prediction.scene_version, material, prediction.solver, prediction.status)
+    formulation, scene, thread, solver, status = map(_text, words)
+    sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.stretch), solver[0], status[0])
     return _BEGIN + _prediction_form(*sizes).pack(
         *divmod(stamp, 10**9),
         *_DISH,
         *formulation,
+        *scene,
         *thread,
         len(vertices),
         _numbers(vertices, _REAL),
@@ -50,26 +51,29 @@ def packed_prediction(stamp: int, prediction: Prediction, material: str) -> byte
     )
 
 
-def packed_margins(stamp: int, margins: Margins | None, reason: str = "") -> bytes:
+def packed_margins(stamp: int, margins: Margins | None, reason: str = "", scene_version: str = "") -> bytes:
     """Return a SafetyMargins: every barrier, the least of each kind, and what touches; or why there are none.
 
     Args:
         stamp: of the pose [ns].
         margins: of its prediction; None where there are none.
         reason: why there are none.
+        scene_version: of the scene in force where there are none.
     """
     time = divmod(stamp, 10**9)
     if margins is None:
-        words = _text(reason)
-        return _BEGIN + _no_margins_form(words[0]).pack(
-            *time, *_DISH, False, *words, *[0] * 6, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
+        scene, words = _text(scene_version), _text(reason)
+        return _BEGIN + _no_margins_form(scene[0], words[0]).pack(
+            *time, *_DISH, *scene, False, *words, *[0] * 6, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
         )
     count = len(margins.kind)
     friction = margins.friction
-    form = _margins_form(count, len(margins.least), len(margins.touching), len(friction.nodes))
+    scene = _text(margins.scene_version)
+    form = _margins_form(scene[0], count, len(margins.least), len(margins.touching), len(friction.nodes))
     return _BEGIN + form.pack(
         *time,
         *_DISH,
+        *scene,
         True,
         *_NO_REASON,
         count,
@@ -116,20 +120,21 @@ def _numbers(values: ArrayLike, kind: np.dtype[np.generic]) -> bytes:
 
 @lru_cache(_KEPT)
 def _prediction_form(
-    formulation: int, material: int, vertices: int, stretch: int, solver: int, status: int
+    formulation: int, scene: int, material: int, vertices: int, stretch: int, solver: int, status: int
 ) -> struct.Struct:
     """Return the format of a PredictedThread with texts of these lengths, and so many vertices and segments."""
-    begin = (*_HEADER, *_text_codes(formulation), *_text_codes(material))
+    begin = (*_HEADER, *_text_codes(formulation), *_text_codes(scene), *_text_codes(material))
     arrays = (*_array_codes(vertices, "d", 3), *_array_codes(stretch, "d"))
     return _form(*begin, *arrays, *_text_codes(solver), *_text_codes(status), "d", "d", "I", "d")
 
 
 @lru_cache(_KEPT)
-def _margins_form(barriers: int, least: int, touching: int, squeezed: int) -> struct.Struct:
-    """Return the format of a SafetyMargins with so many barriers, least ones, nodes that touch, and under friction."""
+def _margins_form(scene: int, barriers: int, least: int, touching: int, squeezed: int) -> struct.Struct:
+    """Return the format of a SafetyMargins with a version of this length, and so many entries of each array."""
     arrays = [code for kind in "BIidd" for code in _array_codes(barriers, kind)]
     return _form(
         *_HEADER,
+        *_text_codes(scene),
         "?",
         *_text_codes(_NO_REASON[0]),
         *arrays,
@@ -142,9 +147,9 @@ def _margins_form(barriers: int, least: int, touching: int, squeezed: int) -> st
 
 
 @lru_cache(_KEPT)
-def _no_margins_form(reason: int) -> struct.Struct:
-    """Return the format of a SafetyMargins without any, but a reason of this length."""
-    return _form(*_HEADER, "?", *_text_codes(reason), *"IIIIII", *_nodes(0), *_nodes(0), "d")
+def _no_margins_form(scene: int, reason: int) -> struct.Struct:
+    """Return the format of a SafetyMargins without any, but texts of these lengths."""
+    return _form(*_HEADER, *_text_codes(scene), "?", *_text_codes(reason), *"IIIIII", *_nodes(0), *_nodes(0), "d")
 
 
 def _nodes(count: int) -> tuple[str, ...]:

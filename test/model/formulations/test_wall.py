@@ -17,7 +17,6 @@ from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.rig.mechanics.dynamics import Attachment as RigAttachment
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-
 from test.model.formulations.scenes import DT, TOLERANCE, east, followed, formulated, polyamide, straight
 
 RADIUS = 0.0175
