@@ -49,6 +49,7 @@ ALLOWED = {
         *(
             "interface",
             "geometry",
+            "scene",
             "model",
             "vision",
             "coils",

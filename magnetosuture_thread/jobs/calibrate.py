@@ -156,7 +156,7 @@ def _read(
             seen = sights(given.recording, given.setup, source=given.source, progress=share)
             simulated = given.recording.notes.get("simulated", "")
             try:
-                passages.append(passage_of(str(path), seen, own, request.against, simulated))
+                passages.append(passage_of(str(path), seen, own, request.against, simulated, given.setup.scene))
             except BagError:
                 if problem := seen.thread_problem():
                     raise BagError(path, problem) from None

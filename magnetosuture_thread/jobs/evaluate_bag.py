@@ -150,7 +150,12 @@ def _predict(given: Given, model: ThreadModelSettings, account: Account, seen: S
         if step.outcome.prediction is not None:
             beside = recorded.of(step.sight.stamp)
             account.predict(
-                step.sight, step.outcome.prediction, step.margins, step.step_time, beside, given.setup.scene.obstacles
+                step.sight,
+                step.outcome.prediction,
+                step.margins,
+                step.step_time,
+                beside,
+                step.scene.obstacles if step.scene is not None else (),
             )
         elif step.outcome.problem is not None:
             refused[_kind(step.outcome.problem)] += 1

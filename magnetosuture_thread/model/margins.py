@@ -48,6 +48,7 @@ class Margins:
         least: of each kind present.
         touching: nodes that touch an obstacle or the wall, rising.
         friction: between obstacles.
+        scene_version: of the scene that they are of; empty where the model knows none.
     """
 
     kind: NDArray[np.uint8]
@@ -58,15 +59,23 @@ class Margins:
     least: tuple[LeastBarrier, ...]
     touching: tuple[int, ...]
     friction: Friction = UNKNOWN
+    scene_version: str = ""
 
     @classmethod
-    def of(cls, barriers: Sequence[BarrierRows], contact_tolerance: float, friction: Friction = UNKNOWN) -> Margins:
+    def of(
+        cls,
+        barriers: Sequence[BarrierRows],
+        contact_tolerance: float,
+        friction: Friction = UNKNOWN,
+        scene_version: str = "",
+    ) -> Margins:
         """Put the barriers of all kinds together.
 
         Args:
             barriers: the rows of each kind, in SI units.
             contact_tolerance: a node this close to an obstacle or the wall touches it [m].
             friction: between obstacles.
+            scene_version: of the scene.
         """
         count = sum(len(rows.value) for rows in barriers)
         whole = cls(
@@ -78,6 +87,7 @@ class Margins:
             tuple(_least(rows) for rows in barriers if len(rows.value)),
             _touching(barriers, contact_tolerance),
             friction,
+            scene_version,
         )
         begin = 0
         for rows in barriers:

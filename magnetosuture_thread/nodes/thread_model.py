@@ -1,4 +1,4 @@
-"""The thread model node: needle poses in, predicted thread and safety margins out; an operator's wishes filtered."""
+"""The thread model node: needle poses in, predicted thread and safety margins out."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
-from magnetosuture_thread.nodes.thread_steering import ThreadSteering
 from magnetosuture_thread.packing.layout import time_of
 from magnetosuture_thread.packing.markers import packed_markers
 from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
-from magnetosuture_thread.scene import read_scene
+from magnetosuture_thread.scene import Scene
 
 
 class ThreadModelNode(Node):
@@ -43,25 +43,31 @@ class ThreadModelNode(Node):
         super().__init__("thread_model", **node_options("thread_model", options))
         settings = declare(self, ThreadModelSettings, read_only=False, fixed=FIXED)
         self.get_logger().info("loading the model's kernels; the first start on a machine compiles them")
-        self._session = ThreadSession(settings, read_scene(settings.scene) if settings.scene else None)
         self._health = Health(self)
+        scene = initial_scene(settings.scene)
+        self._session = ThreadSession(settings, scene)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         self._settings = ThreadSettings(self, self._session, self._health)
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         if listens:
             self.listen()
-        self._steering = ThreadSteering(self, self._session, self._health)
         self._health.warn("no needle pose yet")
+        where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
         self.get_logger().info(
-            f"ready: {settings.segments} segments of {settings.material}, "
-            f"scene {settings.scene or 'unknown'}, {settings.formulation} by {settings.solver}"
+            f"ready: {settings.segments} segments of {settings.material}, {where}, "
+            f"{settings.formulation} by {settings.solver}"
         )
 
     def listen(self) -> None:
         """Take poses and seen threads from their topics."""
         topics.SEEN_THREAD.subscribe(self, self.on_seen_thread, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
+
+    def on_scene(self, scene: Scene) -> None:
+        """Go on in another scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
+        self._session.change(self._session.settings, scene)
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Step the thread to a needle pose; where that cannot be done, say so.
@@ -118,14 +124,16 @@ class ThreadModelNode(Node):
         else:
             problem = WAITING if outcome.problem is None else str(outcome.problem)
             (self._health.warn if outcome.problem is None else self._health.error)(problem)
-            self._margins.publish(packed_margins(time_of(outcome.stamp), None, problem))
+            packed = packed_margins(time_of(outcome.stamp), None, problem, scene_version=outcome.scene_version)
+            self._margins.publish(packed)
 
     def _publish(self, outcome: Outcome, prediction: Prediction, step_time: float) -> None:
-        when, settings = time_of(outcome.stamp), self._session.settings
+        when, settings, version = time_of(outcome.stamp), self._session.settings, outcome.scene_version
         # The prediction first: it is waited for, and the margins are only worked out here.
         self._predicted.publish(packed_prediction(when, prediction, settings.material, step_time=step_time))
         margins = outcome.margins
-        self._margins.publish(packed_margins(when, margins, "" if margins else prediction.status))
+        reason = "" if margins else prediction.status
+        self._margins.publish(packed_margins(when, margins, reason, scene_version=version))
         if self._markers.get_subscription_count():
             friction = margins.friction if margins else UNKNOWN
             self._markers.publish(packed_markers(when, prediction, friction, self._session.thread.diameter))

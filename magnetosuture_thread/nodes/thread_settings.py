@@ -1,9 +1,8 @@
-"""The thread model's settings while it runs: its parameters, the topics that set them, the obstacles it shows."""
+"""The thread model's settings while it runs: its parameters, and the topic that sets some of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.node import Node
 
@@ -36,20 +35,16 @@ class ThreadSettings:
         topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
 
     def on_material(self, data: bytes) -> None:
-        """Take what is newly known of the thread and the liquid."""
-        self._set(topics.MATERIAL, data, thread_messages.material_values)
-
-    def _set(self, topic: topics.Topic, data: bytes, values: Callable[[Any], dict[str, Any]]) -> None:
-        """Set the parameters that a message is about, or say why that cannot be."""
+        """Take what is newly known of the thread and the liquid, or say why that cannot be."""
         try:
             if len(data) > LARGEST:
-                raise InvalidInputError(topic.channel.name, f"{len(data)} bytes", f"at most {LARGEST}")
-            self._parameters.set(values(thread_messages.decoded(topic, data)))
+                raise InvalidInputError(topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {LARGEST}")
+            self._parameters.set(thread_messages.material_values(thread_messages.decoded(topics.MATERIAL, data)))
         except MagnetosutureError as error:
             self._health.refuse(error)
 
     def _prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
-        put_in_force = self._session.prepare(settings)
+        put_in_force = self._session.prepare(settings, self._session.scene)
 
         def change() -> None:
             before = self._session.settings

@@ -14,7 +14,7 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.geometry.orientation import as_told
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SEEN_THREAD, TRUE_THREAD, Channel
+from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE, SEEN_THREAD, TRUE_THREAD, Channel
 from magnetosuture_thread.model.session import EARLY
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
@@ -47,7 +47,8 @@ class Sights(Iterator[Sight]):
         found: of these with a needle.
         refused: the others, by why.
         on_frame: called with stamp and what was seen in each frame, before its sight is given.
-        on_record: called with stamp and each recorded pose and seen thread, before its sight is given.
+        on_record: called with stamp and each recorded pose and seen thread, before its sight is given; and with each
+            scene that is taken.
     """
 
     def __init__(
@@ -91,8 +92,11 @@ class Sights(Iterator[Sight]):
         return next(self._going)
 
     def changes(self) -> list[Record]:
-        """Return, once, what the bag says of obstacles and thread before the sight that was given last."""
+        """Return, once, what the bag says of scene and thread before the sight that was given last."""
         changes, self._changes = self._changes, []
+        for record in changes:
+            if record.topic == SCENE.recorded:
+                self.on_record(stamp_of(record), record)
         return changes
 
     def thread_problem(self) -> str:

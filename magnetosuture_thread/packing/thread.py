@@ -30,9 +30,7 @@ _UNKNOWN, _FREE, _TOUCHING = 0, 1, 2  # as in SafetyMargins.msg
 _KIND, _NODE, _OBSTACLE = (np.dtype(code) for code in ("u1", "<u4", "<i4"))
 
 
-def packed_prediction(
-    time: Time, prediction: Prediction, material: str, *, step_time: float = 0.0, scene_version: str = ""
-) -> bytes:
+def packed_prediction(time: Time, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:
     """Return a PredictedThread.
 
     Args:
@@ -40,10 +38,9 @@ def packed_prediction(
         prediction: the thread.
         material: its name.
         step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
-        scene_version: of the scene that it was predicted in.
     """
     vertices = prediction.vertices
-    words = (prediction.formulation, scene_version, material, prediction.solver, prediction.status)
+    words = (prediction.formulation, prediction.scene_version, material, prediction.solver, prediction.status)
     formulation, scene, thread, solver, status = map(text, words)
     sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.stretch), solver[0], status[0])
     return BEGIN + _prediction_form(*sizes).pack(

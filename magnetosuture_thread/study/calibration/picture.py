@@ -73,7 +73,7 @@ def _draw_scene(axes: Axes, calibration: Calibration, course: Course) -> None:
     passage = course.passage
     whole = np.flatnonzero(passage.known.mean(axis=1) >= np.quantile(passage.known.mean(axis=1), 0.5))
     chosen = whole[np.linspace(0, len(whole) - 1, min(INSTANTS, len(whole))).astype(int)]
-    for shape in calibration.settings.obstacles():
+    for shape in passage.scene.obstacles if passage.scene is not None else ():
         if isinstance(shape, Disc):
             centre, radius = (1e3 * shape.centre[0], 1e3 * shape.centre[1]), 1e3 * shape.radius
             axes.add_patch(Circle(centre, radius, facecolor=OBSTACLE, edgecolor=INK, linewidth=0.8))

@@ -33,7 +33,7 @@ def replay(passage: Passage, settings: ThreadModelSettings) -> Points:
     slots = {int(frame): slot for slot, frame in enumerate(passage.frames)}
     stamps = passage.stamps.tolist()
     for leg, end, initial in zip(passage.legs, [*passage.legs[1:], len(stamps)], passage.initials, strict=True):
-        session, last = ThreadSession(settings), nothing
+        session, last = ThreadSession(settings, passage.scene), nothing
         for _ in session.on_seen(stamps[leg], initial):
             pass
         for index in range(leg, end):

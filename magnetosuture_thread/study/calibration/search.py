@@ -84,7 +84,8 @@ def calibrate(
         raise ConfigurationError("thread_model.medium", settings.medium, "liquid: what is fitted is bending over drag")
     replays = Replays(passages, run, best)
     stages = Stages(replays.best, progress, say)
-    ThreadSession(settings)  # which says what is wrong with the obstacles, if anything is
+    for scene in dict.fromkeys(passage.scene for passage in passages):
+        ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
     replays.tell(stages.told)
     return _Search(replays, settings, parameters, both, stages).go()
 
