@@ -17,7 +17,6 @@ from magnetosuture_thread.model.friction import FrictionLaw
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import FARTHEST, NeedlePose, Prediction
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.model.steering import Steered, at_rest, steered
 from magnetosuture_thread.model.thread import Thread
 
 EARLY = 30  # poses that may wait for the centreline of their frame
@@ -95,9 +94,7 @@ class ThreadSession:
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=EARLY)
         self._last: int | None = None
-        self._needle, self._motion = settings.needle_filter(), settings.node_motion()
-        self._proven: tuple[Outcome, NeedlePose] | None = None
-        self._needle.safe_velocity(np.zeros(2), np.array([1.0, 0.0]), np.zeros(2))  # compiled now
+        self._motion = settings.node_motion()
 
     @property
     def thread(self) -> Thread:
@@ -115,12 +112,12 @@ class ThreadSession:
         """
         if settings == self.settings:
             return lambda: None
-        predictor, needle, motion = settings.predictor(), settings.needle_filter(), settings.node_motion()
+        predictor, motion = settings.predictor(), settings.node_motion()
 
         def put_in_force() -> None:
             predictor.follow_on(self._predictor)
             motion.follow_on(self._motion)
-            self.settings, self._predictor, self._needle, self._motion = settings, predictor, needle, motion
+            self.settings, self._predictor, self._motion = settings, predictor, motion
 
         return put_in_force
 
@@ -165,7 +162,7 @@ class ThreadSession:
         """
         if self._last is not None and stamp < self._last - REPLAYED:
             self._predictor.reset()
-            self._last = self._proven = None
+            self._last = None
             self._early.clear()
             if self._seen is not None and self._seen[0] > stamp:
                 self._seen = None  # of the time before it was set back
@@ -183,35 +180,7 @@ class ThreadSession:
         self._last = stamp
         settings, speeds = self.settings, self._motion.take(prediction.vertices, prediction.interval)
         proof = Proof(settings.friction_law(), settings.contact_tolerance, speeds)
-        outcome = Outcome(stamp, prediction, proof=proof)
-        if prediction.converged:
-            self._proven = outcome, pose
-        return outcome
-
-    def on_asked(self, stamp: int, velocity: NDArray[np.float64]) -> Steered:
-        """Filter the velocity that an operator asks of the needle, by the thread as last predicted.
-
-        Where the needle is goes by its last pose that gave a prediction. Without one that is new enough nobody knows
-        what the needle would do to the thread, and it is told to rest.
-
-        Args:
-            stamp: when it was asked for [ns].
-            velocity: of the needle's tip, shape (2,) [m/s].
-
-        Raises:
-            InvalidInputError: the velocity is not finite, or beyond 1 m/s.
-            SolverError: the filter's program has no solution.
-        """
-        if self._proven is None:
-            return at_rest(velocity, "no predicted thread yet")
-        outcome, pose = self._proven
-        age = (stamp - outcome.stamp) * 1e-9
-        if not abs(age) <= self.settings.steering_timeout:
-            return at_rest(velocity, f"the last predicted thread is {age:.2f} s old")
-        assert outcome.margins is not None
-        if not self._needle.length:
-            pose = self.settings.attachment_pose(pose)  # the point that is steered
-        return steered(self._needle, outcome.margins.friction, pose.tail, pose.heading, velocity)
+        return Outcome(stamp, prediction, proof=proof)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":

@@ -15,10 +15,9 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
 from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
+from magnetosuture_thread.model.friction_settings import FrictionSettings
 from magnetosuture_thread.model.medium import Medium
-from magnetosuture_thread.model.needle import NeedleFilter
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
-from magnetosuture_thread.model.steering_settings import SteeringSettings
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
 
 MEDIA = ("liquid", "air")
@@ -36,7 +35,7 @@ SHARPEST_TURN = 0.5  # rad; of a thread at rest at a node, beyond which its segm
 
 
 @dataclass(frozen=True)
-class ThreadModelSettings(SteeringSettings):
+class ThreadModelSettings(FrictionSettings):
     """What the thread model must know of the thread, the liquid and the obstacles."""
 
     GROUP: ClassVar[str] = "thread_model"
@@ -186,7 +185,7 @@ class ThreadModelSettings(SteeringSettings):
 
         A segment could lie across such an obstacle with both of its nodes outside.
         """
-        self.check_steering(self.GROUP, self.margin_range)
+        self.check_friction(self.GROUP, self.margin_range)
         least = 0.5 * self.length / self.segments
         for disc in self._discs:
             if disc.radius < least:
@@ -291,8 +290,3 @@ class ThreadModelSettings(SteeringSettings):
         predictor = ThreadPredictor(formulation, thread, longest_step=self.longest_step, held=self.held_nodes)
         predictor.warm_up()
         return predictor
-
-    def needle_filter(self) -> NeedleFilter:
-        """Return the steered needle's own barriers; raises as `predictor` does."""
-        surroundings = Surroundings(self.obstacles(), self.margin_range)
-        return self.filter_among(surroundings, make_solver(self.solver, self.residual_tolerance))
