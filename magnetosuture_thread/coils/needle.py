@@ -243,7 +243,7 @@ class NeedleWatch:
 
     def _note_gap(self, arrival: float) -> None:
         """Forget the pose where the coils were given nothing for longer than they certainly hold their currents."""
-        if self._motion == REST or arrival - self._given <= self._holds:
+        if self._motion == REST or arrival - self._given <= self._holds + 1e-6:
             return
         self._unknown = self._past[-1][0] + self._stops if self._past else -math.inf
         self._motion = REST
