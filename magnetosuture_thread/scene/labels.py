@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import shapely
 
@@ -14,8 +15,21 @@ DIRECTIONS = 16  # in which a name can stand beside its shape
 STEPS = (1.0, 1.6, 2.4)  # times the name's height, from the shape
 
 
-def label_places(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the middle of each shape's name: in the shape, in a hole of it, or else beside it, clear of the others.
+@dataclass(frozen=True)
+class LabelPlace:
+    """Where a name stands.
+
+    Attributes:
+        middle: of the name [m].
+        line: from the name to its shape, where it stands beside it; else empty [m].
+    """
+
+    middle: tuple[float, float]
+    line: tuple[tuple[float, float], ...] = ()
+
+
+def label_places(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[LabelPlace]:
+    """Return a place for each shape's name: in the shape, in a hole of it, or else beside it, clear of the others.
 
     Where no place is clear, a name stands in its shape all the same.
 
@@ -26,16 +40,17 @@ def label_places(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[tup
     solids = [shape.solid for shape in scene.shapes]
     dish = shapely.Point(0.0, 0.0).buffer(scene.dish.radius)
     taken: list[shapely.Geometry] = []
-    places = []
+    places: list[LabelPlace] = []
     for shape, solid, (width, height) in zip(scene.shapes, solids, sizes, strict=True):
-        place = shape.label_point
-        if not solid.contains(_box(place, width, height)):
+        place = LabelPlace(shape.label_point)
+        if not solid.contains(_box(place.middle, width, height)):
             for candidate in _beside(shape, solid, width, height):
                 box = _box(candidate, 1.1 * width, 1.2 * height)
                 if dish.contains(box) and not any(box.intersects(other) for other in (*solids, *taken)):
-                    place = candidate
+                    start, end = shapely.shortest_line(_box(candidate, width, height), solid).coords
+                    place = LabelPlace(candidate, (start, end))
                     break
-        taken.append(_box(place, width, height))
+        taken.append(_box(place.middle, width, height))
         places.append(place)
     return places
 

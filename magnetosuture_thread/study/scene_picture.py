@@ -98,13 +98,13 @@ def _draw_names(axes: Axes, scene: Scene) -> None:
     }
     texts = [axes.text(0.0, 0.0, shape.name, zorder=5, **style) for shape in scene.shapes]
     to_metres = axes.transData.inverted()
-    boxes = [1e-3 * to_metres.transform_bbox(text.get_window_extent()).size for text in texts]
-    places = label_places(scene, [(float(width), float(height)) for width, height in boxes])
-    for shape, text, (x, y) in zip(scene.shapes, texts, places, strict=True):
-        text.set_position((1e3 * x, 1e3 * y))
-        if (x, y) != shape.label_point:
-            ends = 1e3 * np.array([(x, y), shape.label_point])
-            axes.plot(*ends.T, color=INK, linewidth=0.7, zorder=3)
+    boxes = [to_metres.transform_bbox(text.get_window_extent()) for text in texts]
+    places = label_places(scene, [(1e-3 * float(box.width), 1e-3 * float(box.height)) for box in boxes])
+    for text, place in zip(texts, places, strict=True):
+        text.set_position((1e3 * place.middle[0], 1e3 * place.middle[1]))
+        if place.line:
+            ends = 1e3 * np.array(place.line)
+            axes.plot(*ends.T, color=INK, linewidth=0.8, zorder=4)
 
 
 def _draw_scale(axes: Axes, diameter: float, reach: float) -> None:

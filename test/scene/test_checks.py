@@ -8,7 +8,7 @@ import shapely
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, shape_from_mapping
 from magnetosuture_thread.scene.checks import farthest_point, scene_warnings
-from magnetosuture_thread.scene.labels import label_places
+from magnetosuture_thread.scene.labels import LabelPlace, label_places
 
 WIDTH = 0.0004
 SQUARE = ((0.0, 0.0), (0.004, 0.0), (0.004, 0.004), (0.0, 0.004))
@@ -51,8 +51,9 @@ def test_an_overlap_has_its_area_and_a_place_in_it():
 @pytest.mark.parametrize(("gap", "warned"), [(0.0, True), (0.0003, True), (0.00039, True), (0.00041, False)])
 def test_a_gap_is_told_while_it_is_narrower_than_the_needle(gap: float, warned: bool):
     found = scene_warnings(scene(moved(0.0, 0.0), moved(0.004 + gap, 0.0)), WIDTH)
-    assert [(warning.what, warning.value) for warning in found] == ([("gap", pytest.approx(gap))] if warned else [])
+    assert [warning.what for warning in found] == (["gap"] if warned else [])
     if warned:
+        assert found[0].value == pytest.approx(gap)
         assert found[0].place[0] == pytest.approx(0.004 + 0.5 * gap)
         assert "narrower than the needle" in found[0].text
 
@@ -64,7 +65,8 @@ def test_gaps_of_discs_count_their_rims():
 
 def test_a_shape_near_or_across_the_wall_is_told():
     (near,) = scene_warnings(scene(Disc((0.0, 0.0152), 0.002)), WIDTH)
-    assert (near.what, near.place) == ("gap", (0.0, pytest.approx(0.0172)))
+    assert near.what == "gap"
+    assert near.place == pytest.approx((0.0, 0.0172))
     assert near.value == pytest.approx(0.0003)
     assert near.text == "the gap between a and the wall at (0.00, 17.20) mm is 0.3 mm wide: narrower than the needle"
     (across,) = scene_warnings(scene(moved(0.015, -0.002)), WIDTH)
@@ -92,8 +94,12 @@ def test_names_stand_clear_of_other_shapes_and_of_each_other():
     sizes = [(0.003, 0.001), (0.006, 0.001), (0.006, 0.001)]
     boxes = [
         shapely.box(x - w / 2, y - h / 2, x + w / 2, y + h / 2)
-        for (x, y), (w, h) in zip(label_places(known, sizes), sizes, strict=True)
+        for (x, y), (w, h) in zip((place.middle for place in label_places(known, sizes)), sizes, strict=True)
     ]
+    for place, shape, box in zip(label_places(known, sizes), known.shapes, boxes, strict=True):
+        start, end = map(shapely.Point, place.line)
+        assert box.distance(start) < 1e-12
+        assert shape.solid.distance(end) < 1e-12
     for index, box in enumerate(boxes):
         assert shapely.Point(0.0, 0.0).buffer(0.025).contains(box)
         assert not any(box.intersects(shape.solid) for shape in known.shapes)
@@ -102,4 +108,5 @@ def test_names_stand_clear_of_other_shapes_and_of_each_other():
 
 def test_a_name_that_fits_stands_in_its_shape_and_one_that_fits_nowhere_too():
     known = scene(moved(0.0, 0.0), Disc((-0.01, 0.0), 0.0005))
-    assert label_places(known, [(0.002, 0.0005), (0.05, 0.01)]) == [known.shapes[0].label_point, (-0.01, 0.0)]
+    places = label_places(known, [(0.002, 0.0005), (0.05, 0.01)])
+    assert places == [LabelPlace(known.shapes[0].label_point), LabelPlace((-0.01, 0.0))]
