@@ -18,6 +18,7 @@ from magnetosuture_thread.cli.commands import (
     hernia,
     record,
     replay,
+    scene,
     simulate,
     track,
 )
@@ -42,6 +43,7 @@ COMMANDS = (
     calibrate_camera.add,
     calibrate_coils.add,
     coils.add,
+    scene.add,
     bag.add,
     bench.add,
 )

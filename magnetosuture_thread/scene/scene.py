@@ -101,6 +101,13 @@ class SceneShape:
             return shapely.Point(self.geometry.centre).buffer(self.geometry.radius, quad_segs=64)
         return shapely.Polygon(self.geometry.outline, self.geometry.holes)
 
+    @property
+    def area(self) -> float:
+        """Area, holes taken off [m^2]."""
+        if isinstance(self.geometry, Disc):
+            return math.pi * self.geometry.radius**2
+        return self.geometry.area
+
     @cached_property
     def label_point(self) -> tuple[float, float]:
         """A point inside of the shape, well away from its boundary: where its name can stand [m]."""

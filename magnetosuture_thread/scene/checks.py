@@ -1,0 +1,111 @@
+"""Looks through a scene for what is allowed and yet is often a slip: overlaps, narrow gaps, shapes across the wall."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import shapely
+
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.scene.scene import Scene, SceneShape
+
+LEAST_OVERLAP = 1e-12  # m^2; shapes that share a boundary do not overlap
+
+
+@dataclass(frozen=True)
+class SceneWarning:
+    """Something to look at.
+
+    Attributes:
+        what: overlap, gap, hole or wall.
+        shapes: names of the shapes that it is about.
+        value: the gap's width, or how far a shape reaches beyond the wall [m]; of an overlap its area [m^2].
+        place: where [m].
+        text: the same in words.
+    """
+
+    what: str
+    shapes: tuple[str, ...]
+    value: float
+    place: tuple[float, float]
+    text: str
+
+
+def scene_warnings(scene: Scene, needle_width: float) -> list[SceneWarning]:
+    """Return what is to be looked at, shape by shape, then pair by pair.
+
+    Args:
+        scene: to look through.
+        needle_width: a gap or a hole narrower than this lets no needle pass [m].
+    """
+    found = [warning for shape in scene.shapes for warning in _alone(shape, scene.dish.radius, needle_width)]
+    solids = [(shape, shape.solid) for shape in scene.shapes]
+    for (first, one), (second, other) in combinations(solids, 2):
+        if shapely.box(*one.bounds).distance(shapely.box(*other.bounds)) < needle_width:
+            found += _together(first, one, second, other, needle_width)
+    return found
+
+
+def farthest_point(shape: SceneShape) -> tuple[float, float]:
+    """Return the point of a shape that is farthest from the dish's centre [m]."""
+    geometry = shape.geometry
+    if isinstance(geometry, Disc):
+        x, y = geometry.centre[0], geometry.centre[1]
+        away = math.hypot(x, y)
+        ahead = (x / away, y / away) if away > 0.0 else (1.0, 0.0)
+        return x + geometry.radius * ahead[0], y + geometry.radius * ahead[1]
+    outline = geometry.rings[0]
+    x, y = outline[int(np.argmax(np.hypot(*outline.T)))].tolist()
+    return x, y
+
+
+def _alone(shape: SceneShape, dish_radius: float, needle_width: float) -> Iterator[SceneWarning]:
+    place = farthest_point(shape)
+    room = dish_radius - math.hypot(*place)
+    if room < 0.0:
+        text = f"{shape.name} lies across the wall: it reaches {_mm(-room)} mm beyond"
+        yield SceneWarning("wall", (shape.name,), -room, place, text)
+    elif room < needle_width:
+        yield SceneWarning("gap", (shape.name,), room, place, _gap(f"{shape.name} and the wall", room, place))
+    for hole in [] if isinstance(shape.geometry, Disc) else shape.geometry.holes:
+        solid = shapely.Polygon(hole)
+        if solid.buffer(-0.5 * needle_width).is_empty:
+            circle = shapely.maximum_inscribed_circle(solid, tolerance=0.01 * needle_width)
+            x, y = circle.coords[0]
+            width = 2.0 * circle.length
+            text = f"a hole of {shape.name} at {_at((x, y))} is {_mm(width)} mm wide: narrower than the needle"
+            yield SceneWarning("hole", (shape.name,), width, (x, y), text)
+
+
+def _together(
+    first: SceneShape, one: shapely.Geometry, second: SceneShape, other: shapely.Geometry, needle_width: float
+) -> Iterator[SceneWarning]:
+    names = (first.name, second.name)
+    common = one.intersection(other)
+    if common.area > LEAST_OVERLAP:
+        inside = common.representative_point()
+        place = float(inside.x), float(inside.y)
+        text = f"{first.name} and {second.name} overlap by {1e6 * common.area:.3g} mm^2 at {_at(place)}"
+        yield SceneWarning("overlap", names, float(common.area), place, text)
+        return
+    gap = float(one.distance(other))
+    if gap < needle_width:
+        middle = shapely.shortest_line(one, other).interpolate(0.5, normalized=True)
+        place = float(middle.x), float(middle.y)
+        yield SceneWarning("gap", names, gap, place, _gap(f"{first.name} and {second.name}", gap, place))
+
+
+def _gap(between: str, width: float, place: tuple[float, float]) -> str:
+    return f"the gap between {between} at {_at(place)} is {_mm(width)} mm wide: narrower than the needle"
+
+
+def _mm(length: float) -> str:
+    return f"{1e3 * length:.3g}"
+
+
+def _at(place: tuple[float, float]) -> str:
+    return f"({1e3 * place[0]:.2f}, {1e3 * place[1]:.2f}) mm"
