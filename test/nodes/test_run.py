@@ -40,7 +40,7 @@ def heard(name: str, environment: dict[str, str]) -> bool:
     names: list[str] = []
     topic = topics.DIAGNOSTICS
     listener.create_subscription(topic.message, topic.name, lambda m: names.append(m.status[0].name), topic.qos)
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline and f"{name}: state" not in names:
         executor.spin_once(timeout_sec=0.1)
     executor.shutdown()

@@ -1,0 +1,215 @@
+"""Tracker and model in one process: the same bits as apart, one clear line where one cannot start, a clean end."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from magnetosuture_msgs.msg import PredictedThread, SafetyMargins
+from rclpy.parameter import Parameter
+
+from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.perception import perception
+from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
+from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
+from test.nodes.conftest import Graph
+from test.nodes.test_run import heard as is_heard
+from test.nodes.test_vision_tracker import compressed
+
+FRAMES = 8
+
+
+def together(graph: Graph, **parameters: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
+    """Add both nodes, made by the composition."""
+    overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+    made = perception(context=graph.context, parameter_overrides=overrides)
+    for node in made:
+        graph.nodes.append(node)
+        graph.executor.add_node(node)
+    return made
+
+
+def met(graph: Graph, tracker: VisionTrackerNode, model: ThreadModelNode) -> None:
+    """Wait until the model hears what the tracker says."""
+    names = {f"/{topic.name}" for topic in (topics.NEEDLE_POSE, topics.SEEN_THREAD)}
+    said = [entry for entry in tracker.publishers if entry.topic_name in names]
+    heard = [entry for entry in model.subscriptions if entry.topic_name in names]
+    assert len(said) == len(heard) == len(names)
+    graph.wait(
+        lambda: (
+            all(entry.get_subscription_count() for entry in said)
+            and all(entry.get_publisher_count() for entry in heard)
+        ),
+        "tracker and model to meet",
+    )
+
+
+def answers(graph: Graph, frames: list[np.ndarray]) -> tuple[list[PredictedThread], list[SafetyMargins]]:
+    """Return what comes of frames, one after the other."""
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+    seen = graph.listen(topics.SEEN_THREAD)
+    for index, image in enumerate(frames):
+        stamp = Time(sec=5, nanosec=index * 33_000_000)
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, stamp))
+        # Confirmed in the third frame; each later one is answered before the next is shown.
+        count = max(0, index - 1)
+        graph.wait(lambda count=count: len(predicted) >= count and len(seen) >= count, "an answer")
+    graph.wait(lambda: bool(margins) and margins[-1].header.stamp == predicted[-1].header.stamp, "its margins")
+    return predicted, margins
+
+
+@pytest.fixture
+def frames(camera, thread_arc) -> list[np.ndarray]:
+    """Pictures of a needle that moves on and turns."""
+    shown = []
+    for index in range(FRAMES):
+        angle = 0.4 + 0.01 * index
+        tail = np.array([0.002 + 1e-4 * index, 0.001])
+        shown.append(camera.render(tail, angle, thread_arc(tail, angle + np.pi, 40.0)))
+    return shown
+
+
+def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
+    said = []
+    for alone in (True, False):
+        with reserved_domain() as domain:
+            graph = Graph(domain)
+            try:
+                if alone:
+                    tracker, model = graph.add(VisionTrackerNode), graph.add(ThreadModelNode)
+                    met(graph, tracker, model)
+                else:
+                    together(graph)
+                predicted, margins = answers(graph, frames)
+            finally:
+                graph.close()
+        for message in predicted:
+            message.step_time = 0.0  # that is a clock's
+        said.append((predicted, [m for m in margins if m.valid]))
+    apart, joined = said
+    assert len(apart[0]) == FRAMES - 2
+    assert apart == joined
+
+
+def test_the_thread_is_handed_over_and_no_message_is_taken_besides(graph, frames):
+    _, model = together(graph)
+    assert not {"/needle/measured_cp", "/thread/measured"} & {entry.topic_name for entry in model.subscriptions}
+    predicted, _ = answers(graph, frames)
+    assert [message.header.stamp.nanosec for message in predicted] == [k * 33_000_000 for k in range(2, FRAMES)]
+
+
+def test_markers_come_only_where_somebody_looks(graph, frames):
+    together(graph)
+    predicted, _ = answers(graph, frames[:4])
+    markers = graph.listen(topics.THREAD_MARKERS)
+    for index, image in enumerate(frames[4:], start=4):
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=index * 33_000_000)))
+        graph.wait(lambda index=index: len(predicted) >= index - 1, "an answer")
+    graph.wait(lambda: bool(markers), "markers")
+    assert len(markers[-1].markers[0].points) == len(predicted[-1].vertices)
+
+
+def test_both_say_how_they_are(graph, frames):
+    said = graph.listen_later(topics.DIAGNOSTICS)
+    together(graph)
+    names = {"vision_tracker: state", "thread_model: state"}
+    graph.wait(lambda: names <= {array.status[0].name for array in said}, "both diagnostics")
+    answers(graph, frames)
+    graph.wait(
+        lambda: {"tracking", "predicting"} <= {array.status[0].message for array in said},
+        "both to be well",
+        timeout=10.0,
+    )
+
+
+def test_a_stamp_that_is_none_is_refused_by_the_model_alone(graph, frames):
+    said, poses = graph.listen_later(topics.DIAGNOSTICS), graph.listen_later(topics.NEEDLE_POSE)
+    tracker = VisionTrackerNode(context=graph.context, parameter_overrides=[Parameter("confirm_frames", value=1)])
+    model = ThreadModelNode(context=graph.context, listens=False)
+    tracker.hand_to(model)
+    for node in (tracker, model):
+        graph.nodes.append(node)
+        graph.executor.add_node(node)
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(frames[0], Time(sec=5, nanosec=1_500_000_000)))
+    graph.wait(lambda: bool(poses), "the pose")
+    words = "needle/measured_cp.header.stamp.nanosec"
+    graph.wait(lambda: any(words in array.status[0].message for array in said), "the refusal")
+
+
+def test_one_that_cannot_be_made_takes_the_other_along(graph):
+    with pytest.raises(MagnetosutureError, match="thread_model"):
+        together(graph, needle_width=0.0004)  # the tracker's; no parameter of the model
+    nodes = graph.probe.get_node_names()
+    graph.wait(lambda: "vision_tracker" not in graph.probe.get_node_names(), f"none of {nodes}")
+
+
+SETUP = """
+/**/vision_tracker:
+  ros__parameters:
+    thread_length: {tracker}
+/**/thread_model:
+  ros__parameters:
+    length: {model}
+    segments: 12
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_the_program_runs_until_it_is_asked_to_end(tmp_path: Path, end: signal.Signals):
+    path = tmp_path / "setup.yaml"
+    path.write_text(SETUP.format(tracker=0.018, model=0.018))
+    with reserved_domain() as domain, (tmp_path / "log").open("wb") as log:
+        environment = graph_environment(domain)
+        command = [sys.executable, "-m", "magnetosuture_thread.nodes.perception", "--ros-args"]
+        process = subprocess.Popen(
+            [*command, "--params-file", str(path), "-r", "__ns:=/lab1"], env=environment, stdout=log, stderr=log
+        )
+        try:
+            assert is_heard("lab1/vision_tracker", environment)
+            assert is_heard("lab1/thread_model", environment)
+            process.send_signal(end)
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
+    said = (tmp_path / "log").read_text()
+    assert "Traceback" not in said
+    assert "ready: 12 segments" in said
+
+
+@pytest.mark.parametrize(
+    ("tracker", "model", "arguments", "words"),
+    [
+        (0.018, 18.0, (), "thread_model.length: got 18.0, expected a number from"),
+        (18.0, 0.018, (), "vision_tracker.thread_length: got 18.0, expected a number from"),
+        (0.018, 0.018, ("-r", "__node:=both"), "two nodes cannot both be named both"),
+    ],
+)
+def test_a_node_that_cannot_start_ends_the_program_with_one_line(
+    tmp_path: Path, tracker: float, model: float, arguments: tuple[str, ...], words: str
+):
+    path = tmp_path / "setup.yaml"
+    text = SETUP if not arguments else ""
+    path.write_text(text.format(tracker=tracker, model=model))
+    given = ["--params-file", str(path)] if text else []
+    with reserved_domain() as domain:
+        ended = subprocess.run(
+            [sys.executable, "-m", "magnetosuture_thread.nodes.perception", "--ros-args", *given, *arguments],
+            env=graph_environment(domain),
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert ended.returncode == 1
+    errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert words in errors[0]
+    assert "Traceback" not in ended.stderr
