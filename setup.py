@@ -27,6 +27,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", files("config/*.yaml")),
+        (f"share/{PACKAGE}/config/scenes", files("config/scenes/*")),
         (f"share/{PACKAGE}/config/viewers", files("config/viewers/*")),
         (f"share/{PACKAGE}/launch", files("launch/*.launch.py")),
     ],

@@ -53,7 +53,7 @@ ALLOWED = {
             "offline",
         ),
     },
-    "cli": {"errors", "setups", "jobs", "study"},
+    "cli": {"errors", "scene", "setups", "jobs", "study"},
 }
 
 # Packages that only some rooms may know.

@@ -34,7 +34,7 @@ from magnetosuture_thread.nodes.console_tap import ConsoleTap
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 
-SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
+SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     pose = messages.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
     path = messages.PathMaker().message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
     margins = thread_messages.invalid_margins(stamp, "no pose")
-    tell(graph, topics.OBSTACLE_MARKERS, discs, lambda: console.state()["obstacles"], "the obstacles")
+    tell(graph, topics.SCENE_MARKERS, discs, lambda: console.state()["obstacles"], "the obstacles")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
     tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["seen"], "the seen thread")
     tell(graph, topics.MARGINS, margins, lambda: console.state()["margins"], "the margins")
@@ -168,7 +168,7 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     assert state["margins"]["reason"] == "no pose"
     assert state["obstacles"] == [{"disc": [0.001, 0.002, 0.003]}]
     assert state["dish_diameter"] == 0.035
-    console.begin(ConsoleSettings(dish_diameter=0.15))
+    console.begin(ConsoleSettings(scene="dish_150mm"))
     state = console.state()
     assert state["dish_diameter"] == 0.15
     assert (state["needle"], state["seen"]) == (None, [])
@@ -280,7 +280,7 @@ def program(domain: int, *parameters: str) -> subprocess.Popen[str]:
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
 def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, which: signal.Signals):
     reports = graph.listen_later(topics.DIAGNOSTICS)
-    with program(graph.domain, "port:=0", "dish_diameter:=0.15") as process:
+    with program(graph.domain, "port:=0", "scene:=dish_150mm") as process:
         try:
             assert process.stdout is not None
             found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
@@ -297,7 +297,7 @@ def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, wh
 @pytest.mark.parametrize(
     ("parameter", "words"),
     [
-        ("dish_diameter:=35.0", "console.dish_diameter: got 35.0"),
+        ("needle_length:=35.0", "console.needle_length: got 35.0"),
         ("dish:=0.035", "console.dish: got 0.035"),
         ("address:=0.0.0.0", "a token, as 0.0.0.0 can be reached"),
     ],
