@@ -18,6 +18,8 @@ from magnetosuture_thread.jobs.behaviour import behaviour
 from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.simulate import simulate
 from magnetosuture_thread.resources import setup_file
+from magnetosuture_thread.scene import read_scene
+from magnetosuture_thread.scene.messages import scene_of
 
 pytestmark = pytest.mark.whole_graph
 
@@ -113,10 +115,13 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
         "/thread/predicted",
         "/thread/margins",
         "/thread/markers",
-        "/thread/obstacles",
+        "/scene",
         "/diagnostics",
     ):
         assert bag.counts[topic] > 0, topic
+    (told,) = bag.records({"/scene"})
+    assert scene_of(told.decode()) == read_scene("dish_35mm")
+    assert told.time == bag.start
     first = min(record.time for record in bag.records({"/truth/needle"}))
     assert first - bag.start < 0.5e9  # the nodes' start is not in it
     covariances = [record.decode().pose.covariance for record in bag.records({"/needle/measured_cp"})]
