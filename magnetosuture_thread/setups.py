@@ -110,9 +110,9 @@ def read_setup(name: str, scene: Scene | None = None) -> Setup:
     settings = load_setup(path, CLASSES)
     _check_agreement(path, settings)
     setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))
-    if scene is not None:
-        setup = setup.within(scene)
-    if scene is not None or setup.has_scene:
+    if scene is not None:  # as of a bag, of which no path is followed
+        return setup.within(scene)
+    if setup.has_scene:
         try:
             setup.follower.check_path(setup.scene)
         except ConfigurationError as error:

@@ -65,7 +65,7 @@ ALLOWED = {
             "packing",
         ),
     },
-    "cli": {"errors", "setups", "jobs", "study"},
+    "cli": {"errors", "scene", "setups", "jobs", "study"},
 }
 
 # Packages that only some rooms may know.

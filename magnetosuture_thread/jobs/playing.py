@@ -113,4 +113,10 @@ class Playing:
             told = [channel for channel in CHANGING if channel != SCENE]
             for record in given.recording.records(told, duration=given.start):
                 yield replace(record, time=given.begin)
-        yield from given.recording.records(self.channels, start=given.start, duration=given.duration)
+        version = given.setup.scene.version
+        for record in given.recording.records(self.channels, start=given.start, duration=given.duration):
+            if record.topic == SCENE.recorded:
+                before, version = version, str(record.decode().version)
+                if version == before:
+                    continue
+            yield record

@@ -112,14 +112,12 @@ def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
     attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.GLUED}.get(str(metadata.get("boundary")))
     length = metadata.get("material", {}).get("L_m")
     for name, given, expected in (
-        ("thread_length", setup.model.thread_length, length),
-        ("attachment", setup.model.attachment, attachment.value if attachment else None),
+        ("thread_model.thread_length", setup.model.thread_length, length),
+        ("thread_model.attachment", setup.model.attachment, attachment.value if attachment else None),
         ("scene", setup.scene.obstacles, reference.discs),
     ):
         if expected is not None and not _same(given, expected):
-            raise ConfigurationError(
-                f"thread_model.{name}", given, f"{expected}, as in {reference.name}", str(setup.path)
-            )
+            raise ConfigurationError(name, given, f"{expected}, as in {reference.name}", str(setup.path))
 
 
 def _same(given: object, expected: object) -> bool:

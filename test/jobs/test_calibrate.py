@@ -24,10 +24,14 @@ from test.study.calibration.runs import LENGTH, rig_run
 
 TRUE = 1.6e-9  # m^4/s; the material's is 1.3e-9
 SETUP = """\
-thread_model:
+/**:
+  ros__parameters:
+    scene: dish_35mm
+    thread_length: 0.019
+
+/**/thread_model:
   ros__parameters:
     material: polyamide_7_0
-    length: 0.019
     segments: 12
     attachment: pinned
     longest_step: 0.07
@@ -160,7 +164,7 @@ def test_bags_of_different_threads_are_refused(folder: Path, tmp_path: Path):
 
 def test_a_bag_of_another_length_is_refused(folder: Path, tmp_path: Path):
     setup = tmp_path / "long.yaml"
-    setup.write_text(SETUP.replace("0.019", "0.15") + "vision_tracker:\n  ros__parameters:\n    thread_length: 0.15\n")
+    setup.write_text(SETUP.replace("0.019", "0.15"))
     with pytest.raises(BagError, match="is it another thread"):
         calibrate([folder / "one"], tmp_path / "found.yaml", Request(setup=str(setup)))
 

@@ -256,7 +256,7 @@ def check(path: Path) -> Bag:
     assert bag.damage is None
     assert "steered by a person" in bag.notes["simulated"]
     assert "thread_model" in bag.notes["scenario"]
-    for name in ("/operator/servo_cv", "/needle/servo_cv", "/camera/image_raw/compressed"):
+    for name in ("/operator/servo_cv", "/needle/filter_state", "/camera/image_raw/compressed", "/scene"):
         assert bag.counts[name] > 0, name
     wishes = [record.decode().twist.linear.x for record in bag.records({"/operator/servo_cv"})]
     assert 0.005 in wishes

@@ -13,6 +13,7 @@ from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.scene.messages import scene_of
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 from magnetosuture_thread.vision.images import decode_image
@@ -25,6 +26,7 @@ def test_the_bag_holds_frames_commands_and_truth_and_says_that_it_is_simulated(s
         "/camera/image_raw/compressed": 30,
         "/camera/camera_info": 30,
         "/needle/servo_cv": 30,
+        "/scene": 1,
         "/truth/needle": 30,
         "/truth/thread": 30,
     }
@@ -97,9 +99,9 @@ def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: Referenc
 @pytest.mark.parametrize(
     ("metadata", "discs", "words"),
     [
-        ({"material": {"L_m": 0.15}}, (), r"thread_model\.length: got 0\.019, expected 0\.15"),
+        ({"material": {"L_m": 0.15}}, (), r"thread_model\.thread_length: got 0\.019, expected 0\.15"),
         ({"boundary": "pinned"}, (), r"thread_model\.attachment: got 'glued', expected pinned"),
-        ({}, (Disc((0.0, 0.0), 0.002),), r"thread_model\.disc_obstacles: got \(\), expected .*radius=0\.002"),
+        ({}, (Disc((0.0, 0.0), 0.002),), r"scene: got \(\), expected .*radius=0\.002"),
     ],
 )
 def test_a_setup_for_another_thread_is_refused(
@@ -137,7 +139,7 @@ def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: Reference
         assert count == 120
     bag = Bag(tmp_path / "one")
     topics = ("/needle/measured_cp", "/thread/measured", "/needle/servo_cv", "/truth/needle", "/truth/thread")
-    assert bag.counts == dict.fromkeys(topics, 120)
+    assert bag.counts == {"/scene": 1, **dict.fromkeys(topics, 120)}
     assert bag.notes["simulated"] == "needle poses and seen thread from the reference trajectory straight_pull"
     off: list[float] = []
     turned: list[float] = []
@@ -160,3 +162,15 @@ def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: Reference
     data = {name: next((tmp_path / name).glob("*.mcap")).read_bytes() for name in ("one", "same", "other")}
     stored = {name: [each.data for each in Bag(tmp_path / name).records({topics[0]})] for name in data}
     assert stored["one"] == stored["same"] != stored["other"]
+
+
+@pytest.mark.parametrize("poses", [False, True])
+def test_a_bag_begins_with_the_scene(tmp_path: Path, straight_pull: ReferenceTrajectory, poses: bool):
+    setup = read_setup("petri_35mm_polyamide")
+    record(straight_pull, setup, tmp_path / "bag", duration=0.2, poses=poses)
+    bag = Bag(tmp_path / "bag")
+    first = next(iter(bag.records(set(bag.topics))))
+    assert first.topic == "/scene"
+    assert first.time == bag.start
+    assert scene_of(first.decode()) == setup.scene
+    assert sum(1 for _ in bag.records({"/scene"})) == 1

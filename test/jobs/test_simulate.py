@@ -18,18 +18,20 @@ from magnetosuture_thread.jobs.behaviour import behaviour
 from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.simulate import simulate
 from magnetosuture_thread.resources import setup_file
+from magnetosuture_thread.scene import read_scene
+from magnetosuture_thread.scene.messages import scene_of
 
 pytestmark = pytest.mark.whole_graph
 
 SHORT = """
-vision_tracker: {ros__parameters: {dish_diameter: 0.035}}
-rig_simulator:
+/**: {ros__parameters: {scene: dish_35mm}}
+/**/rig_simulator:
   ros__parameters:
     needle_start: [0.004, 0.0, 0.0]
     thread_segments: 30
     frame_rate: 30.0
 FAULTS
-path_follower:
+/**/path_follower:
   ros__parameters:
     waypoints: [0.0125, 0.0035]
 """
@@ -113,10 +115,13 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
         "/thread/predicted",
         "/thread/margins",
         "/thread/markers",
-        "/thread/obstacles",
+        "/scene",
         "/diagnostics",
     ):
         assert bag.counts[topic] > 0, topic
+    (told,) = bag.records({"/scene"})
+    assert scene_of(told.decode()) == read_scene("dish_35mm")
+    assert told.time == bag.start
     first = min(record.time for record in bag.records({"/truth/needle"}))
     assert first - bag.start < 0.5e9  # the nodes' start is not in it
     covariances = [record.decode().pose.covariance for record in bag.records({"/needle/measured_cp"})]
@@ -169,7 +174,7 @@ def test_a_run_can_be_ended_before_its_path(scenario: Path, tmp_path: Path):
 
 def test_a_scenario_without_a_path_is_refused(tmp_path: Path):
     path = tmp_path / "still.yaml"
-    path.write_text("vision_tracker: {ros__parameters: {dish_diameter: 0.035}}\n")
+    path.write_text("/**: {ros__parameters: {scene: dish_35mm}}\n")
     with pytest.raises(ConfigurationError, match=r"path_follower\.waypoints"):
         simulate(str(path), tmp_path / "bag")
     assert not (tmp_path / "bag").exists()
@@ -177,7 +182,7 @@ def test_a_scenario_without_a_path_is_refused(tmp_path: Path):
 
 def test_raw_frames_are_refused_as_the_bag_would_not_hold_them(tmp_path: Path):
     path = tmp_path / "raw.yaml"
-    path.write_text(SHORT.replace("{dish_diameter: 0.035}", "{image_transport: raw}").replace("FAULTS", ""))
+    path.write_text(SHORT.replace("FAULTS", "") + "/**/vision_tracker: {ros__parameters: {image_transport: raw}}\n")
     with pytest.raises(ConfigurationError, match=r"vision_tracker\.image_transport"):
         simulate(str(path), tmp_path / "bag")
 

@@ -197,7 +197,8 @@ def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.C
     file = tmp_path / "camera.yaml"
     assert cli.main(["calibrate-camera", str(SAMPLES), "--dish-diameter", "0.035", "--output", str(file)]) == 0
     assert "5 frames" in capsys.readouterr().out
-    assert cli.main(["track", str(SAMPLES), "--setup", str(file), "--json", str(tmp_path / "seen.json")]) == 0
+    given = ["--setup", str(file), "--scene", "dish_35mm", "--json", str(tmp_path / "seen.json")]
+    assert cli.main(["track", str(SAMPLES), *given]) == 0
     assert {row["status"] for row in json.loads((tmp_path / "seen.json").read_text())} == {"tracked"}
 
 

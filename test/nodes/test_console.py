@@ -37,7 +37,7 @@ from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
 from test.nodes.margins import no_margins
 
-SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
+SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
 
 @pytest.fixture
@@ -313,6 +313,7 @@ def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, wh
     ("parameter", "words"),
     [
         ("scene:=nowhere", "scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dish_150mm"),
+        ("needle_length:=35.0", "console.needle_length: got 35.0"),
         ("dish:=0.035", "console.dish: got 0.035"),
         ("address:=0.0.0.0", "a token, as 0.0.0.0 can be reached"),
     ],

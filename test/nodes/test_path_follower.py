@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from builtin_interfaces.msg import Time
 
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from test.nodes.scenes import scene_told
 
 EAST = np.array([1.0, 0.0])
 
@@ -83,3 +88,33 @@ def test_it_waits_for_as_many_as_it_is_told(graph):
     graph.wait(lambda: node._commands.get_subscription_count() == 2, "the second")
     graph.publish(topics.NEEDLE_POSE, pose(5.1, 0.0))
     graph.wait(lambda: bool(first and second), "commands")
+
+
+def test_a_path_that_another_scene_blocks_is_not_followed_until_it_is_free_again(graph):
+    graph.add(PathFollowerNode, settle=0.0, waypoints=[0.012, 0.0], scene="dish_35mm")
+    commands, diagnostics = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
+    graph.wait(lambda: len(commands) == 1, "a command")
+    post = SceneShape("post", "wall", Disc((0.0123, 0.0), 0.001))
+    graph.publish(topics.SCENE, scene_told(Scene(Dish(0.035), (post,))))
+    seconds = 5.0
+
+    def says(words: str) -> bool:
+        nonlocal seconds
+        seconds += 1 / 60
+        graph.publish(topics.NEEDLE_POSE, pose(seconds, 0.0))
+        return any(words in report.status[0].message for report in diagnostics[-1:])
+
+    graph.wait(lambda: says("waypoints: got [0.012, 0.0], expected a point outside of post"), "the reason")
+    before = len(commands)
+    graph.publish(topics.NEEDLE_POSE, pose(seconds + 0.01, 0.0))
+    graph.publish(topics.SCENE, scene_told(Scene(Dish(0.035))))
+    graph.wait(lambda: says("following"), "the path to be followed again")
+    assert len(commands) > before
+
+
+def test_a_path_that_is_blocked_from_the_start_is_refused(graph):
+    with pytest.raises(ConfigurationError, match="expected a point outside of post"):
+        graph.add(PathFollowerNode, waypoints=[0.008, 0.004], scene="dish_35mm_post")
+    with pytest.raises(ConfigurationError, match=r"expected within the dish, 0\.0175 m"):
+        graph.add(PathFollowerNode, waypoints=[0.02, 0.0], scene="dish_35mm")

@@ -13,11 +13,14 @@ from std_srvs.srv import SetBool
 
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.errors import ConfigurationError, SolverError
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.nodes.rig_time import RigTime
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from test.nodes.scenes import scene_told
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
@@ -241,3 +244,24 @@ def test_a_paused_simulated_clock_stands_still(graph):
     node.time.pause(False)
     graph.wait(lambda: nanoseconds(clocks[-1].clock) > still, "the clock to go on")
     assert nanoseconds(clocks[-1].clock) < still + 60e9
+
+
+def test_the_scene_that_is_told_is_drawn_and_one_that_cannot_be_is_refused(graph):
+    node = graph.add(RigSimulatorNode, **SMALL)
+    frames, diagnostics = graph.listen(topics.CAMERA_INFO), graph.listen(topics.DIAGNOSTICS)
+    graph.wait(lambda: bool(frames), "a frame")
+    before = frames[-1].k[0]
+    other = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.002)),))
+    graph.publish(topics.SCENE, scene_told(other))
+    graph.wait(lambda: node.rig.scene.version == other.version, "the other scene")
+    graph.wait(lambda: frames[-1].k[0] < 0.9 * before, "a frame of the wider dish")
+    on_needle = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.006, 0.0), 0.002)),))
+    graph.publish(topics.SCENE, scene_told(on_needle))
+    refusal = "refused: scene: got post where the needle is"
+    graph.wait(lambda: any(refusal in d.status[0].message for d in diagnostics), "the refusal")
+    assert node.rig.scene.version == other.version
+
+
+def test_without_a_scene_there_is_nothing_to_simulate(graph):
+    with pytest.raises(ConfigurationError, match=r"rig_simulator\.scene: got '', expected a scene file"):
+        graph.add(RigSimulatorNode, needle_start=[0.003, 0.0, 0.0])

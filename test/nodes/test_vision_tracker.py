@@ -13,6 +13,8 @@ from sensor_msgs.msg import CompressedImage, Image
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.scene import Dish, Scene
+from test.nodes.scenes import scene_told
 
 TAIL = np.array([0.002, 0.001])
 
@@ -148,3 +150,15 @@ def test_a_camera_that_falls_silent_is_noticed(graph, camera, thread_arc):
     assert tracking[-1].state == TrackerState.STATE_LOST
     graph.wait(lambda: any(text.startswith("no camera frame for") for text in states(diagnostics)), "a warning")
     assert len(poses) == 1
+
+
+def test_without_a_scene_it_waits_for_the_topic(graph, camera, thread_arc):
+    node = graph.add(VisionTrackerNode, confirm_frames=1)
+    diagnostics, poses = graph.listen(topics.DIAGNOSTICS), graph.listen(topics.NEEDLE_POSE)
+    graph.wait(lambda: any("no scene yet" in d.status[0].message for d in diagnostics), "the reason")
+    graph.publish(topics.SCENE, scene_told(Scene(Dish(0.035))))
+    graph.wait(lambda: node._session is not None, "the scene")
+    image = frame(camera, thread_arc)
+    for index in range(3):
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5 + index)))
+        graph.wait(lambda n=index: len(poses) > n, "a pose")

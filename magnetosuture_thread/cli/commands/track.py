@@ -32,6 +32,7 @@ def add(subparsers: Subparsers) -> None:
         metavar="NAME",
         help="a set-up's name or YAML file (default: %(default)s)",
     )
+    parser.add_argument("--scene", default="", metavar="NAME", help="a scene's name or file (default: the set-up's)")
     parser.add_argument(
         "--metres-per-pixel",
         type=number(1e-7, 1e-2),
@@ -55,12 +56,13 @@ def add(subparsers: Subparsers) -> None:
 def run(options: argparse.Namespace) -> int:
     """Track the needle in camera frames."""
     from magnetosuture_thread.jobs.track import settings_with, track
+    from magnetosuture_thread.scene import read_scene
     from magnetosuture_thread.setups import read_setup
     from magnetosuture_thread.study.track_table import track_lines, track_table
 
     console = make_console()
     say = sayer(console)
-    setup = read_setup(options.setup)
+    setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
     settings = settings_with(setup.vision, options.metres_per_pixel, options.centre)
     with progress(console, "track") as advance:
         frames = track(

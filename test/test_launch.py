@@ -1,0 +1,92 @@
+"""The launch file, over stand-ins for launch: which arguments it takes, and what it starts with which parameters."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+from magnetosuture_thread.interface import NODES, RIG_NODES
+
+ROOT = Path(__file__).parent.parent
+SHIPPED = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
+
+
+def kept(kind: str) -> Callable[..., SimpleNamespace]:
+    """Return what stands in for a class of launch: it keeps what it is given."""
+    return lambda *given, **named: SimpleNamespace(kind=kind, given=given, **named)
+
+
+class Configuration:
+    """Stands in for LaunchConfiguration."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def perform(self, context: dict[str, str]) -> str:
+        """Return the argument's value."""
+        return context[self.name]
+
+
+@pytest.fixture
+def description(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return what the launch file describes."""
+    modules = {
+        "ament_index_python": {},
+        "ament_index_python.packages": {"get_package_share_directory": lambda package: str(ROOT)},
+        "launch": {"LaunchContext": dict, "LaunchDescription": lambda entries: entries},
+        "launch.actions": {"DeclareLaunchArgument": kept("argument"), "OpaqueFunction": kept("function")},
+        "launch.conditions": {"IfCondition": kept("if"), "UnlessCondition": kept("unless")},
+        "launch.substitutions": {"LaunchConfiguration": Configuration},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": kept("node")},
+    }
+    for name, contents in modules.items():
+        module = ModuleType(name)
+        for entry, value in contents.items():
+            setattr(module, entry, value)
+        monkeypatch.setitem(sys.modules, name, module)
+    spec = importlib.util.spec_from_file_location("launched", ROOT / "launch" / "magnetosuture.launch.py")
+    assert spec is not None
+    assert spec.loader is not None
+    launched = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(launched)
+    return list(launched.generate_launch_description())
+
+
+def nodes(description: list[Any], **arguments: str) -> list[Any]:
+    """Return the nodes that are started with arguments."""
+    declared = {entry.given[0]: entry for entry in description if entry.kind == "argument"}
+    given = {name: arguments.get(name, entry.default_value) for name, entry in declared.items()}
+    (function,) = (entry for entry in description if entry.kind == "function")
+    return list(function.function(given))
+
+
+def test_a_setup_is_one_of_those_that_ship(description):
+    (setup,) = (entry for entry in description if entry.kind == "argument" and entry.given[0] == "setup")
+    assert setup.choices == SHIPPED
+    assert setup.default_value in setup.choices
+
+
+def test_every_node_gets_the_same_file_and_namespace(description):
+    started = nodes(description, setup="hernia_ring")
+    assert {node.executable for node in started} == {"scene_server", *NODES, *RIG_NODES, "console"}
+    for node in started:
+        assert node.name == node.executable
+        assert node.parameters[0] == str(ROOT / "config" / "hernia_ring.yaml")
+        assert node.namespace.name == "namespace"
+    bridges = {node.condition.kind: node.parameters[2:] for node in started if node.executable == "coil_bridge"}
+    assert bridges == {"unless": [], "if": [{"driver": "simulated", "autostart": "armed"}]}
+
+
+def test_a_file_of_ones_own_comes_in_place_of_a_name_and_must_be_there(description, tmp_path: Path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("")
+    assert {node.parameters[0] for node in nodes(description, setup_file=str(mine))} == {str(mine)}
+    with pytest.raises(FileNotFoundError, match=r"setup_file: got '.*nowhere\.yaml', expected a parameter file"):
+        nodes(description, setup_file=str(tmp_path / "nowhere.yaml"))
