@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import cmath
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 Points = NDArray[np.float64]
+TIGHTEST = 0.3  # of the radius of a circle that a polyline turns in
 
 
 def arc_lengths(points: Points) -> NDArray[np.float64]:
@@ -99,6 +103,38 @@ def chain_inside(points: Points, segments: int, segment_length: float, radius: f
             step = _along_circle(centre, step, segment_length, radius)
         chain[index] = centre + step
     return chain
+
+
+def laid_behind(tail: Points, heading: Points, length: float, radius: float) -> Points:
+    """Return a polyline of a length behind a needle in the plane: straight, and where a circle is in the way, turning.
+
+    It turns by arcs of `TIGHTEST` of the circle's radius, so early that it comes to lie along the circle.
+
+    Args:
+        tail: of the needle, shape (2,) [m].
+        heading: unit vector along it, shape (2,).
+        length: of the polyline [m].
+        radius: of the circle about the origin; inf for none [m].
+
+    Returns:
+        Vertices, shape (m, 2) [m].
+    """
+    if not math.hypot(*(tail - length * heading).tolist()) > radius:
+        return np.array([tail, tail - length * heading])
+    arc = TIGHTEST * radius
+    spacing = 0.05 * arc
+    # In complex numbers: to turn is to multiply. The origin is to the left where the side is 1.
+    way, place = complex(*(-heading).tolist()), complex(*tail.tolist())
+    side = 1.0 if (way.conjugate() * -place).imag >= 0.0 else -1.0
+    turn = cmath.exp(1j * side * spacing / arc)
+    laid = [place]
+    while len(laid) <= length / spacing + 1.0:
+        ahead = place + spacing * way
+        if abs(ahead + 1j * side * arc * way) > radius - arc:  # from there it could not turn in any more
+            way *= turn
+        place += spacing * way
+        laid.append(place)
+    return np.array([[point.real, point.imag] for point in laid])
 
 
 def _along_circle(centre: Points, step: Points, length: float, radius: float) -> Points:

@@ -129,6 +129,7 @@ class ThreadPredictor:
         with suppress(SolverError):  # an obstacle that lies here says nothing of a thread that lies elsewhere
             for count in (1, 2):
                 self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
+        self._formulation.warm_up()
         self.reset()
 
     def reset(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, laid_behind
 from magnetosuture_thread.model.friction import FrictionLaw
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import FARTHEST, NeedlePose, Prediction
@@ -194,7 +195,8 @@ class ThreadSession:
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":
-            return np.array([attached.tail, attached.tail - self.thread.length * attached.heading])
+            radius = self.scene.dish.radius - 0.5 * self.thread.diameter if self.scene is not None else math.inf
+            return laid_behind(attached.tail, attached.heading, self.thread.length, radius)
         if self._seen is None or self._seen[0] != stamp:
             return None
         centreline = self._seen[1]

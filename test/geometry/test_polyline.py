@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magnetosuture_thread.geometry.polyline import arc_lengths, chain_along, points_at
+from magnetosuture_thread.geometry.polyline import arc_lengths, chain_along, chain_inside, laid_behind, points_at
 
 
 def test_arc_lengths_and_points_of_a_corner():
@@ -43,3 +45,48 @@ def test_a_chain_in_space():
     helix = np.column_stack([np.cos(np.linspace(0, 6, 200)), np.sin(np.linspace(0, 6, 200)), np.linspace(0, 1, 200)])
     chain = chain_along(helix, 10, 0.4)
     np.testing.assert_allclose(np.linalg.norm(np.diff(chain, axis=0), axis=1), 0.4, rtol=1e-9)
+
+
+CIRCLE = 0.0175
+
+
+@pytest.mark.parametrize("segments", [25, 81])
+def test_a_chain_goes_along_the_circle_where_its_path_leads_outside(segments: int):
+    length = 0.15
+    path = np.array([[0.0, 0.0], [-0.15, 0.03]])
+    chain = chain_inside(path, segments, length / segments, CIRCLE)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(chain, axis=0), axis=1), length / segments, rtol=1e-12)
+    assert np.linalg.norm(chain, axis=1).max() < CIRCLE * (1.0 + 1e-12)
+    angle = np.unwrap(np.arctan2(chain[-5:, 1], chain[-5:, 0]))
+    assert (np.diff(angle) > 0.0).all() or (np.diff(angle) < 0.0).all()  # on and on, not back and forth
+
+
+def test_a_path_with_a_wave_outside_of_the_circle_comes_back_to_itself():
+    angle = np.linspace(0.0, 2.0, 200)
+    radius = CIRCLE - 2e-4 + 4e-4 * np.exp(-(((angle - 1.0) / 0.2) ** 2))
+    path = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    free, chain = chain_along(path, 40, 8e-4), chain_inside(path, 40, 8e-4, CIRCLE)
+    assert np.linalg.norm(free, axis=1).max() > CIRCLE + 1e-4
+    assert np.linalg.norm(chain, axis=1).max() < CIRCLE * (1.0 + 1e-12)
+    assert np.linalg.norm(chain - free, axis=1).max() < 4e-4
+    np.testing.assert_array_equal(chain_inside(path, 40, 8e-4, 0.1), chain_along(path, 40, 8e-4))
+
+
+def test_only_the_first_vertex_may_be_outside():
+    path = np.array([[0.018, 0.0], [0.04, 0.0]])
+    chain = chain_inside(path, 20, 1e-3, CIRCLE)
+    np.testing.assert_array_equal(chain[0], path[0])
+    assert np.linalg.norm(chain[1:], axis=1).max() < CIRCLE * (1.0 + 1e-12)
+
+
+def test_what_is_laid_behind_a_needle_turns_in_before_the_circle():
+    tail, heading = np.array([0.0, 0.0]), np.array([0.6, 0.8])
+    laid = laid_behind(tail, heading, 0.15, CIRCLE)
+    assert arc_lengths(laid)[-1] >= 0.15
+    assert np.linalg.norm(laid, axis=1).max() < CIRCLE
+    edges = np.diff(laid, axis=0)
+    turns = np.arccos(np.clip((edges[1:] * edges[:-1]).sum(axis=1) / np.linalg.norm(edges[0]) ** 2, -1.0, 1.0))
+    assert (turns / np.linalg.norm(edges[0])).max() < 1.01 / (0.3 * CIRCLE)
+    np.testing.assert_allclose(edges[0] / np.linalg.norm(edges[0]), -heading, atol=1e-12)
+    for length, radius in ((0.01, CIRCLE), (0.15, math.inf)):
+        np.testing.assert_array_equal(laid_behind(tail, heading, length, radius), [tail, tail - length * heading])

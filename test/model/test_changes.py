@@ -5,37 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import pytest
-
 from magnetosuture_thread.configuration import from_mapping, to_mapping
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.model.changes import of_material, of_obstacles
+from magnetosuture_thread.model.changes import of_material
 from magnetosuture_thread.model.settings import ThreadModelSettings
-
-OUTLINE = [(0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)]
-HOLE = [(0.004, 0.004), (0.006, 0.004), (0.005, 0.006)]
 
 
 def changed(values: dict[str, Any], **before: Any) -> ThreadModelSettings:
     """Return the settings after a change."""
     return from_mapping(ThreadModelSettings, {**to_mapping(from_mapping(ThreadModelSettings, before)), **values})
-
-
-def test_obstacles_take_the_place_of_all_others():
-    polygons = [[OUTLINE, HOLE], [[(x + 0.02, y) for x, y in OUTLINE]]]
-    settings = changed(of_obstacles([(-0.01, 0.0, 0.002)], polygons, [0.0]), disc_obstacles=[0.0, 0.0, 0.001])
-    disc, first, second = settings.obstacles()
-    assert disc == Disc((-0.01, 0.0), 0.002)
-    assert isinstance(first, Polygon)
-    assert isinstance(second, Polygon)
-    assert first.area == pytest.approx(1e-4 - 2e-6)
-    assert (len(first.holes), len(second.holes)) == (1, 0)
-    assert changed(of_obstacles([], []), disc_obstacles=[0.0, 0.0, 0.001]).obstacles() == ()
-
-
-def test_corners_are_rounded_as_they_were_unless_it_is_told():
-    assert changed(of_obstacles([], []), corner_radius=3e-4).corner_radius == 3e-4
-    assert changed(of_obstacles([], [], [1e-4]), corner_radius=3e-4).corner_radius == 1e-4
 
 
 def test_what_is_not_told_of_a_material_stays():

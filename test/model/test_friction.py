@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
-from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, ObstacleAvoidance
+from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.barriers.rows import BarrierKind
 from magnetosuture_thread.model.friction import (
     UNKNOWN,
@@ -70,6 +70,13 @@ def test_a_node_at_the_threshold_itself_is_free():
 def test_the_needle_itself_is_no_friction_of_the_thread():
     at_needle = ((0.0, 1.9e-3, 1e-3), (0.0, -1.9e-3, 1e-3))
     assert LAW.judge(barriers(*at_needle), np.ones(8)).state is FrictionState.FREE
+
+
+def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it():
+    close = WallAvoidance(7.5e-3, 0.0, 5e-3).rows(NODES)
+    assert (close.clearance < 1e-3).any()
+    disc = (-7e-3, 1.5e-3, 1e-3)
+    assert LAW.judge([*barriers(disc), close], np.full(8, 1e-3)) == Friction(FrictionState.FREE, (), 1.0)
 
 
 def test_speeds_are_averaged():

@@ -19,6 +19,7 @@ def rows(kind: BarrierKind, nodes: list[int], obstacle: list[int], clearance: li
 
 CONNECTIVITY = rows(BarrierKind.CONNECTIVITY, [1, 2, 3], [NO_OBSTACLE] * 3, [1e-9, -1e-9, 0.0])
 OBSTACLE = rows(BarrierKind.OBSTACLE, [3, 7, 7, 5], [0, 0, 1, 2], [4e-5, 2e-3, 5e-5, -1e-6])
+WALL = rows(BarrierKind.WALL, [6, 7], [NO_OBSTACLE] * 2, [3e-3, 2e-5])
 NONE = rows(BarrierKind.OBSTACLE, [], [], [])
 
 
@@ -41,6 +42,13 @@ def test_the_least_of_each_kind_is_named():
 @pytest.mark.parametrize(("tolerance", "touching"), [(5e-5, (3, 5, 7)), (1e-5, (5,)), (0.0, (5,)), (1.0, (3, 5, 7))])
 def test_nodes_within_the_tolerance_touch(tolerance: float, touching: tuple[int, ...]):
     assert Margins.of([CONNECTIVITY, OBSTACLE], tolerance).touching == touching
+
+
+def test_who_touches_the_wall_touches():
+    found = Margins.of([CONNECTIVITY, OBSTACLE, WALL], 4.5e-5)
+    assert found.touching == (3, 5, 7)
+    assert [(least.kind, least.node, least.obstacle) for least in found.least] == [(0, 2, -1), (2, 5, 2), (5, 7, -1)]
+    assert Margins.of([CONNECTIVITY, WALL], 1e-5).touching == ()
 
 
 def test_a_kind_without_barriers_is_not_there():

@@ -11,17 +11,19 @@ import pytest
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import settings as model_settings
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction
 from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.scene import Scene
+from test.model.worlds import polygon, scene_with
 
 EAST = np.array([1.0, 0.0])
 SECOND = 1_000_000_000
-SQUARE = [-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007]
+SQUARE = polygon(-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007)
 
 
 def made(**values: Any) -> ThreadModelSettings:
@@ -29,9 +31,9 @@ def made(**values: Any) -> ThreadModelSettings:
     return from_mapping(ThreadModelSettings, values)
 
 
-def straight(**values: Any) -> ThreadSession:
+def straight(scene: Scene | None = None, **values: Any) -> ThreadSession:
     """Return a session that needs no camera."""
-    return ThreadSession(made(initial_shape="straight", **values))
+    return ThreadSession(made(initial_shape="straight", **values), scene)
 
 
 def pose(stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> NeedlePose:
@@ -66,7 +68,7 @@ def on_a_curve(session: ThreadSession, first: int, last: int) -> list[Prediction
 
 
 def test_a_pose_waits_for_the_thread_of_its_frame():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     assert [go(session, 1.0 + 0.1 * k, 1e-4 * k).waiting for k in range(4)] == [True] * 4
     # The first frame's thread was never seen.
     found = list(session.on_seen(1_100_000_000, seen(1e-4)))
@@ -76,14 +78,14 @@ def test_a_pose_waits_for_the_thread_of_its_frame():
 
 
 def test_the_thread_may_be_seen_first():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     session.on_seen(SECOND, seen())  # kept, whether or not anybody asks for what comes of it
     assert go(session, 0.9).waiting
     assert predicted(go(session, 1.0)).status == "started"
 
 
 def test_only_so_many_poses_wait():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     for k in range(3 * EARLY):
         assert go(session, 1.0 + 0.01 * k).waiting
     kept = list(session.on_seen(SECOND, seen()))
@@ -92,7 +94,7 @@ def test_only_so_many_poses_wait():
 
 
 def test_an_early_pose_that_fails_does_not_keep_the_next_from_being_followed():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     go(session, 1.0)
     go(session, 1.0)  # its stamp is not later
     go(session, 1.1)
@@ -102,7 +104,7 @@ def test_an_early_pose_that_fails_does_not_keep_the_next_from_being_followed():
 
 
 def test_a_thread_that_cannot_be_the_needles_is_refused_and_waited_for_anew():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     go(session, 1.0)
     go(session, 1.1)
     found = list(session.on_seen(SECOND, seen(y=5e-3)))
@@ -124,7 +126,7 @@ def test_a_thread_that_cannot_be_the_needles_is_refused_and_waited_for_anew():
     ],
 )
 def test_a_centreline_that_is_none_is_refused(centreline: Points, offset: list[float]):
-    session = ThreadSession(made(attachment_offset=offset))
+    session = ThreadSession(made(attachment_offset=offset), None)
     go(session, 1.0)
     (outcome,) = session.on_seen(SECOND, centreline)
     assert isinstance(outcome.problem, InvalidInputError)
@@ -159,7 +161,7 @@ def test_a_step_that_is_not_solved_is_told_and_the_next_goes_on_from_before():
 
 
 def test_only_threads_that_are_of_use_are_wanted():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     assert session.wants_seen(0)
     session.on_seen(SECOND, seen())
     go(session, 1.0)
@@ -170,7 +172,7 @@ def test_only_threads_that_are_of_use_are_wanted():
 
 
 def test_time_set_back_starts_anew():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     session.on_seen(100 * SECOND, seen())
     go(session, 100.0)
     go(session, 100.1)
@@ -195,8 +197,8 @@ def test_any_stamp_that_a_message_can_hold_is_taken(stamp: int):
 
 @pytest.mark.parametrize("values", [{}, {"formulation": "paper"}, {"attachment_offset": [5e-4, -3e-4]}])
 def test_two_sessions_say_the_same_to_the_last_bit(values: dict[str, Any]):
-    obstacles = {"disc_obstacles": [-0.005, 0.003, 0.002], "polygon_obstacles": SQUARE, "polygon_sizes": [4]}
-    one, other = (on_a_curve(straight(**values, **obstacles), 0, 60) for _ in range(2))
+    scene = scene_with(Disc((-0.005, 0.003), 0.002), SQUARE, diameter=0.026)
+    one, other = (on_a_curve(straight(scene, **values), 0, 60) for _ in range(2))
     for first, second in zip(one, other, strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
         for rows, others in zip(first.margins, second.margins, strict=True):
@@ -237,7 +239,7 @@ def test_no_offset_is_an_offset_of_zero_to_the_last_bit():
     ],
 )
 def test_a_seen_thread_begins_where_it_is_fixed(offset: list[float], begin: float, end: float):
-    session = ThreadSession(made(attachment_offset=offset))
+    session = ThreadSession(made(attachment_offset=offset), None)
     go(session, 1.0)
     prediction = predicted(next(iter(session.on_seen(SECOND, seen()))))
     np.testing.assert_allclose(prediction.vertices[0], [begin, 0.0], atol=1e-12)
@@ -245,7 +247,7 @@ def test_a_seen_thread_begins_where_it_is_fixed(offset: list[float], begin: floa
 
 
 def test_a_seen_thread_must_begin_at_the_tail_wherever_it_is_fixed():
-    session = ThreadSession(made(attachment_offset=[2e-3, 0.0]))
+    session = ThreadSession(made(attachment_offset=[2e-3, 0.0]), None)
     go(session, 1.0)
     (outcome,) = session.on_seen(SECOND, seen(x=2e-3))
     assert "from the needle's tail" in str(outcome.problem)
@@ -262,14 +264,13 @@ def test_a_seen_thread_must_begin_at_the_tail_wherever_it_is_fixed():
         {"attachment": "glued"},
         {"attachment_offset": [1e-3, 1e-3]},
         {"margin_range": 1e-2},
-        {"disc_obstacles": [0.0, 0.02, 0.003]},
         {"medium": "air", "gravity": [0.0, -0.01]},
     ],
 )
 def test_it_goes_on_from_the_present_shape(values: dict[str, Any]):
     session = straight()
     before = on_a_curve(session, 0, 30)[-1]
-    session.change(made(initial_shape="straight", **values))
+    session.change(made(initial_shape="straight", **values), None)
     assert session.settings == made(initial_shape="straight", **values)
     after = on_a_curve(session, 30, 31)[0]
     assert after.interval == pytest.approx(1 / 30.0)  # no pose was lost, and no time
@@ -278,11 +279,55 @@ def test_it_goes_on_from_the_present_shape(values: dict[str, Any]):
     assert np.abs(after.stretch).max() < 1e-3
 
 
+def test_a_scene_changes_what_is_around_and_what_the_predictions_name():
+    session, scene = straight(), scene_with(Disc((0.0, 0.02), 0.003))
+    assert [p.scene_version for p in on_a_curve(session, 0, 30)] == [""] * 30
+    session.change(session.settings, scene)
+    assert (session.scene, session.scene_version) == (scene, scene.version)
+    outcome = go(session, 2.0, 0.0068, 0.0026, 0.75)
+    assert predicted(outcome).scene_version == outcome.scene_version == scene.version
+    assert outcome.margins is not None
+    assert outcome.margins.scene_version == scene.version
+    assert go(session, 1.5).scene_version == scene.version  # refused, as it is of the past
+    session.change(session.settings, None)
+    assert go(session, 2.1, 0.0068, 0.0026, 0.75).scene_version == ""
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
+    session = straight(scene_with(), formulation=formulation, attachment="glued")
+    go(session, 1.0, x=0.007, angle=0.2)
+    session.change(session.settings, scene_with(diameter=0.02))
+    outcomes = [go(session, 1.0 + k / 30.0, x=0.007, angle=0.2) for k in range(1, 20)]
+    last = predicted(outcomes[-1])
+    away = np.linalg.norm(last.vertices[1:], axis=1).max()
+    assert away < 0.01 - 30e-6 + 1e-6
+    assert formulation == "paper" or away > 0.0099  # in which a thread that is pushed shrinks instead
+    margins = outcomes[-1].margins
+    assert margins is not None
+    assert formulation == "paper" or margins.touching
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize("length", [0.019, 0.15])
+def test_no_thread_starts_outside_of_the_dish(formulation: str, length: float):
+    session = straight(scene_with(diameter=0.035), formulation=formulation, thread_length=length, segments=81)
+    for k in range(10):
+        prediction = predicted(go(session, 1.0 + k / 30.0, x=-0.012 + 1e-4 * k))
+        assert np.linalg.norm(prediction.vertices, axis=1).max() < 0.0175 - 30e-6 + 1e-6
+    crooked = ThreadSession(made(formulation=formulation), scene_with(diameter=0.035))
+    go(crooked, 1.0, x=0.0174)
+    wavy = seen(0.0174) + np.array([0.0, 2e-4]) * np.sin(np.arange(60))[:, None]
+    wavy[:20, 0] += np.linspace(0.0, 2e-3, 20)  # out through the wall
+    (outcome,) = crooked.on_seen(SECOND, wavy)
+    assert np.linalg.norm(predicted(outcome).vertices[1:], axis=1).max() < 0.0175 - 30e-6 + 1e-9
+
+
 def test_what_does_not_concern_the_thread_does_not_move_it():
     one, other = straight(), straight()
     for session in (one, other):
         on_a_curve(session, 0, 30)
-    one.change(made(initial_shape="straight", margin_range=1e-2, contact_tolerance=1e-4))
+    one.change(made(initial_shape="straight", margin_range=1e-2, contact_tolerance=1e-4), None)
     for first, second in zip(on_a_curve(one, 30, 40), on_a_curve(other, 30, 40), strict=True):
         np.testing.assert_allclose(first.vertices, second.vertices, atol=1e-7)
 
@@ -291,7 +336,7 @@ def test_the_same_settings_change_nothing_to_the_last_bit():
     one, other = straight(), straight()
     for session in (one, other):
         on_a_curve(session, 0, 30)
-    one.change(made(initial_shape="straight"))
+    one.change(made(initial_shape="straight"), None)
     for first, second in zip(on_a_curve(one, 30, 40), on_a_curve(other, 30, 40), strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
 
@@ -301,15 +346,15 @@ def test_the_same_settings_change_nothing_to_the_last_bit():
     [
         {"segments": 60},
         {"segments": 7},
-        {"length": 0.03, "segments": 40},
-        {"length": 0.01},
-        {"length": 0.001, "segments": 8},
+        {"thread_length": 0.03, "segments": 40},
+        {"thread_length": 0.01},
+        {"thread_length": 0.001, "segments": 8},
     ],
 )
 def test_other_segments_lie_along_the_thread_before(values: dict[str, Any]):
     session = straight()
     before = on_a_curve(session, 0, 30)[-1].vertices
-    session.change(made(initial_shape="straight", **values))
+    session.change(made(initial_shape="straight", **values), None)
     after = on_a_curve(session, 30, 31)[0].vertices
     assert len(after) == session.thread.segments + 1
     assert session.thread == session.settings.thread()
@@ -321,14 +366,14 @@ def test_other_segments_lie_along_the_thread_before(values: dict[str, Any]):
 
 def test_a_thread_in_air_keeps_its_speed():
     air = {"medium": "air", "air_drag": 0.0, "initial_shape": "straight"}
-    session, other = ThreadSession(made(**air)), ThreadSession(made(**air))
+    session, other = ThreadSession(made(**air), None), ThreadSession(made(**air), None)
     for one in (session, other):
         for k in range(10):
             predicted(go(one, 1.0 + k / 100.0, 1e-3 * k))
-    session.change(made(**air, margin_range=1e-2))
+    session.change(made(**air, margin_range=1e-2), None)
     same, kept = (predicted(go(one, 1.1, 1e-2)).vertices for one in (session, other))
     np.testing.assert_allclose(same, kept, atol=1e-7)
-    session.change(made(**air, segments=50))
+    session.change(made(**air, segments=50), None)
     finer, kept = (predicted(go(one, 1.11, 1.1e-2)).vertices for one in (session, other))
     np.testing.assert_allclose(finer[::2], kept, atol=1e-5)
 
@@ -336,13 +381,13 @@ def test_a_thread_in_air_keeps_its_speed():
 def test_tissue_that_takes_hold_later_holds_where_the_thread_is_then():
     session = straight()
     before = on_a_curve(session, 0, 30)[-1].vertices
-    session.change(made(initial_shape="straight", held_nodes=[20]))
+    session.change(made(initial_shape="straight", held_nodes=[20]), None)
     for k in range(28, 0, -1):  # back, so that the thread gets slack
         after = predicted(
             go(session, 3.0 - k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0)
         )
     np.testing.assert_allclose(after.vertices[20], before[20], atol=1e-12)
-    session.change(made(initial_shape="straight"))
+    session.change(made(initial_shape="straight"), None)
     assert np.linalg.norm(on_a_curve(session, 100, 130)[-1].vertices[20] - before[20]) > 1e-3
 
 
@@ -354,13 +399,14 @@ def test_settings_that_cannot_be_used_leave_those_before_in_force(values: dict[s
     before = one.settings
 
     def refuse(*_: Any) -> None:
-        raise ConfigurationError("thread_model.disc_obstacles", 1.0, "something else")
+        raise ConfigurationError("scene.shape_0", 1.0, "something else")
 
     with monkeypatch.context() as patch:
         patch.setattr(model_settings, "make_formulation", refuse)
         with pytest.raises(ConfigurationError):
-            one.change(made(initial_shape="straight", disc_obstacles=[0.0, 0.01, 0.002], **values))
+            one.change(one.settings, scene_with(Disc((0.0, 0.01), 0.002)))
     assert one.settings is before
+    assert one.scene is None
     for first, second in zip(on_a_curve(one, 20, 30), on_a_curve(other, 20, 30), strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
 
@@ -369,7 +415,7 @@ def test_what_is_prepared_and_not_put_in_force_changes_nothing():
     one, other = straight(), straight()
     for session in (one, other):
         on_a_curve(session, 0, 20)
-    put_in_force = one.prepare(made(initial_shape="straight", material="silk_6_0"))
+    put_in_force = one.prepare(made(initial_shape="straight", material="silk_6_0"), None)
     np.testing.assert_array_equal(on_a_curve(one, 20, 25)[-1].vertices, on_a_curve(other, 20, 25)[-1].vertices)
     put_in_force()  # later, and yet from where the thread is now
     assert on_a_curve(one, 25, 26)[0].interval == pytest.approx(1 / 30.0)
@@ -377,17 +423,17 @@ def test_what_is_prepared_and_not_put_in_force_changes_nothing():
 
 
 def test_a_change_while_the_thread_is_waited_for_loses_no_pose():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     for k in range(3):
         go(session, 1.0 + 0.1 * k)
-    session.change(made(material="silk_6_0"))
+    session.change(made(material="silk_6_0"), None)
     assert [predicted(outcome).stamp for outcome in session.on_seen(SECOND, seen())] == pytest.approx([1.0, 1.1, 1.2])
 
 
 def test_who_waits_for_the_camera_can_be_told_to_start_straight():
-    session = ThreadSession(made())
+    session = ThreadSession(made(), None)
     assert go(session, 1.0).waiting
-    session.change(made(initial_shape="straight"))
+    session.change(made(initial_shape="straight"), None)
     assert predicted(go(session, 1.1)).status == "started"
 
 
@@ -395,20 +441,19 @@ def test_who_waits_for_the_camera_can_be_told_to_start_straight():
 @pytest.mark.parametrize(
     "obstacle",
     [
-        {"disc_obstacles": [-0.01, 1e-4, 0.001]},  # upon the thread, a little to one side
-        {"disc_obstacles": [-0.01, 0.0, 0.001]},  # upon it: no side is nearer
-        {"disc_obstacles": [0.0, 0.0, 0.005]},  # upon the needle
-        {"disc_obstacles": [-0.01, 0.0, 0.03]},  # upon everything
-        {"polygon_obstacles": [-0.012, -0.001, -0.006, -0.001, -0.006, 0.002, -0.012, 0.002], "polygon_sizes": [4]},
+        Disc((-0.01, 1e-4), 0.001),  # upon the thread, a little to one side
+        Disc((-0.01, 0.0), 0.001),  # upon it: no side is nearer
+        Disc((0.0, 0.0), 0.005),  # upon the needle
+        Disc((-0.01, 0.0), 0.03),  # upon everything
+        polygon(-0.012, -0.001, -0.006, -0.001, -0.006, 0.002, -0.012, 0.002),
     ],
 )
-def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, obstacle: dict[str, Any]):
+def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, obstacle: Disc | Polygon):
     """It pushes the thread out; where that is not possible, the step says so and its margins are not valid."""
     session = straight(formulation=formulation)
     go(session, 1.0)
-    settings = made(initial_shape="straight", formulation=formulation, **obstacle)
-    session.change(settings)
-    outside = settings.obstacles()[0]
+    settings = session.settings
+    session.change(settings, scene_with(obstacle))
     proven = 0
     for k in range(1, 15):
         prediction = go(session, 1.0 + k / 30.0, 1e-4 * k).prediction
@@ -417,11 +462,11 @@ def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, 
         proven += 1
         margins = Margins.of(prediction.margins, settings.contact_tolerance)
         free = margins.kind == 2
-        if isinstance(outside, Disc):
-            distance = outside.signed_distance(prediction.vertices)[0] - 30e-6
+        if isinstance(obstacle, Disc):
+            distance = obstacle.signed_distance(prediction.vertices)[0] - 30e-6
             np.testing.assert_allclose(margins.clearance[free], distance[margins.node[free]], atol=1e-12)
         assert margins.clearance[free].min(initial=0.0) > -1e-7
-    assert (proven > 0) == (obstacle.get("disc_obstacles") in (None, [-0.01, 1e-4, 0.001]))
+    assert (proven > 0) == (isinstance(obstacle, Polygon) or obstacle == Disc((-0.01, 1e-4), 0.001))
 
 
 def test_no_kernel_is_compiled_by_a_change():
@@ -431,9 +476,11 @@ import gc
 import numpy as np
 from numba.core.registry import CPUDispatcher
 from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 def kernels():
     ours = (found for found in gc.get_objects() if isinstance(found, CPUDispatcher))
@@ -442,15 +489,19 @@ def kernels():
 def made(**values):
     return from_mapping(ThreadModelSettings, {"initial_shape": "straight", **values})
 
-square = [-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007]
-session, before, stamp = ThreadSession(made()), kernels(), 0
+square = Polygon(((-0.012, 0.001), (-0.006, 0.001), (-0.006, 0.007), (-0.012, 0.007)))
+disc = Disc((-0.01, 1e-4), 0.001)
+session, before, stamp = ThreadSession(made(), None), kernels(), 0
 for values in (
-    {}, {"segments": 60}, {"length": 0.03}, {"material": "silk_6_0"}, {"medium": "air", "gravity": [0.0, -1.0]},
-    {"disc_obstacles": [-0.01, 1e-4, 0.001]}, {"polygon_obstacles": square, "polygon_sizes": [4]},
-    {"disc_obstacles": [-0.01, 1e-4, 0.001], "polygon_obstacles": square, "polygon_sizes": [4]},
+    {}, {"segments": 60}, {"thread_length": 0.03}, {"material": "silk_6_0"}, {"medium": "air", "gravity": [0.0, -1.0]},
+    {"shapes": (), "diameter": 0.036}, {"shapes": (disc,)}, {"shapes": (square,)}, {"shapes": (disc, square)},
     {"attachment": "glued", "rest_curvature": 20.0}, {"held_nodes": [20]}, {"attachment_offset": [1e-3, 0.0]},
 ):
-    session.change(made(**values))
+    scene = None
+    if "shapes" in values:
+        shapes = tuple(SceneShape(f"shape_{i}", "tissue", shape) for i, shape in enumerate(values.pop("shapes")))
+        scene = Scene(Dish(values.pop("diameter", 0.1)), shapes)
+    session.change(made(**values), scene)
     for _ in range(40):
         stamp += 33_000_000
         at = np.array([0.0, stamp * 5e-12])

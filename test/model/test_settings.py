@@ -12,15 +12,17 @@ from numba.core.registry import CPUDispatcher
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model import settings
 from magnetosuture_thread.model.choices import make_formulation
 from magnetosuture_thread.model.formulations import PaperOptions
+from magnetosuture_thread.model.margins import TOUCHABLE
 from magnetosuture_thread.model.predictor import NeedlePose
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.model.settings import ThreadModelSettings, check_scene
+from magnetosuture_thread.scene import Scene
+from test.model.worlds import polygon, scene_with
 
-SQUARE = [0.0, 0.0, 0.01, 0.0, 0.01, 0.01, 0.0, 0.01]
-HOLE = [0.004, 0.004, 0.006, 0.004, 0.006, 0.006, 0.004, 0.006]
+SQUARE = polygon(0.0, 0.0, 0.01, 0.0, 0.01, 0.01, 0.0, 0.01)
 
 
 def made(**values: Any) -> ThreadModelSettings:
@@ -28,48 +30,9 @@ def made(**values: Any) -> ThreadModelSettings:
     return from_mapping(ThreadModelSettings, values)
 
 
-def test_obstacles_are_discs_then_polygons_with_their_holes():
-    settings = made(
-        disc_obstacles=[0.02, 0.0, 0.001],
-        polygon_obstacles=[*SQUARE, *HOLE, *(np.array(SQUARE) - 0.012).tolist()],
-        polygon_sizes=[4, -4, 4],
-        corner_radius=0.0,
-    )
-    disc, first, second = settings.obstacles()
-    assert isinstance(disc, Disc)
-    assert isinstance(first, Polygon)
-    assert isinstance(second, Polygon)
-    assert first.area == pytest.approx(1e-4 - 4e-6)
-    assert len(first.holes) == 1
-    assert len(second.holes) == 0
-
-
-def test_sharp_corners_are_rounded():
-    rounded = made(polygon_obstacles=SQUARE, polygon_sizes=[4]).obstacles()[0]
-    assert isinstance(rounded, Polygon)
-    assert len(rounded.outline) > 8
-    blunt = made(polygon_obstacles=SQUARE, polygon_sizes=[4], corner_angle=3.0).obstacles()[0]
-    assert isinstance(blunt, Polygon)
-    assert len(blunt.outline) == 4
-
-
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"polygon_obstacles": SQUARE}, "polygon_sizes: .* 4 in all"),
-        ({"polygon_obstacles": SQUARE, "polygon_sizes": [3]}, "4 in all"),
-        ({"polygon_obstacles": SQUARE, "polygon_sizes": [-4]}, "an outline before its holes"),
-        ({"polygon_obstacles": SQUARE, "polygon_sizes": [4.0]}, "a list of whole numbers"),
-        ({"polygon_obstacles": SQUARE[:-1], "polygon_sizes": [4]}, "multiple of 2"),
-        (
-            {"polygon_obstacles": [0.0, 0.0, 0.01, 0.01, 0.01, 0.0, 0.0, 0.01], "polygon_sizes": [4]},
-            "polygon 0.*does not cross",
-        ),
-        ({"polygon_obstacles": SQUARE[:4], "polygon_sizes": [2]}, "at least 3 points"),
-        ({"polygon_obstacles": [float("nan"), *SQUARE[1:]], "polygon_sizes": [4]}, "polygon_obstacles"),
-        ({"polygon_obstacles": [1e3 * x for x in SQUARE], "polygon_sizes": [4]}, "from -1 to 1"),
-        ({"polygon_obstacles": [0.1 * x for x in HOLE], "polygon_sizes": [4]}, "half of a segment"),
-        ({"disc_obstacles": [0.0, 0.0, 1e-4]}, "half of a segment"),
         ({"held_nodes": [26]}, "nodes from 1 to 25"),
         ({"held_nodes": [0]}, "from 1 to"),
         ({"formulation": "magic"}, "one of rod, paper"),
@@ -109,11 +72,11 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
         {"held_nodes": [20], "rest_curvature": 30.0},
         {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},
         {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
-        {"polygon_obstacles": SQUARE, "polygon_sizes": [4], "margin_range": 0.02},
+        {"margin_range": 0.02},
     ],
 )
 def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
-    predictor = made(**values).predictor()
+    predictor = made(**values).predictor(scene_with(SQUARE, diameter=0.06))
     assert not predictor.started
     east = np.array([1.0, 0.0])
     tail = np.array([-0.005, -0.005])
@@ -124,6 +87,27 @@ def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
     assert prediction.solver == values.get("solver", "banded")
     assert np.isfinite(prediction.vertices).all()
     assert prediction.residual < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        (
+            scene_with(Disc((0.0, 0.0), 1e-3), Disc((0.01, 0.0), 1e-4)),
+            r"scene\.shape_1: got 0\.0001, .* half of a segment",
+        ),
+        (scene_with(polygon(0.0, 0.0, 0.01, 0.0, 0.01, 3e-4, 0.0, 3e-4)), r"scene\.shape_0: .* half of a segment"),
+        (scene_with(diameter=0.005), r"scene\.dish\.diameter: got 0\.005, .*more than 0\.00633333 m, two segments"),
+    ],
+)
+def test_a_scene_that_the_segments_do_not_resolve_is_refused(scene: Scene, words: str):
+    settings = made(segments=25 if scene.shapes else 6)
+    with pytest.raises(ConfigurationError, match=words):
+        check_scene(settings, scene)
+    with pytest.raises(ConfigurationError, match=words):
+        settings.predictor(scene)
+    check_scene(settings, None)
+    check_scene(made(segments=100), scene)
 
 
 def test_a_material_can_be_another_than_those_that_are_known():
@@ -157,7 +141,7 @@ def test_the_papers_options_come_from_the_settings(monkeypatch, values: dict[str
         return make_formulation(*arguments)
 
     monkeypatch.setattr(settings, "make_formulation", spied)
-    made(formulation="paper", **values).predictor()
+    made(formulation="paper", **values).predictor(None)
     assert (given[0].damping, given[0].stiffness_weight) == (damping, weight)
     assert given[0] == replace(PaperOptions.tuned(weight), damping=damping)
 
@@ -172,14 +156,14 @@ def test_the_attachment_turns_with_the_needle():
 
 
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
-@pytest.mark.parametrize("disc", [[0.0, 0.0, 0.005], [-0.01, 0.0, 0.03], [-0.01, 0.0, 0.0005]])
-def test_a_predictor_can_be_made_wherever_obstacles_are(formulation: str, disc: list[float]):
+@pytest.mark.parametrize("disc", [Disc((0.0, 0.0), 0.005), Disc((-0.01, 0.0), 0.03), Disc((-0.01, 0.0), 0.0005)])
+def test_a_predictor_can_be_made_wherever_obstacles_are(formulation: str, disc: Disc):
     """Where it is warmed up there may be one, which says nothing of where the thread will be."""
-    assert not made(formulation=formulation, disc_obstacles=disc).predictor().started
+    assert not made(formulation=formulation).predictor(scene_with(disc)).started
 
 
 def test_what_cannot_be_solved_is_said_at_each_step_and_not_at_the_start():
-    assert not made(residual_tolerance=1e-12, rest_curvature=329.2).predictor().started
+    assert not made(residual_tolerance=1e-12, rest_curvature=329.2).predictor(None).started
 
 
 def test_inertia_and_weight_come_from_the_settings():
@@ -199,14 +183,17 @@ def kernels() -> int:
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
 def test_no_kernel_is_compiled_once_the_predictor_is_made(formulation: str):
     """Else the first callback, or the first contact in the middle of an operation, would wait for a compiler."""
-    obstacles = {"polygon_obstacles": SQUARE, "polygon_sizes": [4], "disc_obstacles": [-0.009, 0.002, 0.0015]}
-    predictor = made(formulation=formulation, **obstacles).predictor()
+    predictor = made(formulation=formulation).predictor(
+        scene_with(SQUARE, Disc((-0.009, 0.002), 0.0015), diameter=0.05)
+    )
     before = kernels()
     east, tail = np.array([1.0, 0.0]), np.array([-0.001, 0.0])
     predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
     touched = False
     for k in range(1, 200):
         prediction = predictor.step(NeedlePose(k / 60.0, tail + k * np.array([0.0, 6e-5]), east))
-        touched = touched or bool((prediction.margins[-1].clearance < 1e-5).any())
+        touched = touched or bool(
+            any((rows.kind in TOUCHABLE) and (rows.clearance < 1e-5).any() for rows in prediction.margins)
+        )
     assert touched
     assert kernels() == before

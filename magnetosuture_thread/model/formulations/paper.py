@@ -53,6 +53,7 @@ from magnetosuture_thread.model.formulations.step import (
     contact_rows,
     driven,
     remember_push,
+    warmed,
 )
 from magnetosuture_thread.model.mechanics import rest_distances
 from magnetosuture_thread.model.program import Solver, Vector
@@ -161,6 +162,11 @@ class PaperFormulation:
         if not converged:
             status = f"not converged, a node is {depth:.1e} m deep and {allowed:.1e} m are allowed; {status}"
         return StepSolution(after, solution.solver, status, solution.residuals, 1, converged)
+
+    def warm_up(self) -> None:
+        """Load what follows where the first solver fails; see `Formulation`."""
+        warmed(self._solver, self._memory, np.zeros(self._thread.segments + 1, dtype=np.bool_), self._rows)
+        self._memory.forget()
 
     def _depth(self, positions: Points, known: NDArray[np.bool_]) -> float:
         """Return the greatest depth of a free node in an obstacle or the wall [m]."""

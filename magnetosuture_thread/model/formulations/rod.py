@@ -34,10 +34,9 @@ from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance, WallAvoidance
-from magnetosuture_thread.model.barriers.wall import moved_inside
 from magnetosuture_thread.model.formulations.rod_program import Rod
 from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, go_on, take
-from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState
+from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState, warmed
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.solvers.banded import STATUS
@@ -67,7 +66,6 @@ class RodFormulation:
         self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
         reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
         self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
-        self._room_radius = (wall_radius - 0.5 * thread.diameter) / thread.segment_length
         medium, glued = thread.medium, thread.attachment is Attachment.GLUED
         if len(medium.gravity) not in (0, dimension):
             raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
@@ -136,12 +134,17 @@ class RodFormulation:
             worst, solves = worst.or_worse(solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
-        if off > 1.0:
-            moved_inside(motion.about, motion.known, self._room_radius)  # whatever else holds: nothing passes the wall
         end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
         return StepSolution(end, solver, status, worst, solves, converged=off <= 1.0)
+
+    def warm_up(self) -> None:
+        """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
+        rows = self._thread.segments
+        solution = warmed(self._solver, self._memory, self._motion.known, rows)
+        take(self._memory, self._motion, solution.velocities, solution.multipliers, 1.0)
+        self._memory.forget()
 
     def _give(self, memory: Memory) -> None:
         """Take memory for the step, and as much for the structured solver."""

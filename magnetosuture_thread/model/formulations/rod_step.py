@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import SurroundingsData
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.barriers.wall import moved_inside
 from magnetosuture_thread.model.formulations.rod_program import LONGEST_RATIO, Rod, assemble
 from magnetosuture_thread.model.formulations.step import Memory, driven, remember_push
 from magnetosuture_thread.model.program import ChainProgram, Vector
@@ -110,7 +111,7 @@ def go_on(
         axes: 0 to d - 1.
         rod: the thread.
         memory: has the program in the end, and its multipliers.
-        surroundings: obstacles [m].
+        surroundings: obstacles and wall [m].
         workspace: of the structured solver; one without iterations leaves every solve to the caller.
         motion: where the step has got to; written.
         positions: see `set_out`, as are the following.
@@ -150,6 +151,8 @@ def go_on(
         if contacts < 0:
             return NO_ROOM, contacts, solves, off, status, worst
         if off <= 1.0 or solves == most_solves:
+            if off > 1.0:  # whatever else holds, nothing passes the wall
+                moved_inside(motion.about, motion.known, (surroundings.wall_radius - rod.radius) / rod.unit)
             return ENDED, contacts, solves, off, status, worst
         if workspace.iterations == 0:
             return UNSOLVED, contacts, solves, off, status, worst

@@ -12,7 +12,7 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import SurroundingsData, find_near
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import BarrierRows
-from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Vector
+from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
 
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
 DEPTH_REACHED = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
@@ -93,6 +93,10 @@ class Formulation(Protocol):
         Raises:
             SolverError: a solution's residual is above the tolerance.
         """
+        ...
+
+    def warm_up(self) -> None:
+        """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
         ...
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
@@ -200,6 +204,14 @@ class Memory(NamedTuple):
             self.upper[:count],
             self.compliance[:count],
         )
+
+
+def warmed(solver: Solver, memory: Memory, known: NDArray[np.bool_], rows: int) -> Solution:
+    """Return a solution of the memory's last program as a general solver gets it, its residuals worked out here."""
+    program = memory.program(rows, known)
+    solution = solver.solve(program, np.zeros_like(memory.linear), np.zeros(rows))
+    residuals_of(program, solution.velocities, solution.multipliers)
+    return solution
 
 
 @compiled
