@@ -10,6 +10,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
+
 def test_the_filter_has_dish_shapes_and_keep_out():
     settings = CoilBridgeSettings(keep_out=0.001, approach_rate=2.0)
     post = SceneShape("post", "instrument", Disc((-0.006, 0.0), 0.001))
@@ -28,7 +29,10 @@ def test_a_scene_without_room_for_the_needle_is_refused():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"keep_out": 0.00015}, r"coil_bridge\.keep_out: got 0\.00015, .* 0\.0002 m, half of coil_bridge\.needle_width"),
+        (
+            {"keep_out": 0.00015},
+            r"coil_bridge\.keep_out: got 0\.00015, .* 0\.0002 m, half of coil_bridge\.needle_width",
+        ),
         ({"max_speed": 0.5}, r"coil_bridge\.max_speed: got 0\.5, .* max_speed x \(driver_timeout \+ 1 / rate\)"),
         ({"driver_timeout": 1.0}, r"coil_bridge\.max_speed: got 0\.02, expected at most 0\.00995 m/s"),
         (

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Quaternion
+from geometry_msgs.msg import Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-from magnetosuture_msgs.msg import BarrierMargin, Disc, ObstacleSet, Outline, Polygon, ThreadMaterial
+from magnetosuture_msgs.msg import BarrierMargin, ThreadMaterial
 from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.bags.types import typestore
@@ -59,25 +59,6 @@ def test_a_stamp_of_more_than_a_second_of_nanoseconds_is_none(nanosec: int):
 def test_a_stamp_goes_there_and_back(sec: int, nanosec: int):
     stamp = Time(sec=sec, nanosec=nanosec)
     assert messages.stamp_of(messages.nanoseconds(stamp)) == stamp
-
-
-def test_obstacles_become_parameters():
-    corners = [Point(x=0.0, y=0.0), Point(x=0.01, y=0.0, z=7.0), Point(x=0.0, y=0.01)]
-    message = ObstacleSet(
-        header=messages.header(STAMP),
-        discs=[Disc(x=0.01, y=-0.002, radius=0.003)],
-        polygons=[Polygon(outline=Outline(corners=corners), holes=[Outline(corners=corners[:2])])],
-    )
-    assert thread_messages.obstacle_values(message) == {
-        "disc_obstacles": [0.01, -0.002, 0.003],
-        "polygon_obstacles": [0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.0],
-        "polygon_sizes": [3, -2],
-    }
-    message.corner_radius = [0.0]
-    assert thread_messages.obstacle_values(message)["corner_radius"] == 0.0
-    message.header.frame_id = "map"
-    with pytest.raises(InvalidInputError, match=r"thread/obstacle_set\.header\.frame_id: got 'map', expected 'dish'"):
-        thread_messages.obstacle_values(message)
 
 
 def test_a_material_becomes_parameters():

@@ -64,7 +64,7 @@ def marker(number: int, kind: int, scale: Vector3, friction: Friction, points: n
 def test_markers_are_packed_as_rclpy_makes_them(segments: int, friction: Friction, diameter: float):
     vertices = np.random.default_rng(segments).normal(size=(segments + 1, 2))
     none: Any = None
-    prediction = Prediction(1.0, "rod", vertices, np.zeros(segments), 0.0, 0, "", "", 0.0, True, none)
+    prediction = Prediction(1.0, "rod", "", vertices, np.zeros(segments), 0.0, 0, "", "", 0.0, True, none)
     width = max(4.0 * diameter, 2e-4)
     balls = Vector3(x=2.0 * width, y=2.0 * width, z=2.0 * width)
     expected = MarkerArray(

@@ -1,4 +1,4 @@
-"""The thread model told of another thread, liquid or obstacles while it runs: by parameters and by topics."""
+"""The thread model told of another thread, liquid or scene while it runs: by parameters and by topics."""
 
 from __future__ import annotations
 
@@ -9,24 +9,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Point, PoseWithCovarianceStamped
-from magnetosuture_msgs.msg import Disc, ObstacleSet, Outline, Polygon, SafetyMargins, ThreadMaterial
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from magnetosuture_msgs.msg import SafetyMargins, ThreadMaterial
+from magnetosuture_msgs.msg import Scene as SceneMessage
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
-from std_msgs.msg import Header
-from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes.scene_messages import scene_message
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.scene import Scene, read_scene
+from test.model.worlds import scene_with
 
-SQUARE = [-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007]
+SCENE = "dish_150mm"
+POST = Disc((-0.005, 0.003), 0.002)
+SQUARE = ((-0.012, 0.001), (-0.006, 0.001), (-0.006, 0.007), (-0.012, 0.007))
+HOLE = ((-0.010, 0.003), (-0.008, 0.003), (-0.009, 0.005))
 
 
 class Bench:
@@ -34,14 +40,13 @@ class Bench:
 
     def __init__(self, graph: Any, **parameters: Any) -> None:
         self.graph = graph
-        self.parameters = {"initial_shape": "straight", **parameters}
+        self.parameters = {"initial_shape": "straight", "scene": SCENE, **parameters}
         self.node = graph.add(ThreadModelNode, **self.parameters)
         self.predicted = graph.listen(topics.PREDICTED_THREAD)
         self.margins = graph.listen(topics.MARGINS)
-        self.obstacles = graph.listen(topics.OBSTACLE_MARKERS)
         self.diagnostics = graph.listen(topics.DIAGNOSTICS)
-        graph.wait(lambda: len(self.obstacles) == 1, "the obstacles at the start")
-        self.session = ThreadSession(from_mapping(ThreadModelSettings, self.parameters))
+        self.scene = read_scene(SCENE)
+        self.session = ThreadSession(from_mapping(ThreadModelSettings, self.parameters), self.scene)
         self.shown = 0
 
     def show(self, count: int) -> None:
@@ -62,6 +67,7 @@ class Bench:
             found = np.array([[vertex.x, vertex.y] for vertex in self.predicted[-1].vertices])
             np.testing.assert_array_equal(found, outcome.prediction.vertices)
             assert self.margins[-1].valid == outcome.prediction.converged
+            assert self.margins[-1].scene_version == self.predicted[-1].scene_version == self.scene.version
 
     def _predicted_last(self, pose: PoseWithCovarianceStamped) -> bool:
         return bool(self.predicted) and self.predicted[-1].header.stamp == pose.header.stamp
@@ -69,7 +75,14 @@ class Bench:
     def change(self, **values: Any) -> None:
         """Have the session do what the node was told."""
         self.parameters.update(values)
-        self.session.change(from_mapping(ThreadModelSettings, self.parameters))
+        self.session.change(from_mapping(ThreadModelSettings, self.parameters), self.scene)
+
+    def place(self, scene: Scene) -> None:
+        """Publish a scene, wait until the node goes by it, and have the session do so too."""
+        self.graph.publish(topics.SCENE, scene_message(self.graph.now(), scene))
+        self.graph.wait(lambda: self.node._session.scene_version == scene.version, "the scene")
+        self.scene = scene
+        self.change()
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """Call one of the node's parameter services."""
@@ -123,18 +136,6 @@ def as_messages(values: dict[str, Any]) -> list[Any]:
     return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
 
 
-def obstacle_set(graph: Any, **fields: Any) -> ObstacleSet:
-    """Return a set of obstacles in the dish frame."""
-    return ObstacleSet(header=messages.header(graph.now()), **fields)
-
-
-def square(hole: bool = False) -> Polygon:
-    """Return the square above the thread as a message, with or without a hole."""
-    corners = [Point(x=x, y=y) for x, y in np.reshape(SQUARE, (-1, 2)).tolist()]
-    inner = [Point(x=-0.010, y=0.003), Point(x=-0.008, y=0.003), Point(x=-0.009, y=0.005)]
-    return Polygon(outline=Outline(corners=corners), holes=[Outline(corners=inner)] if hole else [])
-
-
 @pytest.mark.parametrize(
     "values",
     [
@@ -143,7 +144,6 @@ def square(hole: bool = False) -> Polygon:
         {"segments": 40},
         {"attachment": "glued"},
         {"attachment_offset": [1e-3, 0.0]},
-        {"disc_obstacles": [-0.005, 0.003, 0.002]},
         {"margin_range": 0.01},
     ],
 )
@@ -158,49 +158,21 @@ def test_a_parameter_counts_from_the_next_pose_on(graph, values):
     assert bench.told(name) == value
 
 
-def test_polygons_are_set_at_once_and_shown_anew(graph):
-    bench = Bench(graph, disc_obstacles=[0.01, 0.01, 0.002])
-    bench.show(2)
-    (reason,) = bench.set(polygon_obstacles=SQUARE)
-    assert "thread_model.polygon_sizes" in reason
-    assert "set at once, by set_parameters_atomically" in reason
-    assert bench.told("polygon_obstacles") == []
-    values = {"polygon_obstacles": SQUARE, "polygon_sizes": [4]}
-    assert bench.set_at_once(**values) == ""
-    bench.change(**values)
+def test_a_scene_counts_from_the_next_pose_on(graph):
+    bench = Bench(graph)
     bench.show(3)
-    assert 1 in bench.margins[-1].obstacle
-    graph.wait(lambda: len(bench.obstacles) == 2, "other markers")
-    assert [marker.action for marker in bench.obstacles[-1].markers] == [Marker.DELETEALL, Marker.ADD, Marker.ADD]
-    assert bench.set_at_once(polygon_obstacles=[], polygon_sizes=[], disc_obstacles=[]) == ""
-    bench.change(polygon_obstacles=[], polygon_sizes=[], disc_obstacles=[])
-    bench.show(2)
-    graph.wait(lambda: len(bench.obstacles) == 3, "no markers")
-    assert [marker.action for marker in bench.obstacles[-1].markers] == [Marker.DELETEALL]
+    bench.place(scene_with(POST))
+    bench.show(3)
+    assert 0 in bench.margins[-1].obstacle
+    bench.place(scene_with(POST, Polygon(SQUARE, (HOLE,))))
+    bench.show(3)
+    assert {0, 1} <= set(bench.margins[-1].obstacle)
     assert bench.set(viscosity=0.5) == []
     bench.change(viscosity=0.5)
-    bench.show(1)
-    assert len(bench.obstacles) == 3
-
-
-def test_obstacles_come_by_topic_and_are_parameters_then(graph):
-    bench = Bench(graph, corner_radius=1e-4)
-    bench.show(3)
-    graph.publish(topics.OBSTACLE_SET, obstacle_set(graph, discs=[Disc(x=-0.005, y=0.003, radius=0.002)]))
-    graph.wait(lambda: len(bench.obstacles) == 2, "the disc")
-    bench.change(disc_obstacles=[-0.005, 0.003, 0.002])
-    bench.show(3)
-    assert bench.told("disc_obstacles") == [-0.005, 0.003, 0.002]
-    graph.publish(topics.OBSTACLE_SET, obstacle_set(graph, polygons=[square(hole=True)]))
-    graph.wait(lambda: len(bench.obstacles) == 3, "the square")
-    assert bench.told("disc_obstacles") == []
-    assert bench.told("polygon_sizes") == [4, -3]
-    assert bench.told("corner_radius") == 1e-4
-    bench.change(disc_obstacles=[], polygon_obstacles=bench.told("polygon_obstacles"), polygon_sizes=[4, -3])
-    bench.show(3)
-    graph.publish(topics.OBSTACLE_SET, obstacle_set(graph, corner_radius=[0.0]))
-    graph.wait(lambda: len(bench.obstacles) == 4, "nothing")
-    assert (bench.told("polygon_obstacles"), bench.told("corner_radius")) == ([], 0.0)
+    bench.show(2)
+    bench.place(scene_with())
+    bench.show(2)
+    assert not any(kind == 2 for kind in bench.margins[-1].kind)
     assert bench.refusals() == 0
 
 
@@ -220,7 +192,6 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph):
     graph.publish(topics.MATERIAL, ThreadMaterial())  # says nothing
     bench.show(3)
     assert bench.refusals() == 0
-    assert len(bench.obstacles) == 1
 
 
 @pytest.mark.parametrize(
@@ -230,12 +201,8 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph):
         ({"viscosity": math.nan}, "out of range"),
         ({"material": "steel"}, "thread_model.material: got 'steel', expected one of polyamide_7_0, silk_6_0"),
         ({"segments": 400}, "longer than thick"),
-        ({"disc_obstacles": [0.0, 0.0, 1e-4]}, "half of a segment"),
-        ({"disc_obstacles": [0.0, 0.0]}, "multiple of 3"),
-        ({"disc_obstacles": [0.0, math.inf, 0.01]}, "from -1 to 1 m"),
-        ({"polygon_obstacles": SQUARE[:4], "polygon_sizes": [2]}, "at least 3 points"),
-        ({"polygon_obstacles": [0.0, 0.0, 0.01, 0.01, 0.01, 0.0, 0.0, 0.01], "polygon_sizes": [4]}, "does not cross"),
-        ({"polygon_obstacles": [0.0] * 200_000, "polygon_sizes": [100_000]}, "200000 entries"),
+        ({"held_nodes": [1] * 200_000}, "200000 entries"),
+        ({"scene": "dish_35mm"}, "read-only"),
         ({"gravity": [0.0, -9.8]}, "medium: air only"),
         ({"formulation": "paper"}, "read-only"),
         ({"viscosity": 0.5, "solver": "osqp"}, "read-only"),
@@ -252,41 +219,35 @@ def test_a_refused_parameter_leaves_all_as_it_was_to_the_last_bit(graph, values,
     assert len(reason) < 700
     assert {name: bench.node.get_parameter(name).value for name in before} == before
     bench.show(4)
-    assert len(bench.obstacles) == 1
 
 
-def corners(*points: tuple[float, float]) -> Polygon:
-    """Return a polygon."""
-    return Polygon(outline=Outline(corners=[Point(x=x, y=y) for x, y in points]))
+def damaged(message: SceneMessage) -> SceneMessage:
+    """Return a scene whose content is not that of its version."""
+    message.dish_diameter += 1e-6
+    return message
+
+
+def elsewhere(message: SceneMessage) -> SceneMessage:
+    """Return a scene in another frame."""
+    message.header.frame_id = "map"
+    return message
 
 
 @pytest.mark.parametrize(
-    ("fields", "words"),
+    ("scene", "alter", "words"),
     [
-        ({"discs": [Disc(x=math.nan, radius=0.01)]}, "thread_model.disc_obstacles"),
-        ({"discs": [Disc(y=1e300, radius=0.01)]}, "from -1 to 1 m"),
-        ({"discs": [Disc(radius=-0.01)]}, "half of a segment"),
-        ({"discs": [Disc(radius=0.01)], "corner_radius": [math.inf]}, "out of range"),
-        ({"polygons": [Polygon()]}, "thread_model.polygon_sizes: got [0], expected an outline before its holes"),
-        ({"polygons": [corners((0.0, 0.0), (0.01, 0.0))]}, "at least 3 points"),
-        ({"polygons": [corners((0.0, 0.0), (0.01, 0.01), (0.01, 0.0), (0.0, 0.01))]}, "does not cross"),
-        ({"polygons": [corners((0.0, 0.0), (math.nan, 0.01), (0.01, 0.0))]}, "polygon_obstacles"),
-        ({"polygons": [Polygon(holes=[square().outline])]}, "an outline before its holes"),
-        ({"polygons": [square(), Polygon(holes=[square().outline])]}, "at least 3 points"),
-        ({"polygons": [square()] * 300}, "2400 entries"),
-        ({"polygons": [corners(*((1e-9 * k, 0.0) for k in range(20_000)))]}, "bytes, expected at most"),
-        ({"discs": [Disc(radius=0.01)] * 20_000}, "bytes, expected at most"),
-        ({"header": Header(frame_id="map"), "discs": [Disc(radius=0.01)]}, "'map', expected 'dish'"),
+        (scene_with(POST), damaged, "scene.version"),
+        (scene_with(POST), elsewhere, "expected 'dish'"),
+        (scene_with(Disc((0.005, 0.005), 1e-4)), lambda message: message, "half of a segment"),
+        (scene_with(Polygon(((0.0, 0.005), (1e-4, 0.005), (0.0, 0.006)))), lambda message: message, "room for a disc"),
     ],
 )
-def test_refused_obstacles_are_said_and_leave_all_as_it_was(graph, fields, words):
-    bench = Bench(graph, disc_obstacles=[-0.005, 0.003, 0.002])
+def test_a_refused_scene_is_reported_and_leaves_all_as_it_was(graph, scene, alter, words):
+    bench = Bench(graph)
     bench.show(4)
-    graph.publish(topics.OBSTACLE_SET, ObstacleSet(**{"header": messages.header(graph.now()), **fields}))
+    graph.publish(topics.SCENE, alter(scene_message(graph.now(), scene)))
     graph.wait(lambda: bench.said(words), "a refusal")
-    assert bench.told("disc_obstacles") == [-0.005, 0.003, 0.002]
     bench.show(4)
-    assert len(bench.obstacles) == 1
 
 
 @pytest.mark.parametrize(
@@ -314,32 +275,32 @@ def test_a_refused_material_is_said_and_leaves_all_as_it_was(graph, fields, word
     bench.show(4)
 
 
-def test_who_starts_later_gets_the_last_obstacles_and_the_last_material(graph):
-    publisher = graph.probe.create_publisher(ObstacleSet, "thread/obstacle_set", topics.LATCHED)
+def test_who_starts_later_gets_the_last_scene_and_the_last_material(graph):
+    publisher = graph.probe.create_publisher(SceneMessage, "scene", topics.LATCHED)
     other = graph.probe.create_publisher(ThreadMaterial, "thread/material", topics.LATCHED)
     for radius in (0.001, 0.002):
-        publisher.publish(obstacle_set(graph, discs=[Disc(x=-0.005, y=0.003, radius=radius)]))
+        scene = scene_with(Disc((-0.005, 0.003), radius))
+        publisher.publish(scene_message(graph.now(), scene))
         other.publish(ThreadMaterial(viscosity=100.0 * radius))
     node = graph.add(ThreadModelNode)
-    graph.wait(lambda: list(node.get_parameter("disc_obstacles").value) == [-0.005, 0.003, 0.002], "the obstacles")
+    graph.wait(lambda: node._session.scene_version == scene.version, "the scene")
     graph.wait(lambda: node.get_parameter("viscosity").value == 0.2, "the liquid")
 
 
 def test_a_publisher_that_cannot_be_heard_is_named(graph):
     bench = Bench(graph)
-    graph.probe.create_publisher(ObstacleSet, "thread/obstacle_set", QoSProfile(depth=1))
+    graph.probe.create_publisher(SceneMessage, "scene", QoSProfile(depth=1))
     graph.wait(
-        lambda: bench.said("publisher of thread/obstacle_set: got another durability, expected transient_local"),
+        lambda: bench.said("publisher of scene: got another durability, expected transient_local"),
         "a word on the publisher",
     )
 
 
-def test_obstacles_may_come_while_the_thread_is_waited_for(graph):
+def test_a_scene_may_come_while_the_thread_is_waited_for(graph):
     bench = Bench(graph, initial_shape="seen")
     bench.show(3)
     assert [margins.reason for margins in bench.margins] == ["waiting for the thread to be seen"] * 3
-    graph.publish(topics.OBSTACLE_SET, obstacle_set(graph, discs=[Disc(x=-0.005, y=0.003, radius=0.002)]))
-    graph.wait(lambda: len(bench.obstacles) == 2, "the disc")
+    bench.place(scene_with(POST))
     thread = np.column_stack([1e-4 - np.linspace(0.0, 0.019, 60), np.full(60, 2e-5)])
     graph.publish(topics.SEEN_THREAD, messages.PathMaker().message(messages.stamp_of(1_033_000_000), thread))
     graph.wait(lambda: len(bench.predicted) == 2 and len(bench.margins) == 5, "the poses that waited")
@@ -359,17 +320,13 @@ def test_who_waits_for_a_camera_in_vain_can_be_told_to_start(graph):
 def test_of_an_obstacle_upon_the_needle_there_is_no_valid_margin(graph):
     bench = Bench(graph)
     bench.show(2)
-    graph.publish(topics.OBSTACLE_SET, obstacle_set(graph, discs=[Disc(x=0.0, y=0.0, radius=0.005)]))
-    graph.wait(lambda: len(bench.obstacles) == 2, "the disc")
-    bench.change(disc_obstacles=[0.0, 0.0, 0.005])
+    bench.place(scene_with(Disc((0.0, 0.0), 0.005)))
     bench.show(3)
     for margins in bench.margins[-3:]:
         assert not margins.valid
         assert "not converged" in margins.reason
         assert margins.contact_state == SafetyMargins.CONTACT_UNKNOWN
-    graph.publish(topics.OBSTACLE_SET, obstacle_set(graph))
-    graph.wait(lambda: len(bench.obstacles) == 3, "nothing")
-    bench.change(disc_obstacles=[])
+    bench.place(scene_with())
     bench.show(3)
     assert bench.margins[-1].valid
 
@@ -383,15 +340,11 @@ def alive() -> int:
 def test_a_hundred_changes_at_the_rate_of_the_camera_lose_no_pose_and_keep_nothing(graph):
     bench = Bench(graph)
     bench.show(2)
-    publisher = graph.probe.create_publisher(ObstacleSet, "thread/obstacle_set", topics.LATCHED)
-    graph.wait(lambda: publisher.get_subscription_count() > 0, "the node")
     before = alive()
     for k in range(100):
         x = -0.005 + 1e-5 * k
         if k % 2:
-            publisher.publish(obstacle_set(graph, discs=[Disc(x=x, y=0.003, radius=0.002)]))
-            graph.wait(lambda x=x: list(bench.node.get_parameter("disc_obstacles").value)[:1] == [x], "the disc")
-            bench.change(disc_obstacles=[x, 0.003, 0.002])
+            bench.place(scene_with(Disc((x, 0.003), 0.002)))
         else:
             assert bench.set(viscosity=0.5 + 0.001 * k) == []
             bench.change(viscosity=0.5 + 0.001 * k)
@@ -407,25 +360,17 @@ def test_a_flood_of_what_is_refused_keeps_no_pose_waiting(graph):
     bench = Bench(graph)
     bench.show(2)
     for _ in range(3):
-        assert "1000000 entries" in bench.set(disc_obstacles=[0.0] * 1_000_000)[0]
+        assert "1000000 entries" in bench.set(attachment_offset=[0.0] * 1_000_000)[0]
         bench.show(1)
 
 
 def test_bytes_that_are_no_message_are_refused_and_end_nothing(graph):
     """As from a publisher whose definition of the type is another."""
-    bench = Bench(graph, disc_obstacles=[-0.005, 0.003, 0.002], corner_radius=1e-4)
+    bench = Bench(graph)
     bench.show(2)
-    settings = bench.node._settings
-    whole = serialize_message(obstacle_set(graph, discs=[Disc(radius=0.01)]))
+    whole = serialize_message(scene_message(graph.now(), scene_with(POST)))
     for data in (b"", whole[:-3], whole[:16], b"\x00\x01\x00\x00" + b"\xff" * 40):
-        settings.on_obstacles(data)
-        settings.on_material(data[:20])
+        bench.node._scene.on_scene(data)
+        bench.node._settings.on_material(data[:20])
     graph.wait(lambda: bench.refusals() >= 8, "the refusals")
-    assert bench.told("disc_obstacles") == [-0.005, 0.003, 0.002]
-
-
-def test_a_rounding_below_rounding_is_refused(graph):
-    bench = Bench(graph, polygon_obstacles=[0.0, 0.0, 0.005, 0.0, 0.0, 0.005], polygon_sizes=[3])
-    before = bench.told("corner_radius")
-    assert "can be cut into triangles" in bench.set_at_once(corner_radius=1e-320)
-    assert bench.told("corner_radius") == before
+    bench.show(2)

@@ -10,6 +10,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from magnetosuture_thread.coils.sources import SourceWatch
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 
 
@@ -21,9 +22,9 @@ def test_only_camera_and_pose_are_sensor_data():
 
 
 def test_what_is_constant_is_latched(graph):
-    graph.add(ThreadModelNode, disc_obstacles=[0.0, 0.0, 0.002])
-    late = graph.listen(topics.OBSTACLE_MARKERS)
-    graph.wait(lambda: bool(late), "the obstacles, published before anybody listened")
+    graph.add(SceneServerNode, scene="dish_35mm_post")
+    late, markers = graph.listen(topics.SCENE), graph.listen(topics.SCENE_MARKERS)
+    graph.wait(lambda: bool(late and markers), "the scene, published before anybody listened")
 
 
 def test_settings_are_latched_and_no_input_of_a_replay():
