@@ -12,7 +12,15 @@ import sys
 import time
 from pathlib import Path
 
-NODES = ("vision_tracker", "thread_model", "coil_bridge", "rig_simulator", "path_follower", "console")
+NODES = {  # by program, what it says it is
+    "vision_tracker": "vision_tracker",
+    "thread_model": "thread_model",
+    "perception": "thread_model",
+    "coil_bridge": "coil_bridge",
+    "rig_simulator": "rig_simulator",
+    "path_follower": "path_follower",
+    "console": "console",
+}
 TIMEOUT = 90.0  # s; the first start compiles kernels
 
 LISTEN = """
@@ -39,11 +47,11 @@ def main(install: Path) -> int:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
     }
-    for name in NODES:
+    for name, node in NODES.items():
         program = f'. "{setup}" && exec "{install.resolve()}/magnetosuture_thread/lib/magnetosuture_thread/{name}"'
         process = subprocess.Popen(["sh", "-c", program], env=environment, cwd="/")
         try:
-            heard = subprocess.run([sys.executable, "-c", LISTEN, name, str(TIMEOUT)], env=environment, check=False)
+            heard = subprocess.run([sys.executable, "-c", LISTEN, node, str(TIMEOUT)], env=environment, check=False)
             process.send_signal(signal.SIGINT)
             code = process.wait(TIMEOUT)
         finally:

@@ -17,7 +17,7 @@ from magnetosuture_thread.interface import DISH_FRAME, OPERATOR_COMMAND
 from magnetosuture_thread.jobs.hernia import start_of
 from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.hernia.run import RATE
+from magnetosuture_thread.study.hernia.run import RATE, point_filter
 from magnetosuture_thread.study.hernia.steered import SteeredThread
 
 BAG = Path(__file__).parent / "hernia_steering"
@@ -69,7 +69,8 @@ def main() -> None:
     notes = {"setup": SETUP, "simulated": "arrow keys pressed by a script, steering the thread model alone"}
     with BagWriter(BAG, notes) as bag:
         bag.add_topic(OPERATOR_COMMAND.recorded, OPERATOR_COMMAND.type_name)
-        for time, (x, y) in keys(SteeredThread(setup.model, start_of(setup))):
+        needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
+        for time, (x, y) in keys(SteeredThread(setup.model, start_of(setup), needle)):
             stamp = 1_000_000_000 + round(time * 1e9)
             linear = make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=0.0)
             still = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)

@@ -1,46 +1,79 @@
 """Starts the nodes on a robot: `ros2 launch magnetosuture_thread magnetosuture.launch.py setup:=NAME`.
 
-The coil bridge goes as far as the set-up says; on hardware a person arms it. With `simulated:=true` a rig in
-software and a path follower come with them, and the bridge drives that rig and arms itself. With `console:=true`
-the operator's page is served on this machine.
+The set-up is one that ships with the package, by `setup:=NAME`, or a file of your own, by `setup_file:=PATH`. With
+`namespace:=NAME` all nodes are in a namespace. The coil bridge goes as far as the set-up says; on hardware a person
+arms it. With `simulated:=true` a rig in software and a path follower come with them, and the bridge drives that rig and
+arms itself. With `console:=true` the operator's page is served on this machine.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition, UnlessCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = "magnetosuture_thread"
-NODES = ("scene_server", "vision_tracker", "thread_model")
+DEFAULT_SETUP = "petri_35mm_polyamide"
 RIG_NODES = ("rig_simulator", "path_follower")
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the nodes with the parameters of one set-up."""
-    file_name = [LaunchConfiguration("setup"), ".yaml"]
-    parameters = [
-        PathJoinSubstitution([FindPackageShare(PACKAGE), "config", file_name]),
-        {"use_sim_time": LaunchConfiguration("use_sim_time")},
-    ]
-    with_console = IfCondition(LaunchConfiguration("console"))
-    with_rig, without = (condition(LaunchConfiguration("simulated")) for condition in (IfCondition, UnlessCondition))
+    """Return the nodes with the parameters of one set-up.
 
-    def node(name: str, *more: dict[str, str], **options: object) -> Node:
-        given = [*parameters, *more]
-        return Node(package=PACKAGE, executable=name, name=name, parameters=given, output="screen", **options)
+    A name that is none of the shipped set-ups, or a file that does not exist, refuses to launch: nodes that started on
+    their defaults would believe in another dish and another needle.
+    """
+    folder = Path(get_package_share_directory(PACKAGE)) / "config"
+    names = sorted(path.stem for path in folder.glob("*.yaml"))
+
+    def argument(name: str, default: str, description: str, **options: object) -> DeclareLaunchArgument:
+        return DeclareLaunchArgument(name, default_value=default, description=description, **options)
+
+    def nodes(context: LaunchContext) -> list[Node]:
+        given = LaunchConfiguration("setup_file").perform(context)
+        file = Path(given).expanduser() if given else folder / f"{LaunchConfiguration('setup').perform(context)}.yaml"
+        if not file.is_file():
+            raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
+        return started(str(file.resolve()))
 
     return LaunchDescription(
         [
-            DeclareLaunchArgument("setup", default_value="petri_35mm_polyamide", description="name of a set-up"),
-            DeclareLaunchArgument("use_sim_time", default_value="false", description="take the time from /clock"),
-            DeclareLaunchArgument("simulated", default_value="false", description="with a rig in software"),
-            DeclareLaunchArgument("console", default_value="false", description="with the operator's page"),
-            *(node(name) for name in NODES),
-            node("coil_bridge", condition=without),
-            node("coil_bridge", {"driver": "simulated", "autostart": "armed"}, condition=with_rig),
-            *(node(name, condition=with_rig) for name in RIG_NODES),
-            node("console", condition=with_console),
+            argument("setup", DEFAULT_SETUP, "name of a set-up that ships with the package", choices=names),
+            argument("setup_file", "", "path of a set-up of your own, in place of setup"),
+            argument("namespace", "", "namespace of all nodes"),
+            argument("use_sim_time", "false", "take the time from /clock"),
+            argument("simulated", "false", "with a rig in software"),
+            argument("console", "false", "with the operator's page"),
+            OpaqueFunction(function=nodes),
         ]
     )
+
+
+def started(file: str) -> list[Node]:
+    """Return the nodes with a parameter file."""
+    with_console = IfCondition(LaunchConfiguration("console"))
+    with_rig, without = (condition(LaunchConfiguration("simulated")) for condition in (IfCondition, UnlessCondition))
+
+    def node(name: str, *more: dict[str, str], named: bool = True, **options: object) -> Node:
+        return Node(
+            package=PACKAGE,
+            executable=name,
+            name=name if named else None,
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[file, {"use_sim_time": LaunchConfiguration("use_sim_time")}, *more],
+            output="screen",
+            **options,
+        )
+
+    return [
+        node("scene_server"),
+        # Two nodes in one process: a name given here would be that of both.
+        node("perception", named=False),
+        node("coil_bridge", condition=without),
+        node("coil_bridge", {"driver": "simulated", "autostart": "armed"}, condition=with_rig),
+        *(node(name, condition=with_rig) for name in RIG_NODES),
+        node("console", condition=with_console),
+    ]

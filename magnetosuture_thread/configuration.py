@@ -179,7 +179,7 @@ def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C
     checked = {}
     for name, value in values.items():
         if name not in about:
-            raise ConfigurationError(f"{cls.GROUP}.{name}", value, _known_names(name, list(about)), source)
+            raise ConfigurationError(f"{cls.GROUP}.{name}", value, known_names(name, list(about)), source)
         checked[name] = about[name].checked(value, source)
     try:
         return cls(**checked)
@@ -241,43 +241,16 @@ def read_yaml(path: Path, what: str) -> Any:
         raise ConfigurationError(what, problem + line, "valid YAML", str(path)) from None
 
 
-def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, Any]:
-    """Read a set-up: a ROS 2 parameter file with one section for each node.
-
-    Args:
-        path: the YAML file.
-        classes: the nodes' configuration classes; the `GROUP` of each is its section's name.
-
-    Returns:
-        A configuration object for each class, by its `GROUP`; a missing section gives the defaults.
-
-    Raises:
-        ConfigurationError: the file cannot be read, is no parameter file, or holds anything invalid.
-    """
-    content = read_yaml(path, "set-up file")
-    known = {cls.GROUP: cls for cls in classes}
-    if not isinstance(content, Mapping):
-        raise ConfigurationError("set-up file", content, "sections " + ", ".join(known), str(path))
-    result: dict[str, Any] = {group: cls() for group, cls in known.items()}
-    for group, section in content.items():
-        if group not in known:
-            raise ConfigurationError(str(group), "…", _known_names(str(group), list(known)), str(path))
-        if not isinstance(section, Mapping) or list(section) != ["ros__parameters"]:
-            raise ConfigurationError(group, section, "one key, ros__parameters", str(path))
-        values = section["ros__parameters"]
-        if not isinstance(values, Mapping):
-            raise ConfigurationError(f"{group}.ros__parameters", values, "parameters by name", str(path))
-        own = {str(name): value for name, value in values.items() if name not in OF_ROS}
-        for name, value in own.items():
-            if isinstance(value, list) and len({type(entry) for entry in value}) > 1:
-                raise ConfigurationError(f"{group}.{name}", value, "entries of one kind: 0.0, not 0", str(path))
-            if value == []:  # which ROS takes for no value at all
-                raise ConfigurationError(f"{group}.{name}", value, "entries, or no such line for none", str(path))
-        result[group] = from_mapping(known[group], own, str(path))
-    return result
+def parse_yaml(text: str) -> Any:
+    """Return the value that a text stands for in a parameter file; the text itself where it is no YAML."""
+    try:
+        return yaml.load(text, _RosLoader)
+    except yaml.YAMLError:
+        return text
 
 
-def _known_names(name: str, known: list[str]) -> str:
+def known_names(name: str, known: list[str]) -> str:
+    """Say in words which names are known, and which of them may have been meant."""
     close = difflib.get_close_matches(name, known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"one of {', '.join(known)}{hint}"

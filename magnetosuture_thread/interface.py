@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
 SCENE_SERVER = "scene_server"  # besides, where the scene changes while the others run
+# As they run here: tracker and model in one process, so that a prediction waits for no message; the bridge alone.
+PROCESSES = ("perception", "coil_bridge")
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"
@@ -42,16 +44,14 @@ CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo")
 NEEDLE_POSE = Channel("needle/measured_cp", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRACKER_STATE = Channel("needle/tracker_state", "magnetosuture_msgs/msg/TrackerState")
 TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped")
-OPERATOR_COMMAND = Channel("operator/servo_cv", "geometry_msgs/msg/TwistStamped")  # a wish, for thread_model to filter
-STEERING_STATE = Channel("operator/steering_state", "magnetosuture_msgs/msg/SteeringState")
+OPERATOR_COMMAND = Channel("operator/servo_cv", "geometry_msgs/msg/TwistStamped")  # above NEEDLE_COMMAND
+FILTER_STATE = Channel("needle/filter_state", "magnetosuture_msgs/msg/FilterState")
 NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
 NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
 SEEN_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
 PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
 MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
 THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
-OBSTACLE_MARKERS = Channel("thread/obstacles", "visualization_msgs/msg/MarkerArray")
-OBSTACLE_SET = Channel("thread/obstacle_set", "magnetosuture_msgs/msg/ObstacleSet")  # around the thread, from now on
 SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene")  # dish and shapes from now on
 SCENE_MARKERS = Channel("scene/markers", "visualization_msgs/msg/MarkerArray")
 MATERIAL = Channel("thread/material", "magnetosuture_msgs/msg/ThreadMaterial")

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.configuration import from_mapping, load_setup, read_yaml, to_mapping
+from magnetosuture_thread.configuration import Configuration
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.parameter_files import EVERY_NODE, load_setup
 from magnetosuture_thread.resources import setup_file
 from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.scene import Scene, read_scene
+from magnetosuture_thread.shared_parameters import SHARED
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 CLASSES = (
@@ -25,20 +27,6 @@ CLASSES = (
     RigSettings,
     PathFollowerSettings,
     ConsoleSettings,
-)
-
-SAME = (
-    (("vision_tracker", "thread_length"), ("thread_model", "length")),
-    (("coil_bridge", "needle_length"), ("vision_tracker", "needle_length")),
-    (("path_follower", "needle_length"), ("vision_tracker", "needle_length")),
-    (("path_follower", "needle_curvature"), ("coil_bridge", "needle_curvature")),
-    (("coil_bridge", "dish_diameter"), ("vision_tracker", "dish_diameter")),
-    (("console", "dish_diameter"), ("vision_tracker", "dish_diameter")),
-    (("console", "needle_length"), ("vision_tracker", "needle_length")),
-    (("console", "needle_curvature"), ("coil_bridge", "needle_curvature")),
-    (("coil_bridge", "disc_obstacles"), ("thread_model", "disc_obstacles")),
-    (("coil_bridge", "polygon_obstacles"), ("thread_model", "polygon_obstacles")),
-    (("coil_bridge", "polygon_sizes"), ("thread_model", "polygon_sizes")),
 )
 
 
@@ -66,37 +54,67 @@ class Setup:
     follower: PathFollowerSettings
     console: ConsoleSettings
 
+    def within(self, scene: Scene) -> Setup:
+        """Return the set-up with another scene than its file names, as a bag has its own."""
+        other = replace(self)
+        other.__dict__["scene"] = scene  # where the cached property looks first
+        return other
 
-def read_setup(name: str) -> Setup:
+    @property
+    def has_scene(self) -> bool:
+        """Whether it names a scene."""
+        return bool(self.model.scene)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene that all nodes start from.
+
+        Raises:
+            ConfigurationError: the set-up names none, or its file cannot be used.
+        """
+        if not self.has_scene:
+            raise ConfigurationError("scene", "none", f"a scene file under {EVERY_NODE}", str(self.path))
+        try:
+            return read_scene(self.model.scene)
+        except ConfigurationError as error:
+            if error.source:
+                raise
+            raise ConfigurationError(error.name, error.value, error.expectation, str(self.path)) from None
+
+
+def _check_agreement(path: Path, settings: Mapping[str, Configuration]) -> None:
+    """Refuse two values of one shared parameter, as of `/**` and of a node's section; the rig's are the truth."""
+    first: dict[str, tuple[str, object]] = {}
+    for group, values in settings.items():
+        if group == RigSettings.GROUP:
+            continue
+        for name in SHARED:
+            if hasattr(values, name):
+                owner, expected = first.setdefault(name, (group, getattr(values, name)))
+                if getattr(values, name) != expected:
+                    words = f"{expected!r}, as {owner}.{name}; what nodes share is written once, under {EVERY_NODE}"
+                    raise ConfigurationError(f"{group}.{name}", getattr(values, name), words, str(path))
+
+
+def read_setup(name: str, scene: Scene | None = None) -> Setup:
     """Read a set-up, given as a path or as the name of one that ships with the package.
+
+    Args:
+        name: of the set-up, or the path of its file.
+        scene: in place of the one that the file names.
 
     Raises:
         ConfigurationError: there is no such file, or it holds anything invalid.
     """
     path = setup_file(name)
     settings = load_setup(path, CLASSES)
-    settings[ConsoleSettings.GROUP] = _console(path, settings)
-    # What several nodes must know of the same thing is in the section of each, as ROS has it.
-    for one, other in SAME:
-        value, expected = (getattr(settings[group], field) for group, field in (one, other))
-        if value != expected:
-            raise ConfigurationError(".".join(one), value, f"{expected}, as {'.'.join(other)}", str(path))
-    points = np.reshape(settings["path_follower"].waypoints, (-1, 2))
-    radius = 0.5 * settings["vision_tracker"].dish_diameter
-    outside = points[np.linalg.norm(points, axis=1) >= radius].tolist()
-    if outside:
-        raise ConfigurationError("path_follower.waypoints", outside[0], f"within the dish, {radius:g} m", str(path))
-    return Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))
-
-
-def _console(path: Path, settings: dict[str, Any]) -> ConsoleSettings:
-    """Return the page's settings: what its section does not say of dish and needle is as the other nodes have it.
-
-    Set-ups from before the page have no such section, and those in their bags neither.
-    """
-    group = ConsoleSettings.GROUP
-    section = read_yaml(path, "set-up file").get(group, {"ros__parameters": {}})
-    mine = [(field, other) for (owner, field), other in SAME if owner == group]
-    given = section["ros__parameters"]
-    told = {field: getattr(settings[owner], name) for field, (owner, name) in mine if field not in given}
-    return from_mapping(ConsoleSettings, {**to_mapping(settings[group]), **told}, str(path))
+    _check_agreement(path, settings)
+    setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))
+    if scene is not None:
+        setup = setup.within(scene)
+    if scene is not None or setup.has_scene:
+        try:
+            setup.follower.check_path(setup.scene)
+        except ConfigurationError as error:
+            raise ConfigurationError(error.name, error.value, error.expectation, str(path)) from None
+    return setup

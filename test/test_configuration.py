@@ -8,8 +8,10 @@ from typing import ClassVar
 
 import pytest
 
-from magnetosuture_thread.configuration import Configuration, described, from_mapping, load_setup, quantity, to_mapping
+from magnetosuture_thread.configuration import Configuration, described, from_mapping, quantity, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.parameter_files import load_setup, matches
+from magnetosuture_thread.shared_parameters import shared
 
 
 @dataclass(frozen=True)
@@ -81,10 +83,10 @@ def test_mapping_goes_there_and_back():
     ("text", "words"),
     [
         ("oven: [", "valid YAML"),
-        ("- oven", "sections oven"),
+        ("- oven", "sections by node"),
         ("oven: {temperature: 400.0}", "one key, ros__parameters"),
         ("oven: {ros__parameters: 3}", "parameters by name"),
-        ("ofen: {ros__parameters: {}}", "one of oven (did you mean oven?)"),
+        ("ofen: {ros__parameters: {}}", "one of /**, oven (did you mean oven?)"),
         ("oven: {ros__parameters: {temperature: 4.0}}", "oven.temperature: got 4.0"),
         ("oven: {ros__parameters: {1: 4.0}}", "oven.1: got 4.0"),
         ("oven: {ros__parameters: {temperature: 2026-13-45}}", "oven.temperature: got '2026-13-45'"),
@@ -115,3 +117,105 @@ def test_an_unreadable_setup_file_is_refused(tmp_path: Path):
     for path in (tmp_path / "missing.yaml", tmp_path / "binary.yaml", tmp_path):
         with pytest.raises(ConfigurationError, match="a readable YAML file"):
             load_setup(path, [Oven])
+
+
+@dataclass(frozen=True)
+class Kettle(Configuration):
+    """Another example, with something that it shares."""
+
+    GROUP: ClassVar[str] = "kettle"
+
+    volume: float = quantity(0.001, "of the water", unit="m^3", minimum=0.0, maximum=0.01)
+    viscosity: float = shared("viscosity")
+
+
+@dataclass(frozen=True)
+class Pot(Configuration):
+    """One more."""
+
+    GROUP: ClassVar[str] = "pot"
+
+    viscosity: float = shared("viscosity")
+    thread_length: float = shared("thread_length")
+
+
+COMMON, OWN = "/**: {ros__parameters: {viscosity: 2.0}}\n", "/**/kettle: {ros__parameters: {viscosity: 3.0}}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "kettle", "pot"),
+    [
+        (COMMON, 2.0, 2.0),
+        (COMMON + OWN, 3.0, 2.0),
+        (OWN + COMMON, 2.0, 2.0),  # as rclpy has it: what stands later counts, however general
+        (OWN, 3.0, 1.0),
+        ("kettle: {ros__parameters: {viscosity: 3.0}}\n", 3.0, 1.0),
+        ("/kettle: {ros__parameters: {viscosity: 3.0}}\n", 3.0, 1.0),
+        ("/lab1/kettle: {ros__parameters: {viscosity: 3.0}}\n", 3.0, 1.0),
+        ("lab1: {kettle: {ros__parameters: {viscosity: 3.0}}, pot: {ros__parameters: {viscosity: 4.0}}}\n", 3.0, 4.0),
+        ("/**: {kettle: {ros__parameters: {viscosity: 3.0}}}\n", 3.0, 1.0),
+    ],
+)
+def test_sections_are_for_whom_ros_has_them(tmp_path: Path, text: str, kettle: float, pot: float):
+    path = tmp_path / "kitchen.yaml"
+    path.write_text(text)
+    loaded = load_setup(path, [Kettle, Pot])
+    assert (loaded["kettle"].viscosity, loaded["pot"].viscosity) == (kettle, pot)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("/**: {ros__parameters: {volume: 0.002}}", "/**.volume: got 0.002, expected a shared parameter"),
+        ("/**: {ros__parameters: {viscositee: 2.0}}", "did you mean viscosity?"),
+        ("/**: {ros__parameters: {viscosity: 2e6}}", "kettle.viscosity: got 2000000.0"),
+        (
+            "/**/kettle: {ros__parameters: {thread_length: 0.02}}",
+            "kettle.thread_length: got 0.02, expected one of",
+        ),
+        ("/**/kettel: {ros__parameters: {volume: 0.002}}", "did you mean kettle?"),
+        ("/lab1/*: {ros__parameters: {viscosity: 2.0}}", "/lab1/*: got"),
+        (
+            "/lab1/kettle: {ros__parameters: {volume: 0.002}}\n/lab2/kettle: {ros__parameters: {volume: 0.001}}",
+            "/lab2/kettle: got '…', expected one namespace in a set-up, as /lab1 before",
+        ),
+        ("/**/kettle: {ros__parameters: {volume: 0.002}, other: {}}", "one key, ros__parameters"),
+        ("/**/kettle:", "one key, ros__parameters"),
+    ],
+)
+def test_a_section_that_is_for_nobody_or_says_too_much_is_refused(tmp_path: Path, text: str, words: str):
+    path = tmp_path / "kitchen.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        load_setup(path, [Kettle, Pot])
+    assert str(caught.value).startswith(str(path))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_of_ros_may_stand_under_every_key(tmp_path: Path):
+    path = tmp_path / "kitchen.yaml"
+    path.write_text("/**: {ros__parameters: {use_sim_time: true, viscosity: 2.0, qos_overrides./scene.depth: 3}}")
+    assert load_setup(path, [Kettle])["kettle"].viscosity == 2.0
+
+
+@pytest.mark.parametrize(
+    ("key", "node", "is_for"),
+    [
+        ("/**", "/kettle", True),
+        ("/**", "/a/b/kettle", True),
+        ("/**/kettle", "/kettle", True),
+        ("/**/kettle", "/a/b/kettle", True),
+        ("/**/kettle", "/a/kettle_2", False),
+        ("/kettle", "/a/kettle", False),
+        ("/a/kettle", "/a/kettle", True),
+        ("/*/kettle", "/a/kettle", True),
+        ("/*/kettle", "/kettle", False),
+        ("/*/kettle", "/a/b/kettle", False),
+        ("/a/**", "/a/b/kettle", True),
+        ("/a/*", "/a/b/kettle", False),
+        ("/a.c/kettle", "/abc/kettle", False),
+    ],
+)
+def test_keys_match_as_in_ros(key: str, node: str, is_for: bool):
+    assert matches(key, node) == is_for

@@ -13,32 +13,43 @@ from magnetosuture_thread.interface import NODES, RIG_NODES
 HOUSE = Path(magnetosuture_thread.__file__).parent
 
 # What each room may import of the house, itself aside.
-BASE = {"errors", "configuration", "resources"}
+BASE = {"errors", "configuration", "resources", "shared_parameters", "parameter_files", "scene"}
 ALLOWED = {
     "errors": set(),
     "configuration": {"errors"},
     "resources": {"errors"},
+    "shared_parameters": {"configuration"},
+    "parameter_files": {"errors", "configuration", "shared_parameters"},
     "interface": set(),
     "compiled": set(),
     "geometry": {"errors", "compiled"},
-    "shared_parameters": {"configuration"},
     "scene": {*BASE, "geometry", "interface", "shared_parameters"},
-    "model": {*BASE, "compiled", "geometry"},
-    "vision": {*BASE, "compiled", "geometry"},
-    "coils": {*BASE, "geometry"},
-    "guidance": {*BASE, "geometry"},
+    "model": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
+    "vision": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
+    "safety": {*BASE, "compiled", "geometry", "scene"},
+    "coils": {*BASE, "geometry", "safety", "scene", "shared_parameters"},
+    "guidance": {*BASE, "geometry", "scene", "shared_parameters"},
     "console": {*BASE, "geometry", "scene", "shared_parameters"},
-    "rig": {*BASE, "compiled", "geometry"},
+    "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
     "bags": {*BASE, "interface"},
-    "study": {"errors", "compiled", "geometry", "interface", "model", "scene"},
-    "nodes": {*BASE, "interface", "geometry", "model", "vision", "coils", "guidance", "rig", "console", "scene"},
-    "offline": {*BASE, "interface", "geometry", "model", "vision", "bags", "study", "setups"},
-    "setups": {*BASE, "model", "vision", "coils", "guidance", "rig", "console"},
+    "packing": {"interface", "geometry", "model"},
+    "study": {"errors", "compiled", "geometry", "interface", "model", "safety", "scene"},
+    "nodes": {
+        *BASE,
+        *("interface", "packing", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
+        "parameter_files",
+    },
+    "offline": {*BASE, "interface", "packing", "geometry", "scene", "model", "vision", "bags", "study", "setups"},
+    "setups": {
+        *BASE,
+        *("scene", "model", "vision", "coils", "guidance", "rig", "console", "parameter_files", "shared_parameters"),
+    },
     "jobs": {
         *BASE,
         *(
             "interface",
             "geometry",
+            "scene",
             "model",
             "vision",
             "coils",
@@ -51,6 +62,7 @@ ALLOWED = {
             "nodes",
             "setups",
             "offline",
+            "packing",
         ),
     },
     "cli": {"errors", "setups", "jobs", "study"},

@@ -9,7 +9,9 @@ import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.resources import setup_file, share
+from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.shared_parameters import SHARED
 
 SHIPPED = sorted(path.stem for path in (share("magnetosuture_thread") / "config").glob("*.yaml"))
 
@@ -22,7 +24,7 @@ def test_there_are_setups():
 def test_every_setup_that_ships_loads(name: str):
     setup = read_setup(name)
     assert setup.name == name
-    assert setup.vision.thread_length == setup.model.length
+    assert setup.vision.thread_length == setup.model.thread_length
     assert setup.model.thread().segment_length > setup.model.thread().diameter
 
 
@@ -30,19 +32,18 @@ def test_every_setup_that_ships_loads(name: str):
 def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     setup = read_setup(name)
     rig, vision, coils = setup.rig, setup.vision, setup.coils
-    assert (rig.dish_diameter, rig.needle_length, rig.needle_width) == (
-        vision.dish_diameter,
-        vision.needle_length,
-        vision.needle_width,
-    )
-    assert (rig.thread_length, rig.thread_attachment) == (setup.model.length, setup.model.attachment)
-    assert (rig.disc_obstacles, rig.polygon_obstacles) == (setup.model.disc_obstacles, setup.model.polygon_obstacles)
+    for name in SHARED:
+        if hasattr(rig, name) and hasattr(vision, name):
+            assert getattr(rig, name) == getattr(vision, name)
+    assert (rig.thread_length, rig.thread_attachment) == (setup.model.thread_length, setup.model.attachment)
+    assert (rig.viscosity, rig.driver_timeout) == (setup.model.viscosity, coils.driver_timeout)
+    rig.check_scene(setup.scene)
     assert (rig.coil_angles, rig.coil_distance, rig.coil_radius) == (
         coils.coil_angles,
         coils.coil_distance,
         coils.coil_radius,
     )
-    body = rig.dynamics().needle
+    body = rig.dynamics(setup.scene).needle
     assert coils.needle_moment == pytest.approx(body.pole * rig.needle_length, rel=0.01)
     assert coils.needle_turning_drag == pytest.approx(body.drag[2], rel=0.02)
     thread_drag = rig.thread_drag_along * rig.thread_length
@@ -52,79 +53,133 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_in_every_setup_that_ships_the_path_keeps_clear_of_wall_and_obstacles(name: str):
-    """The needle follows its path as the bridge has it move, and nothing is taken off any velocity."""
+def test_in_every_setup_that_ships_the_needle_gets_to_the_end_of_its_path_through_the_filter(name: str):
+    """The needle moves as the filter lets it: nearly everywhere as commanded, and slowed where it would be too near."""
     setup = read_setup(name)
-    workspace, needle, follower = setup.coils.workspace(), setup.coils.needle(), setup.follower.follower()
+    safety, follower = setup.coils.safety_filter(setup.scene), setup.follower.follower()
     x, y, angle = setup.rig.needle_start
     tail, heading, time, interval, progress = np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]), 0.0, 0.02, 0.0
+    velocity, shares = np.zeros(2), []
     while progress < 1.0:
-        wish = follower.follow(time, tail, heading)
-        progress, time = wish.progress, time + interval
+        command = follower.follow(time, tail, heading)
+        progress, time = command.progress, time + interval
         assert time < 120.0
-        assert workspace.safe_velocity(wish.velocity, tail, heading).tolist() == wish.velocity.tolist()
-        e = needle.chord_direction(heading)
-        turned = float(wish.velocity @ (-e[1], e[0])) / (0.5 * needle.chord) * interval
-        turn = np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
-        middle = tail + 0.5 * needle.chord * e + float(wish.velocity @ e) * interval * e
-        heading, tail = turn @ heading, middle - 0.5 * needle.chord * (turn @ e)
+        velocity = safety.filter(command.velocity, tail, heading, previous=velocity, elapsed=interval).filtered
+        if (speed := float(np.linalg.norm(command.velocity))) > 1e-4:
+            shares.append(float(np.linalg.norm(velocity)) / speed)
+        tail, heading = safety.kinematics.moved(
+            tail, heading, *safety.kinematics.body_velocity(heading, velocity), interval
+        )
+    assert np.mean(shares) > 0.95, np.mean(shares)
 
 
 @pytest.mark.parametrize(
     ("section", "words"),
     [
-        ("coil_bridge: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
-        ("path_follower: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
-        ("path_follower: {ros__parameters: {waypoints: [0.0, 0.0, 0.0335, 0.001]}}", "within the dish, 0.0175 m"),
-        ("path_follower: {ros__parameters: {needle_curvature: 8.0}}", "as coil_bridge.needle_curvature"),
-        ("coil_bridge: {ros__parameters: {dish_diameter: 0.05}}", "as vision_tracker.dish_diameter"),
-        ("console: {ros__parameters: {dish_diameter: 0.05}}", "as vision_tracker.dish_diameter"),
-        ("console: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
-        ("console: {ros__parameters: {needle_curvature: 8.0}}", "as coil_bridge.needle_curvature"),
-        ("coil_bridge: {ros__parameters: {disc_obstacles: [0.0, 0.0, 0.002]}}", "as thread_model.disc_obstacles"),
-        ("thread_model: {ros__parameters: {disc_obstacles: [0.0, 0.0, 0.002]}}", "as thread_model.disc_obstacles"),
+        ("/**/coil_bridge: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
+        ("/**/path_follower: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
         (
-            "coil_bridge: {ros__parameters: {polygon_obstacles: [0.0, 0.0, 0.01, 0.0, 0.0, 0.01], polygon_sizes: [3]}}",
-            "as thread_model.polygon_obstacles",
+            "/**/path_follower: {ros__parameters: {needle_curvature: 8.0}}",
+            "needle_curvature: got 8.0, expected 0.0, as",
         ),
+        ("/**/console: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
+        ("/**/thread_model: {ros__parameters: {thread_length: 0.03}}", "as vision_tracker.thread_length"),
+        ("/**/coil_bridge: {ros__parameters: {scene: dish_35mm}}", "'', as vision_tracker.scene"),
     ],
 )
-def test_sections_that_contradict_each_other_are_refused(tmp_path: Path, section: str, words: str):
+def test_two_values_of_what_nodes_share_are_refused(tmp_path: Path, section: str, words: str):
     path = tmp_path / "odd.yaml"
     path.write_text(section + "\n")
-    with pytest.raises(ConfigurationError, match=words):
+    with pytest.raises(ConfigurationError, match=words) as caught:
         read_setup(str(path))
+    assert "written once, under /**" in str(caught.value)
 
 
-@pytest.mark.parametrize("section", ["", "console: {ros__parameters: {port: 0}}"])
-def test_the_page_shows_the_dish_and_the_needle_of_the_others_where_it_is_not_told(tmp_path: Path, section: str):
-    """As in set-ups, and in bags, from before there was a page."""
-    path = tmp_path / "before.yaml"
-    length = "needle_length: 0.004"
+def test_what_nodes_share_is_written_once(tmp_path: Path):
+    path = tmp_path / "shared.yaml"
     path.write_text(
-        f"vision_tracker: {{ros__parameters: {{dish_diameter: 0.05, {length}}}}}\n"
-        f"coil_bridge: {{ros__parameters: {{dish_diameter: 0.05, {length}, needle_curvature: 8.0}}}}\n"
-        f"path_follower: {{ros__parameters: {{{length}, needle_curvature: 8.0}}}}\n{section}\n"
+        "/**: {ros__parameters: {scene: dish_150mm, needle_length: 0.004, needle_curvature: 8.0, driver_timeout: 0.5}}"
     )
-    page = read_setup(str(path)).console
-    assert (page.dish_diameter, page.needle_length, page.needle_curvature) == (0.05, 0.004, 8.0)
-    assert page.port == (0 if section else 8090)
+    setup = read_setup(str(path))
+    for part in (setup.vision, setup.coils, setup.rig, setup.follower, setup.console):
+        assert part.needle_length == 0.004
+        assert part.scene == "dish_150mm"
+    assert setup.console.needle_curvature == setup.coils.needle_curvature == setup.rig.needle_curvature == 8.0
+    assert setup.coils.driver_timeout == setup.rig.driver_timeout == 0.5
+    assert setup.scene.dish.diameter == 0.15
+
+
+def test_the_rig_may_be_another_than_the_nodes_believe(tmp_path: Path):
+    path = tmp_path / "wrong.yaml"
+    path.write_text("/**/rig_simulator: {ros__parameters: {needle_length: 0.008}}\n")
+    assert read_setup(str(path)).rig.needle_length == 0.008
+
+
+@pytest.mark.parametrize(
+    ("scene", "waypoints", "words"),
+    [
+        (
+            "dish_35mm",
+            "0.0, 0.0, 0.0175, 0.0",
+            r"waypoints: got \[0.0175, 0.0\], expected within the dish",
+        ),
+        ("dish_35mm_post", "0.0, 0.0, 0.008, 0.004", r"got \[0.008, 0.004\], expected a point outside of post"),
+        ("hernia_ring", "0.0, 0.0105", r"expected a point outside of ring"),
+    ],
+)
+def test_a_path_through_a_wall_or_a_shape_is_refused(tmp_path: Path, scene: str, waypoints: str, words: str):
+    path = tmp_path / "path.yaml"
+    path.write_text(
+        f"/**: {{ros__parameters: {{scene: {scene}}}}}\n"
+        f"/**/path_follower: {{ros__parameters: {{waypoints: [{waypoints}]}}}}\n"
+    )
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        read_setup(str(path))
+    assert str(caught.value).startswith(str(path))
+    assert read_setup(str(path), Scene(Dish(0.15))).follower.waypoints  # where nothing is in its way
+
+
+def test_a_point_in_a_hole_is_in_nobodys_way(tmp_path: Path):
+    path = tmp_path / "hole.yaml"
+    path.write_text(
+        "/**: {ros__parameters: {scene: hernia_ring}}\n"
+        "/**/path_follower: {ros__parameters: {waypoints: [0.0, 0.005]}}\n"
+    )
+    assert read_setup(str(path)).scene.names[0] == "ring"
+
+
+def test_a_setup_without_a_scene_says_so_once_it_is_needed(tmp_path: Path):
+    path = tmp_path / "none.yaml"
+    path.write_text("/**/thread_model: {ros__parameters: {segments: 30}}\n")
+    setup = read_setup(str(path))
+    with pytest.raises(ConfigurationError, match=r"scene: got 'none', expected a scene file under /\*\*"):
+        _ = setup.scene
+    other = Scene(Dish(0.15))
+    assert setup.within(other).scene is other
+    assert read_setup(str(path), other).scene is other
+
+
+def test_a_scene_that_is_none_is_refused_with_the_setup(tmp_path: Path):
+    path = tmp_path / "odd.yaml"
+    path.write_text("/**: {ros__parameters: {scene: hernia}}\n")
+    with pytest.raises(
+        ConfigurationError, match=r"scene: got 'hernia', expected a YAML or GeoJSON file, or one of .*hernia_ring"
+    ):
+        read_setup(str(path))
 
 
 def test_a_setup_is_found_by_path(tmp_path: Path):
     path = tmp_path / "mine.yaml"
-    path.write_text("thread_model: {ros__parameters: {segments: 30}}\n")
+    path.write_text("/**/thread_model: {ros__parameters: {segments: 30}}\n")
     assert read_setup(str(path)).model.segments == 30
 
 
-def test_a_dish_in_millimetres_is_refused(tmp_path: Path):
+def test_a_needle_in_millimetres_is_refused(tmp_path: Path):
     path = tmp_path / "millimetres.yaml"
-    path.write_text("vision_tracker: {ros__parameters: {dish_diameter: 35.0}}\n")
+    path.write_text("/**: {ros__parameters: {needle_length: 7.0}}\n")
     with pytest.raises(ConfigurationError) as caught:
         read_setup(str(path))
-    assert str(caught.value) == (
-        f"{path}: vision_tracker.dish_diameter: got 35.0, expected a number from 0.005 to 0.5 m"
-    )
+    assert str(caught.value) == f"{path}: vision_tracker.needle_length: got 7.0, expected a number from 0.001 to 0.05 m"
 
 
 def test_an_unknown_setup_is_refused_with_the_known_ones():
@@ -134,15 +189,12 @@ def test_an_unknown_setup_is_refused_with_the_known_ones():
         setup_file("nowhere.yaml")
 
 
-def test_thread_and_obstacle_must_make_sense(tmp_path: Path):
+def test_a_thread_must_make_sense(tmp_path: Path):
     for text, words in (
-        ("segments: 2000, length: 0.019", "so that a segment is longer than thick"),
-        ("disc_obstacles: [0.0, 0.0, -0.001]", "half of a segment"),
-        ("disc_obstacles: [0.0, 0.0, 0.0003]", "half of a segment"),
+        ("segments: 2000", "so that a segment is longer than thick"),
         ("viscosity: 1000.0", "from 0.0001 to 100 Pa s"),
-        ("length: 0.03", "vision_tracker.thread_length: got 0.019, expected 0.03, as thread_model.length"),
     ):
         path = tmp_path / "odd.yaml"
-        path.write_text(f"thread_model: {{ros__parameters: {{{text}}}}}\n")
+        path.write_text(f"/**/thread_model: {{ros__parameters: {{{text}}}}}\n")
         with pytest.raises(ConfigurationError, match=words):
             read_setup(str(path))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from magnetosuture_thread.coils.field import CoilModel
-from magnetosuture_thread.geometry.arc import needle_chord
+from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
 
@@ -47,13 +47,14 @@ class NeedleMechanics:
     turning_drag: float
 
     @cached_property
-    def _chord(self) -> tuple[float, Vector]:
-        return needle_chord(self.length, self.curvature)
+    def kinematics(self) -> NeedleKinematics:
+        """How a velocity of the tip moves it."""
+        return NeedleKinematics(self.length, self.curvature)
 
     @property
     def chord(self) -> float:
         """Distance from tail to tip [m]."""
-        return self._chord[0]
+        return self.kinematics.chord
 
     @property
     def pole(self) -> float:
@@ -62,7 +63,7 @@ class NeedleMechanics:
 
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
-        return np.asarray(self._chord[1] @ heading)
+        return self.kinematics.chord_direction(heading)
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,10 @@ class Allocation:
     currents: Vector
     velocity: Vector
     saturated: bool
+
+    def scaled(self, share: float) -> Allocation:
+        """Return a share of the currents; the velocity is linear in them."""
+        return self if share == 1.0 else Allocation(share * self.currents, share * self.velocity, self.saturated)
 
 
 class CoilAllocation:

@@ -1,4 +1,4 @@
-"""The gate that every velocity command passes: checked, limited in speed, and timed out.
+"""The gate that every velocity command of an input passes: checked, and timed out.
 
 Pure: it reads no clock. `arrival` is a monotonic time, `now` the time of the stamps; both in seconds.
 """
@@ -10,7 +10,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.limits import shortened
 from magnetosuture_thread.coils.sources import SourceWatch
 from magnetosuture_thread.coils.stamps import check_stamp
 from magnetosuture_thread.errors import InvalidInputError
@@ -19,16 +18,16 @@ Vector = NDArray[np.float64]
 
 
 class CommandGate:
-    """Holds the last good command for as long as it is good.
+    """Holds the last good command of one input for as long as it is good.
 
     Args:
         timeout: a command is good for this long after its arrival, and its stamp may be this old [s].
-        max_speed: faster commands are slowed to this, their direction kept [m/s].
+        topic: of the input, for errors and reasons.
     """
 
-    def __init__(self, timeout: float, max_speed: float) -> None:
+    def __init__(self, timeout: float, topic: str = "needle/servo_cv") -> None:
         self._timeout = timeout
-        self._max_speed = max_speed
+        self._topic = topic
         self._sources = SourceWatch()
         self._velocity = np.zeros(2)
         self._stamp = -math.inf
@@ -50,11 +49,11 @@ class CommandGate:
         """
         speaking = self._sources.hear(number, arrival)
         if not np.all(np.isfinite(velocity)):
-            raise InvalidInputError("needle/servo_cv.twist.linear", velocity.tolist(), "finite numbers [m/s]")
-        check_stamp("needle/servo_cv", stamp, now, self._stamp, self._timeout)
+            raise InvalidInputError(f"{self._topic}.twist.linear", velocity.tolist(), "finite numbers [m/s]")
+        check_stamp(self._topic, stamp, now, self._stamp, self._timeout)
         if speaking > 1:
-            raise InvalidInputError("needle/servo_cv", f"{speaking} publishers at once", "one")
-        self._velocity = shortened(velocity, self._max_speed)
+            raise InvalidInputError(self._topic, f"{speaking} publishers at once", "one")
+        self._velocity = np.array(velocity, dtype=np.float64)
         self._stamp, self._arrival = stamp, arrival
 
     def forget(self) -> None:
@@ -71,6 +70,15 @@ class CommandGate:
         """Its stamp [s], -inf before the first."""
         return self._stamp
 
+    def disputed(self, arrival: float) -> bool:
+        """Return whether several publish at once at a monotonic time [s]."""
+        return self._sources.count(arrival) > 1
+
+    @property
+    def unused(self) -> bool:
+        """Whether there was no good command since the last `forget`."""
+        return self._arrival == -math.inf
+
     def closed(self, now: float, arrival: float) -> str:
         """Say why no command is to be followed at a time; empty if one is.
 
@@ -81,8 +89,8 @@ class CommandGate:
             now: time of the stamps' clock [s].
             arrival: a monotonic time [s].
         """
-        if self._sources.count(arrival) > 1:
-            return "several publishers of needle/servo_cv at once"
+        if self.disputed(arrival):
+            return f"several publishers of {self._topic} at once"
         if self._arrival == -math.inf:
             return "no command yet"
         good = max(arrival - self._arrival, now - self._stamp) <= self._timeout

@@ -12,15 +12,17 @@ from typing import ClassVar
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
 from magnetosuture_thread.coils.field import CoilProperties, coils_around, make_coils
-from magnetosuture_thread.coils.workspace import Workspace
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import require_needle
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
+from magnetosuture_thread.safety import NeedleSafetyFilter
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.shared_parameters import shared
 
 INSIDE = 0.9  # of the distance to the coils
 FEWEST = 4.0  # periods of the loop in a timeout; two of them are given away so that no current outlives it
+FEWEST_HELD = 2.0  # periods of the loop in the drivers' timeout, or they would switch off between two steps
+MAX_BLIND_WAY = 0.01  # m; that the needle could go while nobody looks, was there nothing in its way
 
 
 @dataclass(frozen=True)
@@ -72,12 +74,12 @@ class CoilBridgeSettings(Configuration):
         1000.0, "greatest change of a coil's current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
     )
 
-    dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
+    scene: str = shared("scene")
     keep_out: float = quantity(
         0.0005,
         "clearance that the needle's axis keeps of the wall and of obstacles; half of its width is within",
         unit="m",
-        minimum=0.0,
+        minimum=2.5e-5,
         maximum=0.05,
     )
     approach_rate: float = quantity(
@@ -87,17 +89,24 @@ class CoilBridgeSettings(Configuration):
         minimum=0.1,
         maximum=1e3,
     )
-    disc_obstacles: tuple[float, ...] = quantity(
-        (), "x, y and radius of each round obstacle", unit="m", minimum=-0.5, maximum=0.5, multiple=3
+    pose_uncertainty: float = quantity(
+        0.0005,
+        "by how much tail and tip may be measured outside of the dish or farther on than the needle can go, besides "
+        "three sigma of the pose's own covariance",
+        unit="m",
+        minimum=0.0,
+        maximum=0.01,
     )
-    polygon_obstacles: tuple[float, ...] = quantity(
-        (), "x and y of each corner of all polygons", unit="m", minimum=-0.5, maximum=0.5, multiple=2
+    prediction_timeout: float = quantity(
+        0.5, "margins of the thread model are good for this long", unit="s", minimum=0.05, maximum=5.0
     )
-    polygon_sizes: tuple[int, ...] = quantity(
-        (),
-        "number of corners of each polygon; negative for a hole in the polygon before it",
-        minimum=-10000,
-        maximum=10000,
+    without_prediction: str = quantity(
+        "stop",
+        "what becomes of the needle while the thread is not predicted: stop, or slow, to speed_without_prediction",
+        choices=("stop", "slow"),
+    )
+    speed_without_prediction: float = quantity(
+        0.002, "greatest speed of the needle's tip then", unit="m/s", minimum=1e-5, maximum=0.5
     )
 
     calibration: str = quantity(
@@ -121,10 +130,9 @@ class CoilBridgeSettings(Configuration):
     aligning_field: float = quantity(
         0.008, "field along the needle that holds its direction", unit="T", minimum=1e-4, maximum=1.0
     )
-    needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
-    needle_curvature: float = quantity(
-        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
-    )
+    needle_length: float = shared("needle_length")
+    needle_width: float = shared("needle_width")
+    needle_curvature: float = shared("needle_curvature")
     needle_moment: float = quantity(
         8.8e-4, "magnetic moment of the needle, were it straight", unit="A m^2", minimum=1e-6, maximum=1.0
     )
@@ -157,9 +165,7 @@ class CoilBridgeSettings(Configuration):
     roboclaw_ports: tuple[str, ...] = quantity((), "serial port of each board, which has two coils in a row")
     roboclaw_addresses: tuple[int, ...] = quantity((), "address of each board, 128 if empty", minimum=128, maximum=135)
     roboclaw_baud_rate: int = quantity(115200, "of the serial lines; USB has none", minimum=2400, maximum=1000000)
-    roboclaw_timeout: float = quantity(
-        0.2, "without a packet for this long a board stops by itself; whole tenths", unit="s", minimum=0.1, maximum=1.0
-    )
+    driver_timeout: float = shared("driver_timeout")
     roboclaw_answer_timeout: float = quantity(
         0.03,
         "that a board has for an answer, of which it needs 1 or 2 ms over USB; it may miss one",
@@ -212,18 +218,30 @@ class CoilBridgeSettings(Configuration):
         coils = make_coils(model, self.coils_properties())
         return CoilAllocation(coils, self.needle(), self.aligning_field, self.max_current)
 
-    def obstacles(self) -> tuple[Disc | Polygon, ...]:
-        """Return all obstacles: the discs, then the polygons."""
-        discs = discs_from(self.disc_obstacles)
-        return (*discs, *polygons_from(self.GROUP, self.polygon_obstacles, self.polygon_sizes))
+    @property
+    def hold_time(self) -> float:
+        """For how long a velocity may go on without anybody looking: until the drivers switch off, and a period [s]."""
+        return self.driver_timeout + 1.0 / self.rate
 
-    def workspace(self) -> Workspace:
-        """Return what keeps the needle off the wall and off the obstacles."""
-        radius, needle = 0.5 * self.dish_diameter, self.needle()
-        return Workspace(radius, self.obstacles(), self.keep_out, self.approach_rate, needle, self.max_speed)
+    def safety_filter(self, scene: Scene) -> NeedleSafetyFilter:
+        """Return what keeps the needle clear of the wall and of the shapes of a scene.
+
+        Raises:
+            ConfigurationError: the needle has no room in it.
+        """
+        return NeedleSafetyFilter(
+            scene,
+            keep_out=self.keep_out,
+            approach_rate=self.approach_rate,
+            hold_time=self.hold_time,
+            max_speed=self.max_speed,
+            max_acceleration=self.max_acceleration,
+            needle_length=self.needle_length,
+            needle_curvature=self.needle_curvature,
+        )
 
     def check(self) -> None:
-        """Refuse too few coils, a coiled needle, obstacles that are none, and limits that cannot hold."""
+        """Refuse too few coils, a coiled needle, and limits that cannot hold."""
         require_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
             name = f"{self.GROUP}.coil_angles"
@@ -233,23 +251,24 @@ class CoilBridgeSettings(Configuration):
             if count != known:
                 name = f"{self.GROUP}.calibration"
                 raise ConfigurationError(name, f"{count} coils in {self.calibration}", f"{known}, as in coil_angles")
-        for obstacle in self.obstacles():
-            if isinstance(obstacle, Disc) and obstacle.radius <= 0.0:
-                name = f"{self.GROUP}.disc_obstacles"
-                raise ConfigurationError(name, obstacle.radius, "as every third number a positive radius [m]")
-        if 0.5 * self.dish_diameter - self.keep_out < 0.5 * self.needle_length:
-            room = 0.5 * (self.dish_diameter - self.needle_length)
-            raise ConfigurationError(
-                f"{self.GROUP}.keep_out", self.keep_out, f"less than {room:g} m, room for the needle"
-            )
         if self.autostart == "armed" and self.driver == "roboclaw":
             name = f"{self.GROUP}.autostart"
             raise ConfigurationError(name, self.autostart, "active at most: hardware is armed by a person")
+        if self.keep_out < 0.5 * self.needle_width:
+            expected = f"at least {0.5 * self.needle_width:g} m, half of {self.GROUP}.needle_width"
+            raise ConfigurationError(f"{self.GROUP}.keep_out", self.keep_out, expected)
         for name in ("command_timeout", "pose_timeout"):
             if getattr(self, name) * self.rate < FEWEST:
                 expected = f"at least {FEWEST / self.rate:g} s, {FEWEST:g} periods of the loop"
                 raise ConfigurationError(f"{self.GROUP}.{name}", getattr(self, name), expected)
+        if self.driver_timeout * self.rate < FEWEST_HELD * (1.0 - 1e-9):
+            expected = f"at least {FEWEST_HELD / self.rate:g} s, {FEWEST_HELD:g} periods of the loop"
+            raise ConfigurationError(f"{self.GROUP}.driver_timeout", self.driver_timeout, expected)
+        if self.max_speed * self.hold_time > MAX_BLIND_WAY * (1.0 + 1e-9):
+            most = MAX_BLIND_WAY / self.hold_time
+            rule = f"max_speed x (driver_timeout + 1 / rate) may be at most {MAX_BLIND_WAY:g} m"
+            raise ConfigurationError(f"{self.GROUP}.max_speed", self.max_speed, f"at most {most:.3g} m/s: {rule}")
         # One step may not take more than all that is left of the clearance.
         if self.approach_rate > self.rate:
             name = f"{self.GROUP}.approach_rate"
-            raise ConfigurationError(name, self.approach_rate, f"at most coil_bridge.rate, {self.rate:g} 1/s")
+            raise ConfigurationError(name, self.approach_rate, f"at most {self.GROUP}.rate, {self.rate:g} 1/s")

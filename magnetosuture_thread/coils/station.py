@@ -10,6 +10,7 @@ from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.rhythm import Rhythm
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.scene import Scene
 
 NO_DRIVER = DriverState(False, "unconfigured")
 
@@ -29,7 +30,8 @@ class CoilStation:
 
     def __init__(self) -> None:
         self.latch = ArmingLatch()
-        Bridge(CoilBridgeSettings(), self.latch)  # loads its kernels: no step and no transition waits for a compiler
+        # Loads its kernels, so that no step and no transition waits for a compiler.
+        Bridge(CoilBridgeSettings(), self.latch, Scene())
         self.bridge: Bridge | None = None
         self.driver: CoilDriver | None = None
         self.outcome: Outcome | None = None
@@ -107,7 +109,7 @@ class CoilStation:
             return None
         state = self.driver.state()
         self._arms = self._arms and self.latch.waits
-        if self._arms and state.ready:
+        if self._arms and state.ready and self.bridge.scene is not None:
             self.arm(True)
         self.outcome = self.bridge.step(now, arrival, state)
         self.driver.apply(self.outcome.allocation.currents)

@@ -19,10 +19,10 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
                   "least": {"connectivity": m, "compression": m, "obstacle": m, ...},   # of the kinds present
                   "contact": [node, ...],
                   "friction": {"state": "unknown|free|pulled|resting", "nodes": [int], "slowdown": float}} | None,
-      "steering": {"asked": [vx, vy], "passed": [vx, vy], "slowdown": float, "held_off": bool, "reason": str,
-                   "age": s} | None,
+      "filter": {"source": "operator|needle|", "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy],
+                 "slowdown": float, "active": [str], "overridden": str, "reason": str, "age": s} | None,
       "bridge": {"state": "unconfigured|inactive|active|fault", "armed": bool, "emergency_stopped": bool,
-                 "reasons": [str], "commanded": [vx, vy], "applied": [vx, vy], "reached": [vx, vy], "saturated": bool,
+                 "reasons": [str], "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy], "saturated": bool,
                  "driver": str, "driver_ready": bool, "driver_warnings": [str], "current": [A],
                  "measured_current": [A], "refused": int, "age": s} | None,
       "nodes": {name: {"level": "ok|warn|error|silent", "message": str, "values": {str: str}, "age": s}},

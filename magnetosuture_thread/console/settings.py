@@ -30,11 +30,8 @@ class ConsoleSettings(Configuration):
         "compressed", "which of the camera's topics is shown", choices=("compressed", "raw")
     )
     scene: str = shared("scene")
-    dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
-    needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
-    needle_curvature: float = quantity(
-        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
-    )
+    needle_length: float = shared("needle_length")
+    needle_curvature: float = shared("needle_curvature")
     frame_rate: float = quantity(30.0, "of what the page is told", unit="Hz", minimum=1.0, maximum=120.0)
     speed: float = quantity(
         0.003, "of the needle's tip at first, until the operator sets another", unit="m/s", minimum=1e-5, maximum=0.5

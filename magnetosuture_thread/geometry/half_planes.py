@@ -17,7 +17,7 @@ SLACK = 1e-14
 
 
 @compiled
-def _nearest(
+def project_within(
     point: NDArray[np.float64], given: Points, bounds: NDArray[np.float64], work: Points, found: NDArray[np.float64]
 ) -> bool:
     """Write the nearest point; `work` (k, 3) has room for rows of length one; return whether there is one."""
@@ -84,4 +84,4 @@ def nearest_within(point: NDArray[np.float64], rows: Points, least: NDArray[np.f
     """
     found = np.empty(2)
     point, rows, least = (np.ascontiguousarray(array, dtype=np.float64) for array in (point, rows, least))
-    return found if _nearest(point, rows, least, np.empty((len(rows), 3)), found) else None
+    return found if project_within(point, rows, least, np.empty((len(rows), 3)), found) else None

@@ -46,3 +46,12 @@ def heading_of(x: float, y: float, z: float, w: float, field: str) -> NDArray[np
     if length < 1e-3:
         raise InvalidInputError(field, "an upright needle", "an x axis in the dish plane")
     return np.asarray(along / length)
+
+
+def as_told(heading: NDArray[np.float64], field: str) -> NDArray[np.float64]:
+    """Return a direction of shape (2,) as it is read from a message, whose quaternion costs the last bits.
+
+    Whoever passes a heading on without a message passes it on by this, so that what comes of it is the same.
+    """
+    z, w = turned(angle_of(heading))
+    return heading_of(0.0, 0.0, z, w, field)

@@ -66,6 +66,50 @@ def chain_along(points: Points, segments: int, segment_length: float) -> Points:
     return chain
 
 
+def chain_inside(points: Points, segments: int, segment_length: float, radius: float) -> Points:
+    """Lay a chain of equal segments along a polyline in the plane, and inside of a circle about the origin.
+
+    Where `chain_along` leads outside, as a thread does that is seen with some error or longer than there is room
+    for, the chain follows the circle instead. Only its first vertex stays where it is in any case.
+
+    Args:
+        points: see `chain_along`, as are the two following.
+        segments: number of segments n.
+        segment_length: length of each, less than the radius [m].
+        radius: of the circle; inf for none [m].
+
+    Returns:
+        Vertices, shape (n + 1, 2) [m].
+    """
+    chain = chain_along(points, segments, segment_length)
+    away = np.linalg.norm(chain, axis=1)
+    if not (away[1:] > radius).any():
+        return chain
+    targets = chain * np.minimum(1.0, radius / np.maximum(away, radius))[:, None]
+    step, follows = chain[1] - chain[0], False
+    for index in range(1, segments + 1):
+        centre = chain[index - 1]
+        toward = targets[index] - centre
+        size = float(np.linalg.norm(toward))
+        # What lies outside was moved in to about one place: there the chain goes on along the circle.
+        if not (follows and away[index] > radius) and size > 0.5 * segment_length:
+            step = toward * (segment_length / size)
+        follows = float(np.linalg.norm(centre + step)) > radius
+        if follows:
+            step = _along_circle(centre, step, segment_length, radius)
+        chain[index] = centre + step
+    return chain
+
+
+def _along_circle(centre: Points, step: Points, length: float, radius: float) -> Points:
+    """Return the step of a length that ends on a circle about the origin, the nearer one to a step that leaves it."""
+    away = float(np.linalg.norm(centre))
+    inward = -centre / away
+    cosine = min(max((away * away + length * length - radius * radius) / (2.0 * away * length), -1.0), 1.0)
+    aside = float(np.sqrt(1.0 - cosine * cosine)) * np.array([-inward[1], inward[0]])
+    return np.asarray(length * (cosine * inward + (aside if float(aside @ step) >= 0.0 else -aside)))
+
+
 def _leave_ball(inside: Points, outside: Points, centre: Points, radius: float) -> Points:
     """Return where the line from a point inside of a ball to one outside leaves it."""
     along = outside - inside

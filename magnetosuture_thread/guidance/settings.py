@@ -8,8 +8,11 @@ from typing import ClassVar
 import numpy as np
 
 from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import require_needle
 from magnetosuture_thread.guidance.follower import PathFollower
+from magnetosuture_thread.scene import WALL, Scene, occupant
+from magnetosuture_thread.shared_parameters import shared
 
 
 @dataclass(frozen=True)
@@ -48,14 +51,25 @@ class PathFollowerSettings(Configuration):
     longest_lag: float = quantity(
         0.002, "the wish waits while the tip is farther from it", unit="m", minimum=1e-5, maximum=0.1
     )
-    needle_length: float = quantity(0.007, "length of the needle along its body", unit="m", minimum=1e-3, maximum=0.05)
-    needle_curvature: float = quantity(
-        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
-    )
+    scene: str = shared("scene")
+    needle_length: float = shared("needle_length")
+    needle_curvature: float = shared("needle_curvature")
 
     def check(self) -> None:
         """Refuse a coiled needle."""
         require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+
+    def check_path(self, scene: Scene) -> None:
+        """Refuse a waypoint beyond the wall or inside of a shape.
+
+        Raises:
+            ConfigurationError: the message names the waypoint and what is there.
+        """
+        for point in np.reshape(self.waypoints, (-1, 2)):
+            what = occupant(scene, point[None])
+            if what:
+                expected = f"within the dish, {scene.dish.radius:g} m" if what == WALL else f"a point outside of {what}"
+                raise ConfigurationError(f"{self.GROUP}.waypoints", point.tolist(), expected)
 
     def follower(self) -> PathFollower:
         """Return a follower of this path."""

@@ -84,12 +84,12 @@ def _judged(path: Path, setup: Setup) -> Run:
     model = setup.model
     material = model.material.replace("_", " ", 1).replace("_", "-")
     return Run(
-        name=f"{material}, {1e3 * model.length:g} mm, {model.segments} segments, "
-        f"{model.attachment} to the needle, dish of {1e3 * setup.rig.dish_diameter:g} mm",
+        name=f"{material}, {1e3 * model.thread_length:g} mm, {model.segments} segments, "
+        f"{model.attachment} to the needle, dish of {1e3 * setup.scene.dish.diameter:g} mm",
         summary=summary,
         instants=collector.instants,
         frames=frames,
-        view=setup.rig.view(),
-        dish_diameter=setup.rig.dish_diameter,
-        obstacles=setup.model.obstacles(),
+        view=setup.rig.view(setup.scene),
+        dish_diameter=setup.scene.dish.diameter,
+        obstacles=setup.scene.obstacles,
     )

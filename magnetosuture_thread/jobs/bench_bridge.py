@@ -213,7 +213,7 @@ def bench_bridge(
         stage = PowerStage(ports, SUPPLY, RESISTANCE, INDUCTANCE)
         parameters = {"driver": "roboclaw", "roboclaw_ports": ports, "coil_resistance": RESISTANCE}
         file = folder / "parameters.yaml"
-        file.write_text(yaml.safe_dump({"coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
+        file.write_text(yaml.safe_dump({"/**/coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
         arguments = ["--params-file", str(read_setup(SETUP).path), "--params-file", str(file)]
         environment = graph_environment(domain)
         stage.open()

@@ -129,8 +129,8 @@ def bench_console(
 def _serving(folder: Path) -> Iterator[Server]:
     """Run the command with the scenario that is measured."""
     content = read_yaml(read_setup(SCENARIO).path, "set-up file")
-    content["thread_model"]["ros__parameters"]["segments"] = SEGMENTS
-    content["rig_simulator"]["ros__parameters"]["frame_rate"] = FRAME_RATE
+    content["/**/thread_model"]["ros__parameters"]["segments"] = SEGMENTS
+    content["/**/rig_simulator"]["ros__parameters"]["frame_rate"] = FRAME_RATE
     path = folder / f"{SCENARIO}.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     server = Server(str(path))

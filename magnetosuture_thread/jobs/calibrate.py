@@ -156,7 +156,7 @@ def _read(
             seen = sights(given.recording, given.setup, source=given.source, progress=share)
             simulated = given.recording.notes.get("simulated", "")
             try:
-                passages.append(passage_of(str(path), seen, own, request.against, simulated))
+                passages.append(passage_of(str(path), seen, own, request.against, simulated, given.setup.scene))
             except BagError:
                 if problem := seen.thread_problem():
                     raise BagError(path, problem) from None
@@ -216,7 +216,7 @@ def _named(given: Given) -> Setup | None:
 def _check_same(before: Sequence[tuple[Path, Setup]], path: Path, setup: Setup) -> None:
     """Refuse a bag whose thread is another than that of the bags before."""
     for other, known in before:
-        for name in ("material", "length"):
+        for name in ("material", "thread_length"):
             value, expected = getattr(setup.model, name), getattr(known.model, name)
             if value != expected:
                 raise InvalidInputError(str(path), f"a thread with {name} {value}", f"{expected}, as in {other}")

@@ -12,7 +12,7 @@ from typing import Any
 
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import GraphError, MagnetosutureError
-from magnetosuture_thread.interface import NODES
+from magnetosuture_thread.interface import NODES, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.jobs.console_recording import BagRecording, new_name
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE, SLOWER_BRIDGE, START_TIMEOUT, Say
 from magnetosuture_thread.nodes import topics
@@ -22,9 +22,9 @@ from magnetosuture_thread.nodes.console_tap import SAID, ConsoleTap
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.setups import Setup, read_setup
 
-# The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so these two
+# The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
 # go before the browser and the rig, and behind the bridge.
-PREFERRED, PRIORITY = ("vision_tracker", "thread_model"), 5
+PREFERRED, PRIORITY = "perception", 5
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
 
 
@@ -169,7 +169,8 @@ class SimulatedHost(RecordingHost):
         """Start the nodes; they are busy until each of them has said something of itself."""
         arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS]
         # Here and not in another thread: the nodes end with the thread that has started them.
-        self._nodes = NodeProcesses((RIG, *NODES), arguments, self._environment, self._logs).__enter__()
+        processes = (SCENE_SERVER, RIG, *PROCESSES)
+        self._nodes = NodeProcesses(processes, arguments, self._environment, self._logs).__enter__()
         self._since = time.monotonic()
 
     async def choose(self, scenario: str) -> str:
@@ -203,11 +204,11 @@ class SimulatedHost(RecordingHost):
         self._nodes.check()
         if not self.busy:
             return
-        missing = [name for name in (RIG, *NODES) if not self.graph.says(name)]
+        missing = [name for name in (SCENE_SERVER, RIG, *NODES) if not self.graph.says(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
-            for name in PREFERRED:  # only now: while it compiles for the first time, others shall not wait for it
-                self.say(f"{name}: {self._nodes.prefer(name, PRIORITY)}")
+            # Only now: while it compiles for the first time, others shall not wait for it.
+            self.say(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
             self._hold("")
             self.say(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > START_TIMEOUT:

@@ -61,7 +61,7 @@ class ReplayHost(RecordingHost):
     def start(self) -> None:
         """Start the nodes, and play the bag once they are there."""
         arguments = self._playing.arguments(self._logs / "lossless.yaml")
-        self._nodes = NodeProcesses(self._playing.nodes, arguments, self._environment, self._logs).__enter__()
+        self._nodes = NodeProcesses(self._playing.processes, arguments, self._environment, self._logs).__enter__()
         self._thread.start()
 
     async def record(self, on: bool) -> str:

@@ -96,7 +96,7 @@ def evaluate_bag(path: Path, name: str, options: Options, page: Path, say: Say, 
         if options.formulation:
             model = replace(model, formulation=options.formulation)
         recorded = bool(given.recording.counts.get(PREDICTED_THREAD.recorded))
-        account = Account(model.length, given.recording.start, _targets(given, options.against), recorded)
+        account = Account(model.thread_length, given.recording.start, _targets(given, options.against), recorded)
         seen = _Looked(given, account, lambda share: progress(0.95 * share))
         refused = _predict(given, model, account, seen)
         figures = account.figures(live_figures(given.recording, given.start, given.duration))
@@ -146,11 +146,16 @@ def _predict(given: Given, model: ThreadModelSettings, account: Account, seen: S
     """Go through a bag once; return what was refused, by why."""
     recorded = RecordedPredictions(given.recording, given.start, given.duration)
     refused = Counter[str]()
-    for step in predictions(seen, model):
+    for step in predictions(seen, model, given.setup.scene):
         if step.outcome.prediction is not None:
             beside = recorded.of(step.sight.stamp)
             account.predict(
-                step.sight, step.outcome.prediction, step.margins, step.step_time, beside, step.settings.obstacles()
+                step.sight,
+                step.outcome.prediction,
+                step.margins,
+                step.step_time,
+                beside,
+                step.scene.obstacles if step.scene is not None else (),
             )
         elif step.outcome.problem is not None:
             refused[_kind(step.outcome.problem)] += 1
@@ -172,8 +177,8 @@ def _pictures(given: Given, model: ThreadModelSettings, account: Account) -> lis
             moment,
             photos.get(moment.instant.stamp),
             target=account.target,
-            length=model.length,
-            dish_diameter=given.setup.vision.dish_diameter,
+            length=model.thread_length,
+            dish_diameter=given.setup.scene.dish.diameter,
             simulated=bool(given.recording.notes.get("simulated")),
         )
         for moment in moments
@@ -197,7 +202,7 @@ def _photos(given: Given, moments: list[Moment]) -> dict[int, Photo]:
             images[stamp] = pixels(record.decode(), record.type_name)
         except (BagError, InvalidInputError):
             continue
-        view = VisionTracker(given.setup.vision).look(images[stamp]).view
+        view = VisionTracker(given.setup.vision, given.setup.scene).look(images[stamp]).view
         if view is not None:
             views[stamp] = view
     spare = next(iter(views.values()), None)
@@ -215,9 +220,9 @@ def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter
         simulated=recording.notes.get("simulated", ""),
         source=given.source,
         formulation=model.formulation,
-        length=model.length,
+        length=model.thread_length,
         segments=model.segments,
-        dish_diameter=setup.vision.dish_diameter,
+        dish_diameter=setup.scene.dish.diameter,
         start=recording.start,
         begin=given.start,
         duration=given.duration,

@@ -15,7 +15,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.study.hernia.run import HerniaSummary, Steering, replay_steering
+from magnetosuture_thread.study.hernia.run import HerniaSummary, Steering, point_filter, replay_steering
 
 START_POINTS = 200  # of the centreline at the start
 
@@ -63,14 +63,15 @@ def hernia(
     steering = read_steering(bag)
     with whole_folder(output) as folder:
         say(f"steering {steering.duration:.0f} s in set-up {setup.name}")
-        run = replay_steering(settings, start_of(setup), steering, progress)
+        needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
+        run = replay_steering(settings, start_of(setup), steering, needle, progress)
         summary = run.summary(setup.name)
         figures = json.dumps(summary.to_json(), indent=2, allow_nan=False)
         (folder / "hernia.json").write_text(figures + "\n", encoding="utf-8")
-        draw_hernia(folder / "hernia.png", run, setup.vision.dish_diameter)
+        draw_hernia(folder / "hernia.png", run)
         if animation:
             say("drawing the animation")
-            draw_animation(folder / "hernia.gif", run, setup.vision.dish_diameter)
+            draw_animation(folder / "hernia.gif", run)
     return summary
 
 

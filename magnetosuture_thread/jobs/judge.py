@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import NEEDLE_COMMAND, SEEN_THREAD, TRUE_THREAD
+from magnetosuture_thread.interface import NEEDLE_COMMAND, SCENE, SEEN_THREAD, TRUE_THREAD
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
+from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.offline.predictions import chosen_source
 from magnetosuture_thread.offline.sights import pixels
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.messages import scene_message, scene_of
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.picture import draw_summary
 from magnetosuture_thread.study.replayed import Instant, Summary
@@ -104,25 +108,61 @@ def opened(
             raise BagError(path, recording.unfit[channel.recorded])
     left = recording.duration - start
     with TemporaryDirectory() as spare:
-        setup = _setup_of(recording.notes, setup_name, recording.damage is not None, Path(spare), say)
+        scene = scene_at(recording, start)
+        setup = _setup_of(recording.notes, setup_name, recording.damage is not None, Path(spare), scene, say)
         yield Given(recording, setup, chosen, start, left if duration is None else min(duration, left))
 
 
-def _setup_of(notes: Mapping[str, str], name: str, is_damaged: bool, spare: Path, say: Say) -> Setup:
-    """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default."""
+def scene_at(recording: Recording, start: float) -> Scene | None:
+    """Return the scene that a bag tells to be in force at a time into it [s], or tells first; None if it tells none.
+
+    Raises:
+        BagError: what it tells is no scene.
+    """
+    found: Scene | None = None
+    if recording.counts.get(SCENE.recorded):
+        for record in recording.records([SCENE]):
+            if found is not None and record.time > recording.start + round(start * 1e9):
+                break
+            try:
+                found = scene_of(record.decode())
+            except InvalidInputError as error:
+                raise BagError(recording.path, str(error)) from None
+    return found
+
+
+def begin_with_scene(bag: BagWriter, given: Given) -> None:
+    """Write the scene at the beginning of a bag made from another."""
+    bag.add_topic(SCENE.recorded, SCENE.type_name)
+    bag.write_message(SCENE.recorded, given.begin, scene_message(given.setup.scene, header(given.begin), make))
+
+
+def _setup_of(
+    notes: Mapping[str, str], name: str, is_damaged: bool, spare: Path, scene: Scene | None, say: Say
+) -> Setup:
+    """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default.
+
+    Raises:
+        ConfigurationError: it cannot be used; of the bag's own, the message says to name another.
+    """
     named, text = notes.get("setup", ""), notes.get(SCENARIO_NOTE, "")
     if name:
         if named and name != named:
             say(f"the bag names the set-up {named}; taking {name}")
-        return read_setup(name)
+        return read_setup(name, scene)
     if text:  # which says more than a name: the file may have changed, or be on another machine
         path = spare / f"{named or 'scenario'}.yaml"
         path.write_text(text, encoding="utf-8")
-        return read_setup(str(path))
+        try:
+            return read_setup(str(path), scene)
+        except ConfigurationError as error:
+            # Its lines may be of another version of this package, which had dish and obstacles in every section.
+            expected = "what this version knows; name a set-up by --setup"
+            raise ConfigurationError("the bag's own set-up", error.name, expected) from None
     if not named:
         lost = ", or has lost its name" if is_damaged else ""
         say(f"the bag names no set-up{lost}; taking {DEFAULT_SETUP}, which may not be its own: --setup names another")
-    return read_setup(named or DEFAULT_SETUP)
+    return read_setup(named or DEFAULT_SETUP, scene)
 
 
 def write_results(
@@ -145,14 +185,14 @@ def write_results(
         say("no picture: the dish is not found in any frame")
         return
     frame, view = found
-    obstacles = given.setup.model.obstacles()
+    obstacles = given.setup.scene.obstacles
     draw_summary(folder / "summary.png", frame, view, chosen, instants, obstacles, given.recording.start, summary)
 
 
 def _frame_of(given: Given, stamp: int) -> tuple[NDArray[np.uint8], DishView] | None:
     """Return the camera frame of a stamp, and where the dish is, by the first frame in which it is found."""
     view, frame = None, None
-    tracker = VisionTracker(given.setup.vision)
+    tracker = VisionTracker(given.setup.vision, given.setup.scene)
     camera = given.recording.camera
     assert camera is not None
     for record in given.recording.records([camera], start=given.start, duration=given.duration):
@@ -174,7 +214,7 @@ def _frame_of(given: Given, stamp: int) -> tuple[NDArray[np.uint8], DishView] | 
 def _plain_dish(given: Given) -> tuple[NDArray[np.uint8], DishView]:
     """Return a drawn dish, where no camera saw the real one."""
     rows, columns = PLAIN_SIZE
-    diameter = given.setup.vision.dish_diameter
+    diameter = given.setup.scene.dish.diameter
     view = DishView((0.5 * (columns - 1), 0.5 * (rows - 1)), diameter / (PLAIN_SHARE * rows))
     v, u = np.mgrid[:rows, :columns]
     inside = np.hypot(u - view.centre_px[0], v - view.centre_px[1]) < 0.5 * PLAIN_SHARE * rows

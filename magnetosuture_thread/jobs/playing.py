@@ -10,10 +10,24 @@ from typing import TYPE_CHECKING
 import yaml
 
 from magnetosuture_thread.bags.reader import Record
-from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, NEEDLE_COMMAND, NEEDLE_POSE, NODES, SEEN_THREAD, Channel
+from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.interface import (
+    CAMERA,
+    CAMERA_INFO,
+    NEEDLE_COMMAND,
+    NEEDLE_POSE,
+    NODES,
+    PROCESSES,
+    SCENE,
+    SEEN_THREAD,
+    Channel,
+)
 from magnetosuture_thread.jobs.judge import Given
 from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
 from magnetosuture_thread.offline.changes import CHANGING
+from magnetosuture_thread.offline.messages import header, make
+from magnetosuture_thread.scene import write_scene
+from magnetosuture_thread.scene.messages import scene_message
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.topics import Topic
@@ -39,16 +53,22 @@ class Playing:
         camera = self.given.recording.camera
         source = (camera, CAMERA_INFO) if self.given.source == "camera" else (NEEDLE_POSE, SEEN_THREAD)
         counts = self.given.recording.counts
-        return [
+        there = [
             channel
             for channel in (*source, NEEDLE_COMMAND, *CHANGING)
-            if channel is not None and counts.get(channel.recorded)
+            if channel is not None and channel != SCENE and counts.get(channel.recorded)
         ]
+        return [SCENE, *there]
 
     @property
     def nodes(self) -> tuple[str, ...]:
         """Return the nodes of the graph."""
         return NODES if self.given.source == "camera" else tuple(name for name in NODES if name != "vision_tracker")
+
+    @property
+    def processes(self) -> tuple[str, ...]:
+        """Return the programs that these nodes run as."""
+        return PROCESSES if self.given.source == "camera" else self.nodes
 
     @property
     def transport(self) -> str:
@@ -67,14 +87,17 @@ class Playing:
         """Return the nodes' arguments.
 
         Args:
-            qos: a file that this makes: parameters under which no message is lost.
+            qos: a file that this makes: parameters under which no message is lost; `scene.yaml` is made beside it.
         """
         from magnetosuture_thread.nodes import topics
         from magnetosuture_thread.nodes.replay import DEPTH
 
         qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
         files = [part for path in (self.given.setup.path, qos) for part in ("--params-file", str(path.resolve()))]
-        arguments = [*files, "-p", "use_sim_time:=true", *NOTHING_MOVES]
+        # Nodes begin in the scene that is played, also where the set-up's file names one of another machine.
+        scene = qos.with_name("scene.yaml")
+        write_scene(self.given.setup.scene, scene)
+        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *NOTHING_MOVES]
         if self.transport:
             arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
         return arguments
@@ -82,7 +105,12 @@ class Playing:
     def records(self) -> Iterator[Record]:
         """Give the messages to play, by time."""
         given = self.given
-        if given.start > 0.0:  # what was said before of obstacles and thread is in force
-            for record in given.recording.records(CHANGING, duration=given.start):
+        # The scene comes first: the one that the bag tells to be in force, or else the set-up's.
+        message = scene_message(given.setup.scene, header(given.begin), make)
+        data = bytes(typestore().serialize_cdr(message, SCENE.type_name))
+        yield Record(SCENE.recorded, SCENE.type_name, given.begin, data)
+        if given.start > 0.0:  # what was said before of the thread is in force
+            told = [channel for channel in CHANGING if channel != SCENE]
+            for record in given.recording.records(told, duration=given.start):
                 yield replace(record, time=given.begin)
         yield from given.recording.records(self.channels, start=given.start, duration=given.duration)

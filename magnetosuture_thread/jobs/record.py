@@ -21,6 +21,7 @@ from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
+    SCENE,
     SEEN_THREAD,
     TRUE_NEEDLE,
     TRUE_THREAD,
@@ -30,7 +31,8 @@ from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.thread import Attachment
 from magnetosuture_thread.offline.messages import header, make, path_message, placed, pose_message
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import Scene
+from magnetosuture_thread.rig.camera.scene import Scene as CameraScene
+from magnetosuture_thread.scene.messages import scene_message
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
@@ -58,9 +60,9 @@ def record(
 ) -> int:
     """Write a trajectory as a bag; return the number of frames, or of poses.
 
-    The bag holds JPEG frames and camera_info, or in their place needle poses and seen threads; besides, the needle
-    velocity command that the trajectory amounts to, and the truth on topics of its own. All of it is simulated, and
-    the bag's notes say so.
+    The bag begins with the scene. It holds JPEG frames and camera_info, or in their place needle poses and seen
+    threads; besides, the needle velocity command that the trajectory amounts to, and the truth on topics of its own.
+    All of it is simulated, and the bag's notes say so.
 
     Args:
         reference: needle poses and thread.
@@ -91,6 +93,9 @@ def record(
     what = "needle poses and seen thread" if poses else "camera frames and needle motion, rendered"
     notes = {"setup": setup.name, "simulated": f"{what} from the reference trajectory {reference.name}"}
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
+        bag.add_topic(SCENE.recorded, SCENE.type_name)
+        begin = round((start + EPOCH) * 1e9)
+        bag.write_message(SCENE.recorded, begin, scene_message(setup.scene, header(begin), make))
         topics = _PoseTopics(bag, setup, noise, seed) if poses else _FrameTopics(bag, setup, reference, quality, seed)
         for index in range(frames):
             time = start + index / rate
@@ -107,9 +112,9 @@ def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
     attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.GLUED}.get(str(metadata.get("boundary")))
     length = metadata.get("material", {}).get("L_m")
     for name, given, expected in (
-        ("length", setup.model.length, length),
+        ("thread_length", setup.model.thread_length, length),
         ("attachment", setup.model.attachment, attachment.value if attachment else None),
-        ("disc_obstacles", setup.model.obstacles(), reference.discs),
+        ("scene", setup.scene.obstacles, reference.discs),
     ):
         if expected is not None and not _same(given, expected):
             raise ConfigurationError(
@@ -170,9 +175,9 @@ class _FrameTopics(_Topics):
 
     def __init__(self, bag: BagWriter, setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> None:
         super().__init__(bag, (COMPRESSED_IMAGE, CAMERA_INFO))
-        view = DishView((322.0, 238.0), setup.vision.dish_diameter / (DISH_SHARE * SIZE[1]))
-        scene = Scene(
-            dish_diameter=setup.vision.dish_diameter,
+        view = DishView((322.0, 238.0), setup.scene.dish.diameter / (DISH_SHARE * SIZE[1]))
+        scene = CameraScene(
+            dish_diameter=setup.scene.dish.diameter,
             needle_length=setup.vision.needle_length,
             needle_width=setup.vision.needle_width,
             thread_diameter=setup.model.thread().diameter,

@@ -152,10 +152,10 @@ class _Replay:
             self.say(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
             with (
                 environment_of(environment),
-                NodeProcesses(playing.nodes, playing.arguments(qos), environment, self.folder / "logs") as nodes,
+                NodeProcesses(playing.processes, playing.arguments(qos), environment, self.folder / "logs") as nodes,
             ):
                 outputs = BagWriter(self.folder / "bag", self.given.notes)
-                for topic in topics.OUTPUTS:
+                for topic in (topics.SCENE, *topics.OUTPUTS):
                     outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
 
                 def watch() -> None:
@@ -181,6 +181,7 @@ class _Replay:
                 finally:
                     live.close()
         qos.unlink()
+        qos.with_name("scene.yaml").unlink()
         return summary, problem
 
     def _play(self, live: LiveReplay, pause: str) -> None:
@@ -206,7 +207,7 @@ class _Replay:
     def _judge(self, live: LiveReplay) -> Summary:
         """Put the outputs side by side; write summary.json and summary.png."""
         given = self.given
-        collector, recorded, replayed = Collector(given.setup.model.length), CurrentSeries(), CurrentSeries()
+        collector, recorded, replayed = Collector(given.setup.model.thread_length), CurrentSeries(), CurrentSeries()
         truth = [c for c in (TRUE_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
         for record in given.recording.records(truth, start=given.start, duration=given.duration):
             message = record.decode()

@@ -12,14 +12,16 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, TRACKER_STATE, Channel
-from magnetosuture_thread.jobs.judge import Given, opened, write_results
+from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, TRACKER_STATE
+from magnetosuture_thread.jobs.judge import Given, begin_with_scene, opened, write_results
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.offline import messages
-from magnetosuture_thread.offline.packing import packed_margins, packed_prediction
 from magnetosuture_thread.offline.predictions import Step, predictions, sights
 from magnetosuture_thread.offline.sights import NOT_NEWER, Sights
+from magnetosuture_thread.packing.layout import time_of
+from magnetosuture_thread.packing.needle import packed_path, packed_pose
+from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
 from magnetosuture_thread.study.replayed import Spread, Summary, error_figures
 from magnetosuture_thread.study.tally import Tally
 from magnetosuture_thread.vision.session import Seen
@@ -87,9 +89,10 @@ def replay_offline(
             duration=given.duration,
             progress=progress,
         )
-        tally, refused = Tally(given.setup.model.length), Counter[str]()
+        tally, refused = Tally(given.setup.model.thread_length), Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
-            steps, made = predictions(seen, given.setup.model), _Output(bag, seen)
+            begin_with_scene(bag, given)
+            steps, made = predictions(seen, given.setup.model, given.setup.scene), _Output(bag, seen)
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)
@@ -177,24 +180,22 @@ class _Output:
         """Write what came of a sight."""
         stamp, outcome, prediction = step.outcome.stamp, step.outcome, step.outcome.prediction
         if prediction is not None:
-            self._bag.write(
-                PREDICTED_THREAD.recorded, max(stamp, 0), packed_prediction(stamp, prediction, step.settings.material)
-            )
+            packed = packed_prediction(time_of(stamp), prediction, step.settings.material)
+            self._bag.write(PREDICTED_THREAD.recorded, max(stamp, 0), packed)
         if isinstance(outcome.problem, InvalidInputError):
             return  # as live: a pose that is refused gets no answer
         reason = WAITING if outcome.waiting else str(outcome.problem) if prediction is None else prediction.status
-        self._bag.write(MARGINS.recorded, max(stamp, 0), packed_margins(stamp, step.margins, reason))
+        packed = packed_margins(time_of(stamp), step.margins, reason, scene_version=outcome.scene_version)
+        self._bag.write(MARGINS.recorded, max(stamp, 0), packed)
 
     def _frame(self, stamp: int, seen: Seen) -> None:
         track = seen.track
         if seen.tracked:
-            self._write(NEEDLE_POSE, stamp, messages.pose_message(stamp, track.tail, track.heading, track.covariance))
+            pose = packed_pose(time_of(stamp), track.tail, track.heading, track.covariance)
+            self._bag.write(NEEDLE_POSE.recorded, max(stamp, 0), pose)
             if len(seen.centreline):
-                self._write(SEEN_THREAD, stamp, messages.path_message(stamp, seen.centreline))
-        self._write(TRACKER_STATE, stamp, messages.tracker_state(stamp, track))
+                self._bag.write(SEEN_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
+        self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), messages.tracker_state(stamp, track))
 
     def _record(self, stamp: int, record: Record) -> None:
         self._bag.write(record.topic, max(stamp, 0), record.data)
-
-    def _write(self, channel: Channel, stamp: int, message: object) -> None:
-        self._bag.write_message(channel.recorded, max(stamp, 0), message)

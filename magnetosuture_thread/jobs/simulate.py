@@ -15,7 +15,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.interface import CAMERA, NODES, OBSTACLE_MARKERS, TIP_SETPOINT
+from magnetosuture_thread.interface import CAMERA, NODES, PROCESSES, SCENE, SCENE_MARKERS, SCENE_SERVER, TIP_SETPOINT
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.loop import LoopCollector, LoopSummary
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.nodes.recorder import Recorder
 
 SCENARIO_NOTE = "scenario"  # of the bag, which holds the set-up's text
+ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # what is told while nodes start, for the bag's beginning
 INTERRUPTED = "interrupted"
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 SETTLE = 1.0  # s for all nodes to have found each other
@@ -43,7 +44,7 @@ SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:aut
 
 # Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
 # for 75 ms, as happens with two busy cores, would be taken for dead.
-PATIENT_DRIVER = {"roboclaw_answer_timeout": 0.2, "roboclaw_timeout": 0.5}
+PATIENT_DRIVER = {"roboclaw_answer_timeout": 0.2, "driver_timeout": 0.5}
 
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -103,7 +104,7 @@ def simulate(
 def judge(bag: Bag, setup: Setup) -> LoopCollector:
     """Return all that a simulated run's bag says, put side by side."""
     collector = LoopCollector(
-        setup.model.length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
+        setup.model.thread_length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
     )
     camera = {channel.recorded for channel in CAMERA.values()}
     for record in bag.records(set(bag.topics) - camera):
@@ -153,10 +154,12 @@ def _run(
         arguments += _wired(ports, len(setup.coils.coil_angles)) if boards else SIMULATED_COILS
         for topic in taken:
             bag.add_topic(topic.channel.recorded, topic.channel.type_name)
-        say(f"starting rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
+        say(f"starting {SCENE_SERVER}, rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
         with (
             environment_of(environment),
-            NodeProcesses(("rig_simulator", *NODES), arguments, environment, folder / "logs") as nodes,
+            NodeProcesses(
+                (SCENE_SERVER, "rig_simulator", *PROCESSES), arguments, environment, folder / "logs"
+            ) as nodes,
         ):
             running, interruption = False, Interruption()
             early: dict[str, bytes] = {}
@@ -164,7 +167,7 @@ def _run(
             def receive(topic: str, arrival: int, data: bytes) -> None:
                 # While nodes start, only what is said once and for all is worth keeping: for the bag's start.
                 if not running:
-                    early.update({topic: data} if topic == OBSTACLE_MARKERS.recorded else {})
+                    early.update({topic: data} if topic in ONCE else {})
                     return
                 for name, said_early in early.items():
                     bag.write(name, arrival, said_early)
@@ -182,7 +185,7 @@ def _run(
                     topics.OPERATOR_COMMAND,
                     topics.TIP_SETPOINT,
                     topics.FAULT_REQUEST,
-                    *topics.SETTINGS,
+                    topics.MATERIAL,
                 )
                 with interruption:
                     _wait(recorder, check, {topic.name for topic in perhaps})

@@ -14,6 +14,7 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.jobs.frames import Frame, FrameSource, numbered
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -75,6 +76,7 @@ def settings_with(
 def track(
     paths: Sequence[Path],
     settings: VisionTrackerSettings,
+    scene: Scene,
     *,
     overlay: Path | None = None,
     remap: Mapping[str, str] | None = None,
@@ -86,6 +88,7 @@ def track(
     Args:
         paths: picture files, one folder of pictures, or one bag.
         settings: what to look for.
+        scene: in which.
         overlay: folder or video to draw into.
         remap: new name of a bag's topic by its recorded name.
         say: called with a line for a person on what of a bag is damaged or not checked.
@@ -97,7 +100,7 @@ def track(
     source = FrameSource(paths, remap=remap)
     for doubt in source.doubts:
         say(f"{paths[0]} {doubt}")
-    tracker = VisionTracker(settings)
+    tracker = VisionTracker(settings, scene)
     warm_up()
     results = []
     # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
@@ -108,7 +111,7 @@ def track(
             results.append(result)
             if writer is not None and frame.image is not None:
                 name = f"frame_{index:06d}" if source.is_sequence else files[index]
-                writer.write(name, _drawn(frame.image, result, settings))
+                writer.write(name, _drawn(frame.image, result, settings, scene))
             progress((index + 1) / max(source.count, 1))
     for line in source.refused:
         say(line)
@@ -130,11 +133,11 @@ def _look(tracker: VisionTracker, frame: Frame, in_sequence: bool) -> TrackedFra
     return TrackedFrame(frame.name, seen, time.thread_time() - began, frame.stamp)
 
 
-def _drawn(image: np.ndarray, result: TrackedFrame, settings: VisionTrackerSettings) -> np.ndarray:
+def _drawn(image: np.ndarray, result: TrackedFrame, settings: VisionTrackerSettings, scene: Scene) -> np.ndarray:
     drawn = draw_overlay(image, result.track, settings.needle_length, result.name)
     view = result.track.view
     if view is not None:
-        draw_dish(drawn, view.centre_px, 0.5 * settings.dish_diameter / view.metres_per_pixel)
+        draw_dish(drawn, view.centre_px, scene.dish.radius / view.metres_per_pixel)
     return drawn
 
 

@@ -3,7 +3,6 @@
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
 from magnetosuture_thread.model.choices import make_formulation, make_solver
 from magnetosuture_thread.model.medium import Medium
-from magnetosuture_thread.model.needle import NeedleFilter
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
 
@@ -14,7 +13,6 @@ __all__ = [
     "Material",
     "Medium",
     "Mesh",
-    "NeedleFilter",
     "NeedlePose",
     "Polygon",
     "Prediction",

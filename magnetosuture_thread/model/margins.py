@@ -12,6 +12,9 @@ from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.barriers.rows import BarrierKind
 from magnetosuture_thread.model.friction import UNKNOWN, Friction
 
+TOUCHABLE = (BarrierKind.OBSTACLE, BarrierKind.WALL)
+"""Kinds of barriers that are of a solid thing."""
+
 
 @dataclass(frozen=True)
 class LeastBarrier:
@@ -40,11 +43,12 @@ class Margins:
         kind: number of the kind, uint8.
         node: index, uint32.
         obstacle: index, int32; -1 where the kind has none.
-        value: h, safe at >= 0; [m] for an obstacle, [m^4] for stiffness, else [m^2].
+        value: h, safe at >= 0; [m] for an obstacle and the wall, [m^4] for stiffness, else [m^2].
         clearance: the same margin as a distance [m].
         least: of each kind present.
-        touching: nodes that touch an obstacle, rising.
+        touching: nodes that touch an obstacle or the wall, rising.
         friction: between obstacles.
+        scene_version: of the scene that they are of; empty where the model knows none.
     """
 
     kind: NDArray[np.uint8]
@@ -55,15 +59,23 @@ class Margins:
     least: tuple[LeastBarrier, ...]
     touching: tuple[int, ...]
     friction: Friction = UNKNOWN
+    scene_version: str = ""
 
     @classmethod
-    def of(cls, barriers: Sequence[BarrierRows], contact_tolerance: float, friction: Friction = UNKNOWN) -> Margins:
+    def of(
+        cls,
+        barriers: Sequence[BarrierRows],
+        contact_tolerance: float,
+        friction: Friction = UNKNOWN,
+        scene_version: str = "",
+    ) -> Margins:
         """Put the barriers of all kinds together.
 
         Args:
             barriers: the rows of each kind, in SI units.
-            contact_tolerance: a node this close to an obstacle touches it [m].
+            contact_tolerance: a node this close to an obstacle or the wall touches it [m].
             friction: between obstacles.
+            scene_version: of the scene.
         """
         count = sum(len(rows.value) for rows in barriers)
         whole = cls(
@@ -75,6 +87,7 @@ class Margins:
             tuple(_least(rows) for rows in barriers if len(rows.value)),
             _touching(barriers, contact_tolerance),
             friction,
+            scene_version,
         )
         begin = 0
         for rows in barriers:
@@ -97,6 +110,6 @@ def _least(rows: BarrierRows) -> LeastBarrier:
 
 
 def _touching(barriers: Sequence[BarrierRows], tolerance: float) -> tuple[int, ...]:
-    """Return the nodes that are this close to an obstacle, rising."""
-    near = [rows for rows in barriers if rows.kind == BarrierKind.OBSTACLE and len(rows.value)]
+    """Return the nodes that are this close to an obstacle or the wall, rising."""
+    near = [rows for rows in barriers if rows.kind in TOUCHABLE and len(rows.value)]
     return tuple(sorted({node for rows in near for node in rows.nodes[rows.clearance <= tolerance, -1].tolist()}))

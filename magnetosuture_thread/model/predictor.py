@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_along
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.formulations import Drive, Formulation, StepSolution, ThreadState
 from magnetosuture_thread.model.program import SOLVED, Residuals
@@ -46,6 +46,7 @@ class Prediction:
     Attributes:
         stamp: [s]
         formulation: name of the formulation.
+        scene_version: of the scene that it was predicted in; empty where the model knows none.
         vertices: all nodes, shape (n + 1, d) [m].
         stretch: each segment's length from end to end over what it should be, less one, shape (n,).
         interval: time since the previous prediction [s].
@@ -60,6 +61,7 @@ class Prediction:
 
     stamp: float
     formulation: str
+    scene_version: str
     vertices: Points
     stretch: NDArray[np.float64]
     interval: float
@@ -85,6 +87,8 @@ class ThreadPredictor:
         longest_step: intervals are divided into steps of at most this [s].
         most_substeps: but into at most so many; then the steps get longer.
         held: nodes that stay where they are at the start, as where tissue holds the thread.
+        wall_radius: inner radius of the dish, in the plane, within which a thread starts; inf without one [m].
+        scene_version: of the scene that the formulation knows; empty where it knows none.
     """
 
     def __init__(
@@ -95,6 +99,8 @@ class ThreadPredictor:
         longest_step: float = 0.02,
         most_substeps: int = 200,
         held: Sequence[int] = (),
+        wall_radius: float = math.inf,
+        scene_version: str = "",
     ) -> None:
         for node in held:
             _check_node("held node", node, thread)
@@ -103,6 +109,8 @@ class ThreadPredictor:
         self._longest_step = longest_step
         self._most_substeps = most_substeps
         self._held = tuple(sorted(set(held)))
+        self._room_radius = wall_radius - 0.5 * thread.diameter
+        self._scene_version = scene_version
         self._pose: NeedlePose | None = None
         self._state: ThreadState | None = None
 
@@ -133,7 +141,7 @@ class ThreadPredictor:
         Args:
             pose: the needle at the same instant.
             centreline: polyline, shape (m, d), m >= 2 [m]; if it is shorter than the thread, the
-                thread goes on straight.
+                thread goes on straight, and where the wall is in its way, along the wall.
 
         Raises:
             InvalidInputError: the pose or the centreline is not finite, or the centreline is shorter
@@ -150,7 +158,7 @@ class ThreadPredictor:
         path = np.vstack([pose.tail, centreline[1:]])
         if arc_lengths(path)[-1] < unit:
             raise InvalidInputError("centreline", f"{arc_lengths(path)[-1]:.2e} m long", f"at least {unit:.2e} m")
-        return self.start_at(pose, chain_along(path, self.thread.segments, unit))
+        return self.start_at(pose, chain_inside(path, self.thread.segments, unit, self._room_radius))
 
     def start_at(self, pose: NeedlePose, vertices: Points) -> Prediction:
         """Take the thread's nodes as they are.
@@ -245,6 +253,7 @@ class ThreadPredictor:
         return Prediction(
             stamp=pose.stamp,
             formulation=self._formulation.name,
+            scene_version=self._scene_version,
             vertices=positions,
             stretch=lengths / self._formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,

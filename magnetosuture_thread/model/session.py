@@ -17,8 +17,8 @@ from magnetosuture_thread.model.friction import FrictionLaw
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import FARTHEST, NeedlePose, Prediction
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.model.steering import Steered, at_rest, steered
 from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.scene import Scene
 
 EARLY = 30  # poses that may wait for the centreline of their frame
 REPLAYED = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
@@ -49,12 +49,14 @@ class Outcome:
         stamp: of the pose [ns].
         prediction: of the thread; None where there is none.
         problem: why there is none; None while the thread is waited for.
+        scene_version: of the scene in force; empty where there is none.
         proof: for its margins; None where there is no prediction.
     """
 
     stamp: int
     prediction: Prediction | None = None
     problem: InvalidInputError | SolverError | None = None
+    scene_version: str = ""
     proof: Proof | None = field(default=None, repr=False, compare=False)
 
     @cached_property
@@ -63,7 +65,7 @@ class Outcome:
         if self.prediction is None or self.proof is None or not self.prediction.converged:
             return None
         friction = self.proof.law.judge(self.prediction.margins, self.proof.speeds)
-        return Margins.of(self.prediction.margins, self.proof.contact_tolerance, friction)
+        return Margins.of(self.prediction.margins, self.proof.contact_tolerance, friction, self.scene_version)
 
     @property
     def waiting(self) -> bool:
@@ -78,59 +80,64 @@ class ThreadSession:
     give the same predictions to the last bit.
 
     Args:
-        settings: thread, liquid and obstacles.
+        settings: of thread and liquid.
+        scene: dish and obstacles; None while nobody knows them, and then there is neither wall nor obstacle.
 
     Attributes:
         settings: in force.
+        scene: in force.
 
     Raises:
-        ConfigurationError: an obstacle cannot be used.
+        ConfigurationError: a shape of the scene cannot be used.
     """
 
-    def __init__(self, settings: ThreadModelSettings) -> None:
-        self.settings = settings
-        self._predictor = settings.predictor()
+    def __init__(self, settings: ThreadModelSettings, scene: Scene | None) -> None:
+        self.settings, self.scene = settings, scene
+        self._predictor = settings.predictor(scene)
         # Obstacles may come later, and no callback shall wait for the compiler of what they need.
         Surroundings(_OBSTACLES, settings.margin_range)
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=EARLY)
         self._last: int | None = None
-        self._needle, self._motion = settings.needle_filter(), settings.node_motion()
-        self._proven: tuple[Outcome, NeedlePose] | None = None
-        self._needle.safe_velocity(np.zeros(2), np.array([1.0, 0.0]), np.zeros(2))  # compiled now
+        self._motion = settings.node_motion()
 
     @property
     def thread(self) -> Thread:
         """The thread that is predicted."""
         return self._predictor.thread
 
-    def prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
-        """Build what other settings need, and return what puts them in force, which cannot fail.
+    @property
+    def scene_version(self) -> str:
+        """Version of the scene in force; empty where there is none."""
+        return self.scene.version if self.scene is not None else ""
 
-        The prediction then goes on from where the thread is and as it moves. That takes some milliseconds, and with
-        an outline of a thousand corners a tenth of a second.
+    def prepare(self, settings: ThreadModelSettings, scene: Scene | None) -> Callable[[], None]:
+        """Build what other settings or another scene need, and return what puts them in force, which cannot fail.
+
+        The prediction then goes on from where the thread is and as it moves; what appears upon it pushes it out. That
+        takes some milliseconds, and with an outline of a thousand corners a tenth of a second.
 
         Raises:
             ConfigurationError: they cannot be used.
         """
-        if settings == self.settings:
+        if settings == self.settings and scene == self.scene:
             return lambda: None
-        predictor, needle, motion = settings.predictor(), settings.needle_filter(), settings.node_motion()
+        predictor, motion = settings.predictor(scene), settings.node_motion()
 
         def put_in_force() -> None:
             predictor.follow_on(self._predictor)
             motion.follow_on(self._motion)
-            self.settings, self._predictor, self._needle, self._motion = settings, predictor, needle, motion
+            self.settings, self.scene, self._predictor, self._motion = settings, scene, predictor, motion
 
         return put_in_force
 
-    def change(self, settings: ThreadModelSettings) -> None:
-        """Go on with other settings, from where the thread is and as it moves.
+    def change(self, settings: ThreadModelSettings, scene: Scene | None) -> None:
+        """Go on with other settings or another scene, from where the thread is and as it moves.
 
         Raises:
             ConfigurationError: they cannot be used; those before stay in force.
         """
-        self.prepare(settings)()
+        self.prepare(settings, scene)()
 
     def wants_seen(self, stamp: int) -> bool:
         """Return whether a seen thread of this stamp [ns] would be of use; most are not."""
@@ -165,7 +172,7 @@ class ThreadSession:
         """
         if self._last is not None and stamp < self._last - REPLAYED:
             self._predictor.reset()
-            self._last = self._proven = None
+            self._last = None
             self._early.clear()
             if self._seen is not None and self._seen[0] > stamp:
                 self._seen = None  # of the time before it was set back
@@ -177,41 +184,13 @@ class ThreadSession:
                 prediction = self._predictor.start(attached, centreline)
             else:
                 self._early.append((stamp, pose))
-                return Outcome(stamp)
+                return Outcome(stamp, scene_version=self.scene_version)
         except (InvalidInputError, SolverError) as error:
-            return Outcome(stamp, problem=error)
+            return Outcome(stamp, problem=error, scene_version=self.scene_version)
         self._last = stamp
         settings, speeds = self.settings, self._motion.take(prediction.vertices, prediction.interval)
         proof = Proof(settings.friction_law(), settings.contact_tolerance, speeds)
-        outcome = Outcome(stamp, prediction, proof=proof)
-        if prediction.converged:
-            self._proven = outcome, pose
-        return outcome
-
-    def on_asked(self, stamp: int, velocity: NDArray[np.float64]) -> Steered:
-        """Filter the velocity that an operator asks of the needle, by the thread as last predicted.
-
-        Where the needle is goes by its last pose that gave a prediction. Without one that is new enough nobody knows
-        what the needle would do to the thread, and it is told to rest.
-
-        Args:
-            stamp: when it was asked for [ns].
-            velocity: of the needle's tip, shape (2,) [m/s].
-
-        Raises:
-            InvalidInputError: the velocity is not finite, or beyond 1 m/s.
-            SolverError: the filter's program has no solution.
-        """
-        if self._proven is None:
-            return at_rest(velocity, "no predicted thread yet")
-        outcome, pose = self._proven
-        age = (stamp - outcome.stamp) * 1e-9
-        if not abs(age) <= self.settings.steering_timeout:
-            return at_rest(velocity, f"the last predicted thread is {age:.2f} s old")
-        assert outcome.margins is not None
-        if not self._needle.length:
-            pose = self.settings.attachment_pose(pose)  # the point that is steered
-        return steered(self._needle, outcome.margins.friction, pose.tail, pose.heading, velocity)
+        return Outcome(stamp, prediction, scene_version=self.scene_version, proof=proof)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":

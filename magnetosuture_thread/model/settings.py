@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
-from magnetosuture_thread.configuration import described, quantity
+from magnetosuture_thread.configuration import Configuration, described, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
-from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
+from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
+from magnetosuture_thread.model.friction import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.medium import Medium
-from magnetosuture_thread.model.needle import NeedleFilter
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
-from magnetosuture_thread.model.steering_settings import SteeringSettings
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.shared_parameters import shared
 
 MEDIA = ("liquid", "air")
 OF_MEDIUM = {
@@ -31,16 +30,21 @@ OF_MEDIUM = {
     "bending_damping": "air",
     "gravity": "air",
 }
-FIXED = {name: "what is compiled when it starts" for name in ("formulation", "solver")}  # why a node cannot change it
+FIXED = {  # why a node cannot change it
+    "formulation": "what is compiled when it starts",
+    "solver": "what is compiled when it starts",
+    "scene": "what it starts with; the topic scene changes it",
+}
 SHARPEST_TURN = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
 @dataclass(frozen=True)
-class ThreadModelSettings(SteeringSettings):
-    """What the thread model must know of the thread, the liquid and the obstacles."""
+class ThreadModelSettings(Configuration):
+    """What the thread model must know of the thread and the liquid; the scene itself is told apart."""
 
     GROUP: ClassVar[str] = "thread_model"
 
+    scene: str = shared("scene")
     formulation: str = quantity(
         "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS
     )
@@ -50,7 +54,7 @@ class ThreadModelSettings(SteeringSettings):
     elastic_modulus: float = quantity(
         0.0, "effective modulus of the thread in bending; 0 takes the material's", unit="Pa", minimum=0.0, maximum=1e12
     )
-    length: float = quantity(0.019, "rest length of the thread", unit="m", minimum=0.001, maximum=2.0)
+    thread_length: float = shared("thread_length")
     segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
     attachment: str = quantity(
         Attachment.PINNED.value,
@@ -72,13 +76,7 @@ class ThreadModelSettings(SteeringSettings):
         "what the thread moves in: liquid drags it, in air its inertia and weight count; for rod",
         choices=MEDIA,
     )
-    viscosity: float = quantity(
-        1.0,
-        "dynamic viscosity of the liquid; glycerin at room temperature is about 1",
-        unit="Pa s",
-        minimum=1e-4,
-        maximum=1e2,
-    )
+    viscosity: float = shared("viscosity")
     wetted_fraction: float = quantity(
         0.5, "part of the thread's surface in the liquid; half for a floating thread", minimum=0.05, maximum=1.0
     )
@@ -135,70 +133,49 @@ class ThreadModelSettings(SteeringSettings):
         minimum=1e-4,
         maximum=0.1,
     )
-    disc_obstacles: tuple[float, ...] = quantity(
-        (),
-        "round obstacles in the dish frame: x, y, radius of each in turn",
-        unit="m",
-        minimum=-1.0,
-        maximum=1.0,
-        multiple=3,
-    )
-    polygon_obstacles: tuple[float, ...] = quantity(
-        (),
-        "corners of polygons in the dish frame: x, y of each in turn, one outline after the other",
-        unit="m",
-        minimum=-1.0,
-        maximum=1.0,
-        multiple=2,
-    )
-    polygon_sizes: tuple[int, ...] = quantity(
-        (),
-        "number of corners of each outline in polygon_obstacles; negative for a hole in the polygon before it",
-        minimum=-10000,
-        maximum=10000,
-    )
-    corner_radius: float = quantity(
-        2e-4, "sharp corners of polygons are rounded by this; 0 leaves them", unit="m", minimum=0.0, maximum=0.1
-    )
-    corner_angle: float = quantity(
-        math.pi / 6.0,
-        "a corner is sharp where the outline turns by more than this",
-        unit="rad",
-        minimum=0.05,
-        maximum=3.1,
-    )
     margin_range: float = quantity(
         5e-3,
-        "margins are published of nodes and obstacles that are closer than this",
+        "margins are published of nodes that are closer to an obstacle or the wall than this",
         unit="m",
         minimum=1e-4,
         maximum=1.0,
     )
     contact_tolerance: float = quantity(
-        2e-6, "a node this close to an obstacle touches it", unit="m", minimum=0.0, maximum=1e-3
+        2e-6, "a node this close to an obstacle or the wall touches it", unit="m", minimum=0.0, maximum=1e-3
     )
     residual_tolerance: float = quantity(
         1e-6, "largest scaled residual with which a solution is accepted", minimum=1e-12, maximum=1e-2
     )
 
-    def check(self) -> None:
-        """Refuse a thread thicker than a segment is long, and obstacles too small for the segments.
+    friction_threshold: float = quantity(
+        5e-4, "a node this close to two obstacles is under friction", unit="m", minimum=0.0, maximum=0.1
+    )
+    friction_slowdown: float = quantity(
+        0.9, "beta: each node under friction slows the needle by this factor", minimum=0.01, maximum=1.0
+    )
+    resting_speed: float = quantity(
+        2e-4,
+        "a thread under friction whose nodes there are not faster rests, and slows nothing",
+        unit="m/s",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    friction_averaging: float = quantity(
+        0.2,
+        "time over which the nodes' velocities are averaged for that, as tracked poses tremble",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
+    )
 
-        A segment could lie across such an obstacle with both of its nodes outside.
-        """
-        self.check_steering(self.GROUP, self.margin_range)
-        least = 0.5 * self.length / self.segments
-        for disc in self._discs:
-            if disc.radius < least:
-                name, words = f"{self.GROUP}.disc_obstacles", "as every third number a radius of at least"
-                raise ConfigurationError(name, disc.radius, f"{words} {least:g} m, half of a segment")
-        for index, polygon in enumerate(self._polygons):
-            if not polygon.has_room_for(least):
-                name, words = f"{self.GROUP}.polygon_obstacles", "polygons with room for a disc of a radius of at least"
-                raise ConfigurationError(name, f"polygon {index}", f"{words} {least:g} m, half of a segment")
+    def check(self) -> None:
+        """Refuse a thread thicker than a segment is long, and values that contradict each other."""
+        if self.friction_threshold > self.margin_range:
+            expected = f"at most {self.GROUP}.margin_range, {self.margin_range:g} m"
+            raise ConfigurationError(f"{self.GROUP}.friction_threshold", self.friction_threshold, expected)
         diameter = self._material().diameter
-        if self.length / self.segments <= diameter:
-            most = math.ceil(self.length / diameter) - 1
+        if self.thread_length / self.segments <= diameter:
+            most = math.ceil(self.thread_length / diameter) - 1
             raise ConfigurationError(
                 f"{self.GROUP}.segments", self.segments, f"at most {most}, so that a segment is longer than thick"
             )
@@ -212,9 +189,9 @@ class ThreadModelSettings(SteeringSettings):
             raise ConfigurationError(
                 f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
             )
-        turn = abs(self.rest_curvature) * self.length / self.segments
+        turn = abs(self.rest_curvature) * self.thread_length / self.segments
         if turn > SHARPEST_TURN:
-            sharpest = SHARPEST_TURN * self.segments / self.length
+            sharpest = SHARPEST_TURN * self.segments / self.thread_length
             words = f"at most {sharpest:.0f} 1/m with {self.segments} segments, which turn by half a radian then"
             raise ConfigurationError(f"{self.GROUP}.rest_curvature", self.rest_curvature, words)
         for about in described(type(self)):
@@ -228,20 +205,6 @@ class ThreadModelSettings(SteeringSettings):
             if node > self.segments:
                 raise ConfigurationError(f"{self.GROUP}.held_nodes", node, f"nodes from 1 to {self.segments}")
 
-    def obstacles(self) -> tuple[Disc | Polygon, ...]:
-        """Return all obstacles: the discs, then the polygons, in the order in which margins number them."""
-        return (*self._discs, *self._polygons)
-
-    @cached_property
-    def _discs(self) -> tuple[Disc, ...]:
-        return discs_from(self.disc_obstacles)
-
-    @cached_property
-    def _polygons(self) -> tuple[Polygon, ...]:
-        return polygons_from(
-            self.GROUP, self.polygon_obstacles, self.polygon_sizes, self.corner_radius, self.corner_angle
-        )
-
     def _material(self) -> Material:
         material = MATERIALS[self.material]
         return replace(
@@ -254,7 +217,7 @@ class ThreadModelSettings(SteeringSettings):
         """Return the thread."""
         thread = Thread.of(
             self._material(),
-            length=self.length,
+            length=self.thread_length,
             segments=self.segments,
             attachment=Attachment(self.attachment),
             viscosity=self.viscosity,
@@ -275,24 +238,73 @@ class ThreadModelSettings(SteeringSettings):
         x, y = pose.heading
         return replace(pose, tail=pose.tail + np.array([along * x - left * y, along * y + left * x]))
 
-    def predictor(self) -> ThreadPredictor:
-        """Return a predictor of this thread among these obstacles, its kernels compiled.
+    def predictor(self, scene: Scene | None) -> ThreadPredictor:
+        """Return a predictor of this thread in a scene, its kernels compiled.
+
+        Args:
+            scene: dish and obstacles; None for neither.
 
         Raises:
-            ConfigurationError: an obstacle cannot be used; the message says why.
+            ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
-        thread, surroundings = self.thread(), Surroundings(self.obstacles(), self.margin_range)
+        check_scene(self, scene)
+        thread, surroundings = self.thread(), surroundings_of(scene, self.margin_range)
         tolerance = self.residual_tolerance
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
         paper = replace(PaperOptions.tuned(weight), damping=self.paper_damping)
         formulation = make_formulation(
             self.formulation, thread, surroundings, make_solver(self.solver, tolerance), tolerance, paper
         )
-        predictor = ThreadPredictor(formulation, thread, longest_step=self.longest_step, held=self.held_nodes)
+        predictor = ThreadPredictor(
+            formulation,
+            thread,
+            longest_step=self.longest_step,
+            held=self.held_nodes,
+            wall_radius=surroundings.wall_radius,
+            scene_version=scene.version if scene else "",
+        )
         predictor.warm_up()
         return predictor
 
-    def needle_filter(self) -> NeedleFilter:
-        """Return the steered needle's own barriers; raises as `predictor` does."""
-        surroundings = Surroundings(self.obstacles(), self.margin_range)
-        return self.filter_among(surroundings, make_solver(self.solver, self.residual_tolerance))
+    def friction_law(self) -> FrictionLaw:
+        """Return what tells friction."""
+        return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.resting_speed)
+
+    def node_motion(self) -> NodeMotion:
+        """Return what follows the nodes' velocities."""
+        return NodeMotion(self.friction_averaging)
+
+
+def surroundings_of(scene: Scene | None, reach: float) -> Surroundings:
+    """Return a scene's obstacles and wall for the barriers, which see as far as a reach [m]; none of no scene."""
+    if scene is None:
+        return Surroundings((), reach)
+    return Surroundings(scene.obstacles, reach, wall_radius=scene.dish.radius)
+
+
+def check_scene(settings: ThreadModelSettings, scene: Scene | None) -> None:
+    """Refuse a scene that the segments of a thread do not resolve.
+
+    A segment could lie across a shape that is smaller, with both of its nodes outside; in a dish that is narrower
+    than two segments, no chain can turn.
+
+    Args:
+        settings: of the thread.
+        scene: dish and obstacles; None for neither.
+
+    Raises:
+        ConfigurationError: the shape that is too small, or the dish.
+    """
+    if scene is None:
+        return
+    least = 0.5 * settings.thread_length / settings.segments
+    if not scene.dish.radius > 2.0 * least:
+        words = f"more than {4.0 * least:g} m, two segments of {settings.GROUP}"
+        raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, words)
+    for shape in scene.shapes:
+        name, words = f"scene.{shape.name}", f"of at least {least:g} m, half of a segment of {settings.GROUP}"
+        if isinstance(shape.geometry, Disc):
+            if shape.geometry.radius < least:
+                raise ConfigurationError(name, shape.geometry.radius, f"a radius {words}")
+        elif not shape.geometry.has_room_for(least):
+            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {words}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from builtin_interfaces.msg import Time
-from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents
+from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents, FilterState
 from rclpy.serialization import deserialize_message
 
 from magnetosuture_thread.coils.bridge import Outcome
@@ -31,6 +31,21 @@ def currents_message(stamp: Time, command: Time | None, outcome: Outcome) -> Coi
     )
 
 
+def filter_message(stamp: Time, outcome: Outcome) -> FilterState:
+    """Return what became of the command; `stamp` is the command's, or the time now where there is none."""
+    return FilterState(
+        header=header(stamp),
+        source=outcome.source,
+        commanded=vector(outcome.commanded),
+        filtered=vector(outcome.filtered),
+        applied=vector(outcome.applied),
+        slowdown=outcome.slowdown,
+        active=list(outcome.active),
+        overridden=outcome.overridden,
+        reason=outcome.reason,
+    )
+
+
 def state_message(stamp: Time, station: CoilStation, driver: DriverState, refused: int) -> CoilBridgeState:
     """Return what the bridge does and why.
 
@@ -51,6 +66,7 @@ def state_message(stamp: Time, station: CoilStation, driver: DriverState, refuse
         driver_warnings=list(driver.warnings),
         supply_voltage=list(driver.voltages),
         refused=refused,
+        scene_version="" if station.bridge is None else station.bridge.scene_version,
     )
     if driver.currents is not None:
         message.measured_current = driver.currents.tolist()
@@ -60,8 +76,8 @@ def state_message(stamp: Time, station: CoilStation, driver: DriverState, refuse
         return message
     message.reasons = list(outcome.reasons)
     message.commanded = vector(outcome.commanded)
+    message.filtered = vector(outcome.filtered)
     message.applied = vector(outcome.applied)
-    message.reached = vector(outcome.allocation.velocity)
     message.saturated = outcome.allocation.saturated
     message.current = outcome.allocation.currents.tolist()
     return message

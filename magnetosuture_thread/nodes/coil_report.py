@@ -27,18 +27,22 @@ class CoilReport:
         node: the coil bridge.
         station: what it has in hand.
         steady: a clock that runs whatever /clock does.
+
+    Attributes:
+        health: of the node, on /diagnostics.
     """
 
     def __init__(self, node: Node, station: CoilStation, steady: Clock) -> None:
         self._node = node
         self._station = station
-        self._health = Health(node)
+        self.health = self._health = Health(node)
         self._refused = 0
         self._told: object = None
         self._logged = ""
         self._setpoints = topics.NEEDLE_SETPOINT.publisher(node)
         self._currents = topics.CURRENTS.publisher(node)
         self._states = topics.BRIDGE_STATE.publisher(node)
+        self._filter = topics.FILTER_STATE.publisher(node)
         self._rig = topics.RIG_CURRENTS.publisher(node)
         node.create_timer(TELLING, lambda: self.state(anyway=True), clock=steady)
         # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
@@ -67,23 +71,38 @@ class CoilReport:
         """Say what the coils were told; `command` is the stamp of the command that they follow, if they do."""
         stamp = self._node.get_clock().now().to_msg()
         self._currents.publish(coil_messages.currents_message(stamp, command, outcome))
-        self._setpoints.publish(messages.twist_message(stamp, outcome.allocation.velocity))
+        self._setpoints.publish(messages.twist_message(stamp, outcome.applied))
+        self._filter.publish(coil_messages.filter_message(command or stamp, outcome))
 
     def state(self, *, anyway: bool) -> None:
         """Publish the state if it has changed, or anyway."""
         station = self._station
         latch, outcome, driver = station.latch, station.outcome, station.driver_state
         reasons = () if outcome is None else outcome.reasons
-        now = (latch.condition, latch.holds, outcome is None, reasons, driver.ready, driver.problem, driver.warnings)
+        scene = "" if station.bridge is None else station.bridge.scene_version
+        now = (
+            latch.condition,
+            latch.holds,
+            outcome is None,
+            reasons,
+            driver.ready,
+            driver.problem,
+            driver.warnings,
+            scene,
+        )
         changed = now != self._told
         if not changed and not anyway:
             return
         stamp = self._node.get_clock().now().to_msg()
         self._states.publish(coil_messages.state_message(stamp, station, driver, self._refused))
+        if outcome is not None and not outcome.publish:
+            self._filter.publish(coil_messages.filter_message(stamp, outcome))
         self._health.note(
             **{key: round(value, 3) for key, value in zip(LOOP, station.rhythm.milliseconds, strict=True)}
         )
-        self._health.note(driver=station.driver_name, **{"driver problem": driver.problem or "none"})
+        self._health.note(
+            driver=station.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"}
+        )
         self._told = now
         self._log(latch.condition.value if outcome else "unconfigured", driver)
         if latch.latched:

@@ -17,6 +17,7 @@ from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.nodes.console_graph import ConsoleGraph
 from magnetosuture_thread.nodes.console_host import NAME, GraphHost
 from magnetosuture_thread.nodes.diagnostics import PERIOD, Health
+from magnetosuture_thread.nodes.parameter_files import init, node_options
 from magnetosuture_thread.nodes.parameters import declare
 
 
@@ -47,11 +48,9 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the node as a program; return 0 when it was asked to end, 1 when it could not start."""
     node = None
     try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        init(arguments, signal_handler_options=SignalHandlerOptions.NO)
         # No executor spins it, so nobody would answer who asks for its parameters.
-        node = rclpy.create_node(
-            NAME, automatically_declare_parameters_from_overrides=True, start_parameter_services=False
-        )
+        node = rclpy.create_node(NAME, **node_options(NAME, {"start_parameter_services": False}))
         asyncio.run(serve(node, declare(node, ConsoleSettings)))
     except (MagnetosutureError, ParameterException, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -30,11 +30,20 @@ READERS = {
     "predicted": (topics.PREDICTED_THREAD, console_messages.predicted, 0.0),
     "margins": (topics.MARGINS, console_messages.margins, 0.0),
     "scene": (topics.SCENE, console_messages.scene, 0.0),
-    "steering": (topics.STEERING_STATE, console_messages.steering, 0.0),
+    "filter": (topics.FILTER_STATE, console_messages.filter_state, 0.0),
     "bridge": (topics.BRIDGE_STATE, console_messages.bridge, 0.0),
 }
-AT_REST = {"asked": [0.0, 0.0], "passed": [0.0, 0.0], "slowdown": 1.0, "held_off": False, "age": 0.0}
-AGED = ("needle", "predicted", "steering", "bridge")
+AT_REST = {
+    "source": "",
+    "commanded": [0.0, 0.0],
+    "filtered": [0.0, 0.0],
+    "applied": [0.0, 0.0],
+    "slowdown": 1.0,
+    "active": [],
+    "overridden": "",
+    "age": 0.0,
+}
+AGED = ("needle", "predicted", "filter", "bridge")
 
 
 class ConsoleGraph:
@@ -103,7 +112,7 @@ class ConsoleGraph:
             for name, latest in self._latest.items()
         }
         if self.held:
-            parts["steering"] = {**AT_REST, "reason": self.held}
+            parts["filter"] = {**AT_REST, "reason": self.held}
         return {
             "time": self.now().nanoseconds * 1e-9,
             "needle_length": settings.needle_length,

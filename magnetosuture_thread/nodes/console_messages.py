@@ -10,9 +10,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3
 from magnetosuture_msgs.msg import (
     BarrierMargin,
     CoilBridgeState,
+    FilterState,
     PredictedThread,
     SafetyMargins,
-    SteeringState,
     TrackerState,
 )
 from magnetosuture_msgs.msg import Scene as SceneMessage
@@ -155,13 +155,16 @@ def _shown_shape(shape: SceneShape, tolerance: float) -> dict[str, Any]:
     return {**shown, "outline": outline, "holes": holes}
 
 
-def steering(message: SteeringState) -> dict[str, Any]:
-    """Return what became of the velocity that the operator asked for [m/s]."""
+def filter_state(message: FilterState) -> dict[str, Any]:
+    """Return what the bridge made of the last velocity command [m/s]."""
     return {
-        "asked": _plane(message.asked),
-        "passed": _plane(message.passed),
+        "source": message.source,
+        "commanded": _plane(message.commanded),
+        "filtered": _plane(message.filtered),
+        "applied": _plane(message.applied),
         "slowdown": message.slowdown,
-        "held_off": message.held_off,
+        "active": list(message.active),
+        "overridden": message.overridden,
         "reason": message.reason,
     }
 
@@ -174,8 +177,8 @@ def bridge(message: CoilBridgeState) -> dict[str, Any]:
         "emergency_stopped": message.emergency_stopped,
         "reasons": list(message.reasons),
         "commanded": _plane(message.commanded),
+        "filtered": _plane(message.filtered),
         "applied": _plane(message.applied),
-        "reached": _plane(message.reached),
         "saturated": message.saturated,
         "driver": message.driver,
         "driver_ready": message.driver_ready,

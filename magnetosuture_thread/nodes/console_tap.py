@@ -12,8 +12,7 @@ from magnetosuture_thread.nodes.console_inbox import Inbox
 
 DEPTH = 1000  # messages of a topic that may wait before any is lost
 PERIOD = 0.01  # s between two looks at all topics
-OPERATOR = (topics.OPERATOR_COMMAND, topics.STEERING_STATE)
-KINDS = (topics.INPUTS, topics.OUTPUTS, topics.SIMULATED, topics.SETTINGS, OPERATOR)
+KINDS = (topics.INPUTS, topics.OUTPUTS, topics.SIMULATED, topics.SETTINGS)
 SAID = tuple({topic.name: topic for kind in KINDS for topic in kind}.values())
 
 

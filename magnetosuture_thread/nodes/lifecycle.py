@@ -13,6 +13,7 @@ from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import OF_ROS, Configuration
 from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 
 C = TypeVar("C", bound=Configuration)
@@ -35,7 +36,7 @@ class ManagedNode(LifecycleNode, Generic[C]):
     """
 
     def __init__(self, name: str, settings: type[C], **options: Any) -> None:
-        super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__(name, **node_options(name, options))
         self._class = settings
         self.settings: C | None = None
         self.problem: Exception | None = None

@@ -21,8 +21,8 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.orientation import angle_of, heading_of, turned
-from magnetosuture_thread.interface import DISH_FRAME
+from magnetosuture_thread.geometry.orientation import angle_of, as_told, heading_of, turned
+from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_POSE
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.vision.look import State, Track
 
@@ -121,12 +121,39 @@ def needle_pose(message: PoseWithCovarianceStamped) -> NeedlePose:
     Raises:
         InvalidInputError: wrong frame, no stamp, or no unit quaternion.
     """
-    require_dish_frame(message.header.frame_id, "needle/measured_cp")
+    require_dish_frame(message.header.frame_id, NEEDLE_POSE.name)
     stamp = message.header.stamp
-    checked_nanoseconds(stamp, "needle/measured_cp")  # the prediction could not be stamped by another
+    checked_nanoseconds(stamp, NEEDLE_POSE.name)  # the prediction could not be stamped by another
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    heading = heading_of(q.x, q.y, q.z, q.w, "needle/measured_cp.pose.orientation")
+    heading = heading_of(q.x, q.y, q.z, q.w, f"{NEEDLE_POSE.name}.pose.orientation")
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
+
+
+def pose_covariance(message: PoseWithCovarianceStamped) -> np.ndarray | None:
+    """Return the covariance of x, y [m] and the heading's angle [rad], shape (3, 3); None for zeros, as for unknown.
+
+    Raises:
+        InvalidInputError: it is not finite, or a variance is negative.
+    """
+    whole = np.asarray(message.pose.covariance).reshape(6, 6)
+    if not whole.any():
+        return None
+    covariance = whole[np.ix_(_IN_PLANE, _IN_PLANE)]
+    if not np.isfinite(covariance).all() or (np.diag(covariance) < 0.0).any():
+        diagonal = np.diag(covariance).tolist()
+        raise InvalidInputError("needle/measured_cp.pose.covariance", diagonal, "finite variances of at least 0")
+    return covariance
+
+
+def tracked_pose(stamp: Time, tail: np.ndarray, heading: np.ndarray) -> NeedlePose:
+    """Return a needle's pose as `needle_pose` returns it of its message, to the last bit.
+
+    Raises:
+        InvalidInputError: no stamp.
+    """
+    checked_nanoseconds(stamp, NEEDLE_POSE.name)
+    along = as_told(heading, f"{NEEDLE_POSE.name}.pose.orientation")
+    return NeedlePose(seconds(stamp), np.array([float(tail[0]), float(tail[1])]), along)
 
 
 class PathMaker:

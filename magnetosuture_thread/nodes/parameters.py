@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import OF_ROS, Configuration, Described, described, from_mapping, to_mapping
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.shared_parameters import SHARED
 
 C = TypeVar("C", bound=Configuration)
 
@@ -36,9 +37,9 @@ def _type(about: Described) -> Parameter.Type:
 def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[str, str] | None = None) -> C:
     """Declare every field of a configuration class and return the settings in force.
 
-    The node must have been made with `automatically_declare_parameters_from_overrides=True`: only so
-    is a parameter that was set from outside but that the node does not know, a slip of the pen,
-    noticed.
+    The node must have been made with the options of `nodes/parameter_files.py`: only so is a parameter that was set
+    from outside but that the node does not know, a slip of the pen, noticed. Shared parameters that it does not know
+    are meant for others, and left aside.
 
     Args:
         node: that gets the parameters.
@@ -54,6 +55,10 @@ def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[
         for name, parameter in node.get_parameters_by_prefix("").items()
         if name.split(".")[0] not in OF_ROS
     }
+    known = {about.name for about in described(cls)}
+    for name in sorted(given.keys() & set(SHARED) - known):
+        node.undeclare_parameter(name)
+        del given[name]
     settings = from_mapping(cls, {name: _plain(value) for name, value in given.items()})
     values = to_mapping(settings)
     for about in described(cls):

@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, PAUSE_REPLAY
+from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, PAUSE_REPLAY, SCENE
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.coil_messages import command_stamp
 from magnetosuture_thread.nodes.replay_losses import Losses
@@ -138,7 +138,7 @@ class LiveReplay:
             missing = [
                 name
                 for name, publisher in self._inputs.items()
-                if name != CAMERA_INFO.recorded and not publisher.get_subscription_count()
+                if name not in (CAMERA_INFO.recorded, SCENE.recorded) and not publisher.get_subscription_count()
             ]
             missing += [name for name, output in self._outputs.items() if not output.get_publisher_count()]
             if self._clock.get_subscription_count() < self._nodes:
@@ -186,6 +186,8 @@ class LiveReplay:
         self.losses.played[name] += 1
         if stamp is not None:
             self.published[name][stamp] = now
+        if record.topic == SCENE.recorded:
+            self._receive(record.topic, record.time, bytes(record.data))
         if record.topic in self._echoed:
             if stamp is not None:
                 self.arrived[name].setdefault(stamp, now)

@@ -21,14 +21,18 @@ class FramePublisher:
     """
 
     def __init__(self, node: Node, camera: DishCamera, settings: RigSettings) -> None:
-        self._quality = settings.jpeg_quality
+        self._quality, self._distance = settings.jpeg_quality, settings.camera_distance
         self._compressed = topics.COMPRESSED_IMAGE.publisher(node)
         self._raw = topics.IMAGE.publisher(node)
         self._info = topics.CAMERA_INFO.publisher(node)
         self._needle = topics.TRUE_NEEDLE.publisher(node)
         self._thread = topics.TRUE_THREAD.publisher(node)
-        self._camera = camera_messages.camera_info(Time().to_msg(), camera.size, camera.view, settings.camera_distance)
         self._path = messages.PathMaker()
+        self.take(camera)
+
+    def take(self, camera: DishCamera) -> None:
+        """Publish frames of another camera from now on."""
+        self._camera = camera_messages.camera_info(Time().to_msg(), camera.size, camera.view, self._distance)
 
     def publish(self, nanoseconds: int, frame: Frame) -> None:
         """Publish a frame with its stamp [ns]; one that got lost has its truth all the same."""

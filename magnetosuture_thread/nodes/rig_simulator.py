@@ -15,17 +15,20 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 
-from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.rig_currents import RigCurrents
 from magnetosuture_thread.nodes.rig_frames import FramePublisher
 from magnetosuture_thread.nodes.rig_time import RigTime
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Frame, Rig
 from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.scene import Scene
 
 EARLY = 0.1  # of a period, that a tick may come before its time
 CLOCK_PERIOD = 0.005  # s of simulated time between two messages on /clock
@@ -36,13 +39,16 @@ class RigSimulatorNode(Node):
     """Stands in for coils, dish and camera."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("rig_simulator", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("rig_simulator", **node_options("rig_simulator", options))
         self._settings = settings = declare(self, RigSettings)
         # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
         simulated = bool(self.get_parameter("use_sim_time").value)
         pace = settings.pace if simulated else 1.0
         self.get_logger().info("loading the rig's kernels; the first start on a machine compiles them")
-        self.rig = Rig(settings)
+        scene = initial_scene(settings.scene)
+        if scene is None:
+            raise ConfigurationError(f"{settings.GROUP}.scene", "", "a scene file: what is simulated has a dish")
+        self.rig = Rig(settings, scene)
         self.rig.warm_up()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health = Health(self)
@@ -54,12 +60,18 @@ class RigSimulatorNode(Node):
         self._late: deque[tuple[float, int, Frame]] = deque()
         self._publisher = FramePublisher(self, self.rig.camera, settings)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         if simulated:
             self._clocks = topics.CLOCK.publisher(self)
             self.create_timer(CLOCK_PERIOD / pace, self.on_clock, clock=self._steady)
         self.create_timer(1.0 / (settings.frame_rate * pace), self.on_frame, clock=self._steady)
         self.currents = RigCurrents(self, settings, self._steady, self._apply)
         self.get_logger().info("ready: everything here is simulated")
+
+    def on_scene(self, scene: Scene) -> None:
+        """Put another dish and other shapes around needle and thread, which stay where they are."""
+        self.rig.set_scene(scene)
+        self._publisher.take(self.rig.camera)
 
     def on_fault(self, message: String) -> None:
         """Take a fault that begins now."""

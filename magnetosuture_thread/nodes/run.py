@@ -16,19 +16,20 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.nodes.parameter_files import init
 
-N = TypeVar("N", bound=Node)
+N = TypeVar("N", bound="Node | tuple[Node, ...]")
 
 
 def run(
     make: Callable[[], N], arguments: Sequence[str] | None = None, made: Callable[[N], None] = lambda node: None
 ) -> int:
-    """Run a node until it is interrupted.
+    """Run a node, or several in one process, until it is interrupted.
 
     Args:
-        make: makes the node.
+        make: makes the node, or all of them.
         arguments: of the command line; those of the process if None.
-        made: called with the node once it is made; for what concerns the whole process.
+        made: called with what was made; for what concerns the whole process.
 
     Returns:
         0 when it was asked to end, 1 when it could not start.
@@ -44,17 +45,20 @@ def run(
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, interrupt)
     try:
-        rclpy.init(args=list(arguments) if arguments is not None else None)
+        init(arguments)
     except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
         print(f"error: {_one_line(error)}", file=sys.stderr)
         return 1
-    node = None
+    nodes: tuple[Node, ...] = ()
+    executor = None
     try:
-        node = make()
-        made(node)
+        result = make()
+        nodes = result if isinstance(result, tuple) else (result,)
+        made(result)
         # The multi-threaded executor loses messages in the wheels of Jazzy.
         executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        for node in nodes:
+            executor.add_node(node)
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
@@ -69,13 +73,15 @@ def run(
         print(f"error: {_one_line(error)}", file=sys.stderr)
         return 1
     except ValueError as error:
-        if node is not None:
+        if nodes:
             raise
         # rclpy's own word for a parameter that has no value, as an empty list.
         print(f"error: a parameter cannot be declared: {_one_line(error)}", file=sys.stderr)
         return 1
     finally:
-        if node is not None:
+        if executor is not None:
+            executor.shutdown()
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0

@@ -16,6 +16,15 @@ from magnetosuture_thread.scene.messages import scene_of
 MAX_MESSAGE_BYTES = 1 << 19  # of 10,000 vertices; what is larger is not even read
 
 
+def initial_scene(name: str) -> Scene | None:
+    """Return the scene of a node's parameter `scene`; None where it is empty.
+
+    Raises:
+        ConfigurationError: there is no such file, or it holds anything invalid.
+    """
+    return read_scene(name) if name else None
+
+
 class SceneFollower:
     """The scene that a node goes by.
 
@@ -25,21 +34,19 @@ class SceneFollower:
     Args:
         node: that subscribes.
         health: of the node.
-        scene: the node's parameter: a path or the name of a scene that ships with the package; empty for none.
+        scene: in force at first; None if it is not known yet.
         changed: called with a scene of the topic that is another than the one in force, before it is; raises a
             `MagnetosutureError`, for example a `ConfigurationError`, where the node cannot use it.
 
     Attributes:
         scene: in force; None until one is known.
-
-    Raises:
-        ConfigurationError: the file of the parameter cannot be used.
     """
 
     def __init__(
-        self, node: Node, health: Health, scene: str, changed: Callable[[Scene], None] = lambda scene: None
+        self, node: Node, health: Health, scene: Scene | None, changed: Callable[[Scene], None] = lambda scene: None
     ) -> None:
-        self.scene: Scene | None = read_scene(scene) if scene else None
+        self.scene = scene
+        self._heard = False
         self._health, self._changed = health, changed
         topics.SCENE.subscribe(node, self.on_scene, raw=True, unheard=health.refuse)
 
@@ -48,17 +55,28 @@ class SceneFollower:
         """Version of the scene in force; empty for none."""
         return "" if self.scene is None else self.scene.version
 
+    def load(self, name: str) -> Scene | None:
+        """Return the scene for a node that is configured now: the topic's if one has come, else that of a parameter.
+
+        Raises:
+            ConfigurationError: there is no such file, or it holds anything invalid.
+        """
+        if not self._heard:
+            self.scene = initial_scene(name)
+        return self.scene
+
     def on_scene(self, data: bytes) -> None:
         """Take a scene that was published."""
         try:
             scene = received_scene(data)
             if scene.version == self.version:
+                self._heard = True
                 return
             self._changed(scene)
         except MagnetosutureError as error:
             self._health.refuse(error)
             return
-        self.scene = scene
+        self.scene, self._heard = scene, True
 
 
 def received_scene(data: bytes) -> Scene:

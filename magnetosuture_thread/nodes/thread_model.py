@@ -1,61 +1,89 @@
-"""The thread model node: needle poses in, predicted thread and safety margins out; an operator's wishes filtered."""
+"""The thread model node: needle poses in, predicted thread and safety margins out."""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.model.friction import UNKNOWN
-from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.predictor import STARTED, Prediction
+from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, Outcome, ThreadSession
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes import messages, thread_messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
-from magnetosuture_thread.nodes.thread_steering import ThreadSteering
+from magnetosuture_thread.packing.layout import time_of
+from magnetosuture_thread.packing.markers import packed_markers
+from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
+from magnetosuture_thread.scene import Scene
 
 
 class ThreadModelNode(Node):
-    """Predicts the thread at every needle pose."""
+    """Predicts the thread at every needle pose.
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__("thread_model", automatically_declare_parameters_from_overrides=True, **options)
+    Args:
+        listens: whether poses and seen threads come by topics; else a tracker in the same process hands them over.
+        options: for rclpy's node.
+    """
+
+    def __init__(self, *, listens: bool = True, **options: Any) -> None:
+        super().__init__("thread_model", **node_options("thread_model", options))
         settings = declare(self, ThreadModelSettings, read_only=False, fixed=FIXED)
         self.get_logger().info("loading the model's kernels; the first start on a machine compiles them")
-        self._session = ThreadSession(settings)
         self._health = Health(self)
+        scene = initial_scene(settings.scene)
+        self._session = ThreadSession(settings, scene)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         self._settings = ThreadSettings(self, self._session, self._health)
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
+        if listens:
+            self.listen()
+        self._health.warn("no needle pose yet")
+        where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
+        self.get_logger().info(
+            f"ready: {settings.segments} segments of {settings.material}, {where}, "
+            f"{settings.formulation} by {settings.solver}"
+        )
+
+    def listen(self) -> None:
+        """Take poses and seen threads from their topics."""
         topics.SEEN_THREAD.subscribe(self, self.on_seen_thread, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
-        self._steering = ThreadSteering(self, self._session, self._health)
-        self._health.warn("no needle pose yet")
-        self.get_logger().info(
-            f"ready: {settings.segments} segments of {settings.material}, "
-            f"{len(settings.obstacles())} obstacles, {settings.formulation} by {settings.solver}"
-        )
+
+    def on_scene(self, scene: Scene) -> None:
+        """Go on in another scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
+        self._session.change(self._session.settings, scene)
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Step the thread to a needle pose; where that cannot be done, say so.
 
         No margin is published that is not proven.
         """
-        stamp = messages.nanoseconds(message.header.stamp)
+        self._step(message.header.stamp, lambda: messages.needle_pose(message))
+
+    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
+        """Take a pose that a tracker hands over, with the same result as that of its message."""
+        self._step(stamp, lambda: messages.tracked_pose(stamp, tail, heading))
+
+    def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
         began = time.perf_counter()
         try:
-            outcome = self._session.on_pose(stamp, messages.needle_pose(message))
+            outcome = self._session.on_pose(messages.nanoseconds(stamp), pose())
         except InvalidInputError as error:
             self._health.refuse(error)
             return
@@ -75,6 +103,13 @@ class ThreadModelNode(Node):
         except InvalidInputError as error:
             self._health.refuse(error)
             return
+        self._start(stamp, centreline)
+
+    def on_seen(self, stamp: Time, centreline: np.ndarray) -> None:
+        """Take a seen thread that a tracker hands over."""
+        self._start(messages.nanoseconds(stamp), centreline)
+
+    def _start(self, stamp: int, centreline: np.ndarray) -> None:
         began = time.perf_counter()
         for outcome in self._session.on_seen(stamp, centreline):
             self._tell(outcome, time.perf_counter() - began)
@@ -82,28 +117,26 @@ class ThreadModelNode(Node):
 
     def _tell(self, outcome: Outcome, step_time: float) -> None:
         """Publish what came of a pose."""
-        stamp = messages.stamp_of(outcome.stamp)
         if outcome.prediction is not None:
-            self._publish(stamp, outcome.prediction, outcome.margins, step_time)
+            self._publish(outcome, outcome.prediction, step_time)
         elif isinstance(outcome.problem, InvalidInputError):
             self._health.refuse(outcome.problem)
-        elif outcome.problem is not None:
-            self._health.error(str(outcome.problem))
-            self._margins.publish(thread_messages.invalid_margins(stamp, str(outcome.problem)))
         else:
-            self._health.warn(WAITING)
-            self._margins.publish(thread_messages.invalid_margins(stamp, WAITING))
+            problem = WAITING if outcome.problem is None else str(outcome.problem)
+            (self._health.warn if outcome.problem is None else self._health.error)(problem)
+            packed = packed_margins(time_of(outcome.stamp), None, problem, scene_version=outcome.scene_version)
+            self._margins.publish(packed)
 
-    def _publish(self, stamp: Time, prediction: Prediction, margins: Margins | None, step_time: float) -> None:
-        settings = self._session.settings
-        self._predicted.publish(thread_messages.prediction_message(stamp, prediction, settings.material, step_time))
-        if margins is None:
-            self._margins.publish(thread_messages.invalid_margins(stamp, prediction.status))
-        else:
-            self._margins.publish(thread_messages.margins_message(stamp, margins))
-        friction = margins.friction if margins else UNKNOWN
-        diameter = self._session.thread.diameter
-        self._markers.publish(thread_messages.thread_markers(stamp, prediction, friction, diameter))
+    def _publish(self, outcome: Outcome, prediction: Prediction, step_time: float) -> None:
+        when, settings, version = time_of(outcome.stamp), self._session.settings, outcome.scene_version
+        # The prediction first: it is waited for, and the margins are only worked out here.
+        self._predicted.publish(packed_prediction(when, prediction, settings.material, step_time=step_time))
+        margins = outcome.margins
+        reason = "" if margins else prediction.status
+        self._margins.publish(packed_margins(when, margins, reason, scene_version=version))
+        if self._markers.get_subscription_count():
+            friction = margins.friction if margins else UNKNOWN
+            self._markers.publish(packed_markers(when, prediction, friction, self._session.thread.diameter))
         figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
         if prediction.status in (SOLVED, STARTED):
             self._health.ok("predicting", **figures)

@@ -1,9 +1,8 @@
-"""The thread model's settings while it runs: its parameters, the topics that set them, the obstacles it shows."""
+"""The thread model's settings while it runs: its parameters, and the topic that sets some of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.node import Node
 
@@ -33,42 +32,25 @@ class ThreadSettings:
         self._node, self._session, self._health = node, session, health
         self._names = [about.name for about in described(ThreadModelSettings)]
         self._parameters = Changeable(node, session.settings, self._prepare)
-        self._obstacles = topics.OBSTACLE_MARKERS.publisher(node)
-        self._show_obstacles()
-        for topic, take in ((topics.OBSTACLE_SET, self.on_obstacles), (topics.MATERIAL, self.on_material)):
-            topic.subscribe(node, take, raw=True, unheard=health.refuse)
-
-    def on_obstacles(self, data: bytes) -> None:
-        """Take another set of obstacles."""
-        self._set(topics.OBSTACLE_SET, data, thread_messages.obstacle_values)
+        topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
 
     def on_material(self, data: bytes) -> None:
-        """Take what is newly known of the thread and the liquid."""
-        self._set(topics.MATERIAL, data, thread_messages.material_values)
-
-    def _set(self, topic: topics.Topic, data: bytes, values: Callable[[Any], dict[str, Any]]) -> None:
-        """Set the parameters that a message is about, or say why that cannot be."""
+        """Take what is newly known of the thread and the liquid, or say why that cannot be."""
         try:
             if len(data) > LARGEST:
-                raise InvalidInputError(topic.channel.name, f"{len(data)} bytes", f"at most {LARGEST}")
-            self._parameters.set(values(thread_messages.decoded(topic, data)))
+                raise InvalidInputError(topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {LARGEST}")
+            self._parameters.set(thread_messages.material_values(thread_messages.decoded(topics.MATERIAL, data)))
         except MagnetosutureError as error:
             self._health.refuse(error)
 
     def _prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
-        put_in_force = self._session.prepare(settings)
+        put_in_force = self._session.prepare(settings, self._session.scene)
 
         def change() -> None:
             before = self._session.settings
             put_in_force()
-            if settings.obstacles() != before.obstacles():
-                self._show_obstacles()
             changed = [name for name in self._names if getattr(settings, name) != getattr(before, name)]
             if changed:
                 self._node.get_logger().info(f"changed: {', '.join(changed)}")
 
         return change
-
-    def _show_obstacles(self) -> None:
-        now = self._node.get_clock().now().to_msg()
-        self._obstacles.publish(thread_messages.obstacle_markers(now, self._session.settings.obstacles()))

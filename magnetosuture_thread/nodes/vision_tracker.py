@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
@@ -16,42 +17,71 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.packing.needle import packed_path, packed_pose
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.images import decode_image, unpack_image
-from magnetosuture_thread.vision.look import no_pose
+from magnetosuture_thread.vision.look import State, no_pose
 from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.warm_up import warm_up
 
+NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
+
+
+class Follower(Protocol):
+    """Who gets poses and seen threads directly, being in the same process."""
+
+    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
+        """Take what is published on the topic of needle poses."""
+
+    def on_seen(self, stamp: Time, centreline: np.ndarray) -> None:
+        """Take what is published on the topic of seen threads."""
 
 
 class VisionTrackerNode(Node):
     """Tracks the needle in every camera frame; when it is lost, no pose is published."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("vision_tracker", automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__("vision_tracker", **node_options("vision_tracker", options))
         settings = declare(self, VisionTrackerSettings)
         self.get_logger().info("loading the tracker's kernels; the first start on a machine compiles them")
         warm_up()
-        self._session = TrackerSession(settings)
+        scene = initial_scene(settings.scene)
+        self._settings = settings
+        self._session = TrackerSession(settings, scene) if scene is not None else None
         self._health = Health(self)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         self._words = "nothing seen"
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._last_frame = self._arrival()
         self._poses = topics.NEEDLE_POSE.publisher(self)
         self._states = topics.TRACKER_STATE.publisher(self)
-        self._path = messages.PathMaker()
+        self._followers: list[Follower] = []
         self._threads = topics.SEEN_THREAD.publisher(self)
         if settings.image_transport == "compressed":
             topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
         else:
             topics.IMAGE.subscribe(self, self.on_image)
         self.create_timer(0.5 * SILENCE, self.on_watch, clock=self._steady)
-        self._health.warn("no camera frame yet")
+        self._health.warn("no camera frame yet" if scene is not None else NO_SCENE)
         self.get_logger().info(f"ready: frames from {self.resolve_topic_name(CAMERA[settings.image_transport].name)}")
+
+    def on_scene(self, scene: Scene) -> None:
+        """Look for the needle in another scene."""
+        if self._session is None:
+            self._session = TrackerSession(self._settings, scene)
+        else:
+            self._session.set_scene(scene)
+
+    def hand_to(self, follower: Follower) -> None:
+        """Hand every pose and seen thread to a follower as well, right after it is published."""
+        self._followers.append(follower)
 
     def on_compressed(self, message: CompressedImage) -> None:
         """Take a JPEG or PNG frame."""
@@ -67,7 +97,7 @@ class VisionTrackerNode(Node):
     def on_watch(self) -> None:
         """Say so when no frame has come for too long."""
         waited = self._arrival() - self._last_frame
-        if self._session.frames and waited > SILENCE:
+        if self._session is not None and self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
             self._states.publish(messages.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
@@ -79,6 +109,10 @@ class VisionTrackerNode(Node):
     def _take(self, message: Image | CompressedImage, decode: Callable[[], Any]) -> None:
         self._last_frame = self._arrival()
         stamp, taken = message.header.stamp, 0.0
+        if self._session is None:
+            self._states.publish(messages.tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
+            self._health.warn(NO_SCENE)
+            return
         try:
             image = np.asarray(decode())
         except InvalidInputError as error:
@@ -89,10 +123,15 @@ class VisionTrackerNode(Node):
             taken = time.perf_counter() - began
         track = seen.track
         if seen.tracked:
-            # The pose first: the prediction waits for it, and a path of many poses takes some milliseconds.
-            self._poses.publish(messages.pose_message(stamp, track.tail, track.heading, track.covariance))
+            # The pose first: the prediction waits for it, and all else can wait.
+            when = stamp.sec, stamp.nanosec
+            self._poses.publish(packed_pose(when, track.tail, track.heading, track.covariance))
+            for follower in self._followers:
+                follower.on_tracked(stamp, track.tail, track.heading)
             if len(seen.centreline):
-                self._threads.publish(self._path.message(stamp, seen.centreline))
+                self._threads.publish(packed_path(when, seen.centreline))
+                for follower in self._followers:
+                    follower.on_seen(stamp, seen.centreline)
         self._states.publish(messages.tracker_state(stamp, track, 0.0 if seen.problem else taken))
         values = {"frames": self._session.frames, "tracked": self._session.tracked}
         if seen.problem is not None:

@@ -1,31 +1,29 @@
-"""What a bag says of obstacles and thread while it runs, as settings: as `thread_model` takes it."""
+"""What a bag says of scene and thread while it runs, as `thread_model` takes it."""
 
 from __future__ import annotations
 
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.configuration import from_mapping, to_mapping
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.interface import DISH_FRAME, MATERIAL, OBSTACLE_SET
+from magnetosuture_thread.interface import MATERIAL, SCENE
 from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.messages import scene_of
 
-CHANGING = (OBSTACLE_SET, MATERIAL)
+CHANGING = (SCENE, MATERIAL)
 
 
-def changed(settings: ThreadModelSettings, record: Record) -> ThreadModelSettings:
-    """Return settings after a recorded message on one of these channels.
+def changed(
+    settings: ThreadModelSettings, scene: Scene | None, record: Record
+) -> tuple[ThreadModelSettings, Scene | None]:
+    """Return settings and scene after a recorded message on one of these channels.
 
     Raises:
         BagError: it cannot be decoded.
         ConfigurationError: it cannot be used.
-        InvalidInputError: it is of another frame.
+        InvalidInputError: it is of another frame, or damaged.
     """
-    message = record.decode()
-    if record.topic == OBSTACLE_SET.recorded:
-        frame = message.header.frame_id
-        if frame != DISH_FRAME:
-            raise InvalidInputError(f"{OBSTACLE_SET.name}.header.frame_id", repr(frame), repr(DISH_FRAME))
-        values = changes.told_obstacles(message)
-    else:
-        values = changes.told_material(message)
-    return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values})
+    if record.topic == SCENE.recorded:
+        return settings, scene_of(record.decode())
+    values = changes.told_material(record.decode())
+    return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values}), scene

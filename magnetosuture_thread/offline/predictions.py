@@ -19,6 +19,7 @@ from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.changes import changed
 from magnetosuture_thread.offline.sights import Sights
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.sight import Sight
 
@@ -81,6 +82,7 @@ class Step:
         margins: of the prediction; None where there is none, or where it did not converge, so that they prove nothing.
         step_time: wall-clock time that the prediction took [s].
         settings: in force.
+        scene: in force.
     """
 
     sight: Sight
@@ -88,23 +90,25 @@ class Step:
     margins: Margins | None
     step_time: float
     settings: ThreadModelSettings
+    scene: Scene | None
 
 
-def predictions(given: Iterable[Sight], settings: ThreadModelSettings) -> Iterator[Step]:
+def predictions(given: Iterable[Sight], settings: ThreadModelSettings, scene: Scene | None) -> Iterator[Step]:
     """Predict the thread over one run, as `thread_model` does.
 
-    What the bag of `sights` says of obstacles and thread is taken as it comes. A pose before the thread is first seen
+    What the bag of `sights` says of scene and thread is taken as it comes. A pose before the thread is first seen
     gives a step that waits, as live, and is not predicted later unless its own thread is seen; sights without a
     needle give none.
 
     Args:
         given: by time.
-        settings: of thread, liquid and obstacles.
+        settings: of thread and liquid.
+        scene: until the bag says another.
 
     Raises:
-        ConfigurationError: an obstacle cannot be used.
+        ConfigurationError: a shape of the scene cannot be used.
     """
-    return _steps(given, ThreadSession(settings))
+    return _steps(given, ThreadSession(settings, scene))
 
 
 def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:
@@ -116,7 +120,7 @@ def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:
             waiting[outcome.stamp] = sight
         else:
             waiting.pop(outcome.stamp, None)
-        return Step(sight, outcome, outcome.margins, taken, session.settings)
+        return Step(sight, outcome, outcome.margins, taken, session.settings, session.scene)
 
     for sight in given:
         if isinstance(given, Sights):
@@ -136,9 +140,9 @@ def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:
 
 
 def _change(session: ThreadSession, given: Sights) -> None:
-    """Take what the bag says of obstacles and thread; what cannot be used is counted, as live."""
+    """Take what the bag says of scene and thread; what cannot be used is counted, as live."""
     for record in given.changes():
         try:
-            session.change(changed(session.settings, record))
+            session.change(*changed(session.settings, session.scene, record))
         except MagnetosutureError as error:
             given.refused[f"{record.topic}: {error}"] += 1

@@ -12,9 +12,9 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.geometry.orientation import angle_of, heading_of, turned
+from magnetosuture_thread.geometry.orientation import as_told
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SEEN_THREAD, TRUE_THREAD, Channel
+from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE, SEEN_THREAD, TRUE_THREAD, Channel
 from magnetosuture_thread.model.session import EARLY
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
@@ -47,7 +47,8 @@ class Sights(Iterator[Sight]):
         found: of these with a needle.
         refused: the others, by why.
         on_frame: called with stamp and what was seen in each frame, before its sight is given.
-        on_record: called with stamp and each recorded pose and seen thread, before its sight is given.
+        on_record: called with stamp and each recorded pose and seen thread, before its sight is given; and with each
+            scene that is taken.
     """
 
     def __init__(
@@ -64,13 +65,13 @@ class Sights(Iterator[Sight]):
         self.refused: Counter[str] = Counter()
         self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
         self.on_record: Callable[[int, Record], None] = lambda stamp, record: None
-        self._dish = setup.vision.dish_diameter
-        self._length = setup.model.length
+        self._dish = setup.scene.dish.diameter
+        self._length = setup.model.thread_length
         self._threads = self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
         if source == "camera":
             warm_up()
-            self._tracker = TrackerSession(setup.vision)
+            self._tracker = TrackerSession(setup.vision, setup.scene)
         self._recording = recording
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
@@ -91,8 +92,11 @@ class Sights(Iterator[Sight]):
         return next(self._going)
 
     def changes(self) -> list[Record]:
-        """Return, once, what the bag says of obstacles and thread before the sight that was given last."""
+        """Return, once, what the bag says of scene and thread before the sight that was given last."""
         changes, self._changes = self._changes, []
+        for record in changes:
+            if record.topic == SCENE.recorded:
+                self.on_record(stamp_of(record), record)
         return changes
 
     def thread_problem(self) -> str:
@@ -194,9 +198,7 @@ class Sights(Iterator[Sight]):
             self.refused[kind] += 1
             return Sight(stamp, reason=seen.track.reason, processing=taken)
         self.found += 1
-        # A message says the heading as a quaternion, which costs the last bits.
-        z, w = turned(angle_of(seen.track.heading))
-        heading = heading_of(0.0, 0.0, z, w, NEEDLE_POSE.name)
+        heading = as_told(seen.track.heading, NEEDLE_POSE.name)
         return Sight(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
 
     def _check_place(self, topic: str, points: Points) -> None:

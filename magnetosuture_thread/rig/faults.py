@@ -102,6 +102,10 @@ class FaultSchedule:
         self._needle = needle_length
         self._seed = seed
 
+    def set_dish(self, diameter: float) -> None:
+        """Take another dish, of this inner diameter [m]."""
+        self._dish = diameter
+
     def add(self, fault: Fault) -> None:
         """Take one more fault, and forget those that are over."""
         self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-MOST_FAULTS:]

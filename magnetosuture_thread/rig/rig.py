@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.rig.camera.dish_camera import Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.scene import Scene, occupant
 
 Vector = NDArray[np.float64]
 
@@ -41,24 +42,30 @@ class Frame:
 class Rig:
     """Needle and thread in the coils' field, under a camera. Time comes in as seconds since the start.
 
-    A power stage that gets no new currents for `coil_timeout` switches off, as real ones do. The times of
+    A power stage that gets no new currents for `driver_timeout` switches off, as real ones do. The times of
     faults count from the first current that is not zero, so that they do not depend on how long the other
     nodes take to start.
 
     Args:
         settings: of the rig.
+        scene: in which needle and thread are.
 
     Attributes:
+        scene: as it is now.
         time: up to which needle and thread have moved [s].
         currents: in force, shape (m,) [A].
         began: time of the first current that was not zero, inf before [s].
+
+    Raises:
+        ConfigurationError: needle or thread would start in the wall or in a shape.
     """
 
-    def __init__(self, settings: RigSettings) -> None:
-        self._settings = settings
-        self._dynamics = settings.dynamics()
-        self.camera = settings.camera()
-        self.faults = settings.schedule()
+    def __init__(self, settings: RigSettings, scene: Scene) -> None:
+        settings.check_scene(scene)
+        self._settings, self.scene = settings, scene
+        self._dynamics = settings.dynamics(scene)
+        self.camera = settings.camera(scene)
+        self.faults = settings.schedule(scene)
         self._random = np.random.default_rng(settings.seed + 1)
         self.time = 0.0
         self.began = math.inf
@@ -71,9 +78,27 @@ class Rig:
         OpenCV gets one core for itself: the others belong to the nodes that are looked at.
         """
         cv2.setNumThreads(1)
-        spare = self._settings.dynamics()
+        spare = self._settings.dynamics(self.scene)
         spare.step(self.currents, 1e-3)
         self.camera.render(spare.tail, spare.heading, spare.thread)
+
+    def set_scene(self, scene: Scene) -> None:
+        """Put another dish and other shapes around needle and thread, which stay where they are.
+
+        Raises:
+            InvalidInputError: needle or thread would be in the wall or in a shape; nothing has changed.
+        """
+        if scene.version == self.scene.version:
+            return
+        # A thread around a post that stays may cut its edge by a chord, which is no reason to refuse.
+        new = replace(scene, shapes=tuple(shape for shape in scene.shapes if shape not in self.scene.shapes))
+        for name, points in {"needle": self._dynamics.body, "thread": self._dynamics.thread}.items():
+            if what := occupant(new, points, holes=False):
+                raise InvalidInputError("scene", f"{what} where the {name} is", "shapes off needle and thread")
+        camera, surface = self._settings.camera(scene), self._settings.surface(scene)
+        self._dynamics.set_surface(surface)
+        self.scene, self.camera = scene, camera
+        self.faults.set_dish(scene.dish.diameter)
 
     def apply(self, currents: Vector, time: float) -> None:
         """Set the coils' currents from a time on; until then the last ones are in force.
@@ -101,7 +126,7 @@ class Rig:
 
     def advance(self, time: float) -> None:
         """Let needle and thread move up to a time since the start [s]; nothing happens for one that is past."""
-        off_at = max(self.time, self._applied_at + self._settings.coil_timeout)
+        off_at = max(self.time, self._applied_at + self._settings.driver_timeout)
         if off_at < time:
             self._move(off_at)
             self.switch_off()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,10 +14,10 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import needle_axis, require_needle
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.obstacles.lists import discs_from, polygons_from
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import LOOKS, Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import LOOK_OF_KIND, LOOKS, Lighting, Look
+from magnetosuture_thread.rig.camera.scene import Scene as CameraScene
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
@@ -27,13 +25,15 @@ from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
 from magnetosuture_thread.rig.power.process import StageProcess
+from magnetosuture_thread.scene import Scene, occupant
+from magnetosuture_thread.shared_parameters import shared
 
 LARGEST_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
 
 
 @dataclass(frozen=True)
 class RigSettings(Configuration):
-    """The rig that is simulated: its dish, coils, needle, thread and camera, and what goes wrong.
+    """The rig that is simulated: its scene, coils, needle, thread and camera, and what goes wrong.
 
     These are the truth of the simulation. What the other nodes believe is in their own sections.
     """
@@ -48,22 +48,10 @@ class RigSettings(Configuration):
         (), "what goes wrong: KIND START DURATION each, in seconds since the first current"
     )
 
-    dish_diameter: float = quantity(0.035, "inner diameter of the petri dish", unit="m", minimum=0.005, maximum=0.5)
-    viscosity: float = quantity(1.0, "of the liquid around the needle", unit="Pa s", minimum=1e-4, maximum=100.0)
-    disc_obstacles: tuple[float, ...] = quantity(
-        (), "x, y and radius of each round obstacle", unit="m", minimum=-0.5, maximum=0.5, multiple=3
-    )
-    polygon_obstacles: tuple[float, ...] = quantity(
-        (), "x and y of each corner of all polygons", unit="m", minimum=-0.5, maximum=0.5, multiple=2
-    )
-    polygon_sizes: tuple[int, ...] = quantity(
-        (),
-        "number of corners of each outline; negative for a hole in the polygon before it, which is seen but not felt",
-        minimum=-10000,
-        maximum=10000,
-    )
+    scene: str = shared("scene")
+    viscosity: float = shared("viscosity")
     obstacle_looks: tuple[str, ...] = quantity(
-        (), f"of what each obstacle seems to be made, discs first: {', '.join(LOOKS)}; none given: silicone"
+        (), f"of what each shape of the scene seems to be made, in order: {', '.join(LOOKS)}; none given: by its kind"
     )
 
     coil_angles: tuple[float, ...] = quantity(
@@ -82,9 +70,7 @@ class RigSettings(Configuration):
     coil_max_current: float = quantity(
         30.0, "that the power stage gives, in either direction", unit="A", minimum=0.01, maximum=1000.0
     )
-    coil_timeout: float = quantity(
-        0.25, "without new currents for this long the power stage switches off", unit="s", minimum=0.01, maximum=10.0
-    )
+    driver_timeout: float = shared("driver_timeout")
 
     power_stage: str = quantity(
         "topic",
@@ -98,11 +84,9 @@ class RigSettings(Configuration):
     coil_inductance: float = quantity(0.01, "of a coil on a board", unit="H", minimum=1e-6, maximum=10.0)
     supply_voltage: float = quantity(24.0, "of the boards", unit="V", minimum=1.0, maximum=80.0)
 
-    needle_length: float = quantity(0.007, "along the body", unit="m", minimum=0.001, maximum=0.05)
-    needle_width: float = quantity(0.0004, "diameter of the body", unit="m", minimum=5e-5, maximum=0.005)
-    needle_curvature: float = quantity(
-        0.0, "of the needle's arc, positive to the left of its heading", unit="1/m", minimum=-1000.0, maximum=1000.0
-    )
+    needle_length: float = shared("needle_length")
+    needle_width: float = shared("needle_width")
+    needle_curvature: float = shared("needle_curvature")
     needle_magnetisation: float = quantity(
         1.0e6, "of the needle, NdFeB, along its body", unit="A/m", minimum=1e3, maximum=2e6
     )
@@ -114,7 +98,7 @@ class RigSettings(Configuration):
         multiple=3,
     )
 
-    thread_length: float = quantity(0.019, "of the thread", unit="m", minimum=0.001, maximum=2.0)
+    thread_length: float = shared("thread_length")
     thread_diameter: float = quantity(60e-6, "of the thread", unit="m", minimum=1e-6, maximum=0.005)
     thread_segments: int = quantity(60, "that the simulated thread is cut into", minimum=8, maximum=400)
     thread_attachment: str = quantity("pinned", "to the needle", choices=("pinned", "glued"))
@@ -141,9 +125,8 @@ class RigSettings(Configuration):
         """Refuse what does not fit together."""
         if len(self.needle_start) != 3:
             raise ConfigurationError(f"{self.GROUP}.needle_start", list(self.needle_start), "x, y and heading")
-        count = len(self.obstacles())
-        if self.obstacle_looks and (len(self.obstacle_looks) != count or not set(self.obstacle_looks) <= set(LOOKS)):
-            expectation = f"one of {', '.join(LOOKS)} for each of {count} obstacles, or none"
+        if not set(self.obstacle_looks) <= set(LOOKS):
+            expectation = f"each one of {', '.join(LOOKS)}"
             raise ConfigurationError(f"{self.GROUP}.obstacle_looks", list(self.obstacle_looks), expectation)
         if len(self.coil_angles) < 1:
             raise ConfigurationError(f"{self.GROUP}.coil_angles", [], "at least one coil's angle [rad]")
@@ -152,21 +135,29 @@ class RigSettings(Configuration):
             expectation = f"a path for two of the {len(self.coil_angles)} coils"
             raise ConfigurationError(f"{self.GROUP}.power_stage_ports", list(self.power_stage_ports), expectation)
         require_needle(self.GROUP, self.needle_length, self.needle_curvature)
-        self._check_room()
         for fault in self.faults:
             Fault.parse(fault)
 
-    def _check_room(self) -> None:
-        """Refuse a start at which needle or thread is in the wall, beyond it, or in an obstacle."""
+    def check_scene(self, scene: Scene) -> None:
+        """Refuse a scene for which the start or the looks do not fit.
+
+        Raises:
+            ConfigurationError: needle or thread would start in the wall or in a shape, or the looks are those of
+                another number of shapes.
+        """
+        count = len(scene.shapes)
+        if self.obstacle_looks and len(self.obstacle_looks) != count:
+            expectation = f"one for each of the scene's {count} shapes, or none"
+            raise ConfigurationError(f"{self.GROUP}.obstacle_looks", list(self.obstacle_looks), expectation)
         at = np.linspace(0.0, 1.0, 100)
         x, y, heading = self.needle_start
         needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
-        things = {"a needle": needle, "a thread": self.thread_at_start(at)}
-        for name, points in things.items():
-            inside = np.linalg.norm(points, axis=1).max() < 0.5 * self.dish_diameter
-            if not inside or any(_touches(points, obstacle) for obstacle in self.obstacles()):
+        for name, points in {"a needle": needle, "a thread": self.thread_at_start(at)}.items():
+            what = occupant(scene, points, holes=False)
+            if what:
                 start = f"{list(self.needle_start)}, thread curvature {self.thread_start_curvature:g}"
-                raise ConfigurationError(f"{self.GROUP}.needle_start", start, f"{name} in the dish, off the obstacles")
+                expectation = f"{name} in the dish, off the obstacles: it would be in {what}"
+                raise ConfigurationError(f"{self.GROUP}.needle_start", start, expectation)
 
     def thread_at_start(self, at: NDArray[np.float64]) -> Points:
         """Return points along the thread as it lies at the start, `at` from 0 to 1, shape (m, 2) [m]."""
@@ -174,38 +165,34 @@ class RigSettings(Configuration):
         tail = np.array([x, y])
         return needle_axis(tail, heading + math.pi, self.thread_length, self.thread_start_curvature, at)[0]
 
-    def obstacles(self) -> tuple[Disc | Polygon, ...]:
-        """Return discs, then polygons."""
-        return self._obstacles
-
-    @cached_property
-    def _obstacles(self) -> tuple[Disc | Polygon, ...]:
-        discs = discs_from(self.disc_obstacles)
-        return (*discs, *polygons_from(self.GROUP, self.polygon_obstacles, self.polygon_sizes))
-
-    def view(self) -> DishView:
+    def view(self, scene: Scene) -> DishView:
         """Return where the dish is in the image: a little off the middle, as in a real rig."""
-        scale = self.dish_diameter / (self.camera_height_share * self.camera_height)
+        scale = scene.dish.diameter / (self.camera_height_share * self.camera_height)
         return DishView((0.5 * self.camera_width + 2.0, 0.5 * self.camera_height - 2.0), scale)
 
-    def camera(self) -> DishCamera:
+    def camera(self, scene: Scene) -> DishCamera:
         """Return the camera over the dish."""
-        scene = Scene(
-            dish_diameter=self.dish_diameter,
+        seen = CameraScene(
+            dish_diameter=scene.dish.diameter,
             needle_length=self.needle_length,
             needle_width=self.needle_width,
             needle_curvature=self.needle_curvature,
             thread_diameter=self.thread_diameter,
-            obstacles=self.obstacles(),
-            looks=tuple(LOOKS[name] for name in self.obstacle_looks),
+            obstacles=scene.obstacles,
+            looks=self._looks(scene),
         )
         lighting = Lighting(gain=self.light_gain, noise=self.noise)
-        return DishCamera(scene, self.view(), (self.camera_width, self.camera_height), self.seed, lighting)
+        return DishCamera(seen, self.view(scene), (self.camera_width, self.camera_height), self.seed, lighting)
 
-    def schedule(self) -> FaultSchedule:
+    def _looks(self, scene: Scene) -> tuple[Look, ...]:
+        """Return how each shape looks: as told, where that is told of all; else by its kind."""
+        told = self.obstacle_looks if len(self.obstacle_looks) == len(scene.shapes) else ()
+        return tuple(LOOKS[name] for name in told or [LOOK_OF_KIND[shape.kind] for shape in scene.shapes])
+
+    def schedule(self, scene: Scene) -> FaultSchedule:
         """Return what goes wrong and when."""
         faults = [Fault.parse(text) for text in self.faults]
-        return FaultSchedule(faults, self.dish_diameter, self.needle_length, self.seed)
+        return FaultSchedule(faults, scene.dish.diameter, self.needle_length, self.seed)
 
     def field(self) -> CoilField:
         """Return the coils' field."""
@@ -227,12 +214,19 @@ class RigSettings(Configuration):
             return None
         return StageProcess(self.power_stage_ports, self.supply_voltage, self.coil_resistance, self.coil_inductance)
 
-    def dynamics(self) -> RigDynamics:
+    def surface(self, scene: Scene) -> Surface:
+        """Return what needle and thread can touch; the hole of a shape is seen but not felt."""
+        return Surface(
+            discs=tuple(o for o in scene.obstacles if isinstance(o, Disc)),
+            polygons=tuple(o.rings[0] for o in scene.obstacles if isinstance(o, Polygon)),
+            wall_radius=scene.dish.radius,
+        )
+
+    def dynamics(self, scene: Scene) -> RigDynamics:
         """Return needle and thread at their start, in the field of the coils."""
         x, y, heading = self.needle_start
         tail = np.array([x, y])
         behind = self.thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1))
-        obstacles = self.obstacles()
         return RigDynamics(
             needle=NeedleBody(
                 length=self.needle_length,
@@ -251,22 +245,10 @@ class RigSettings(Configuration):
                 attachment=Attachment(self.thread_attachment),
                 diameter=self.thread_diameter,
             ),
-            surface=Surface(
-                discs=tuple(o for o in obstacles if isinstance(o, Disc)),
-                polygons=tuple(o.rings[0] for o in obstacles if isinstance(o, Polygon)),
-                wall_radius=0.5 * self.dish_diameter,
-            ),
+            surface=self.surface(scene),
             field=self.field(),
             tail=tail,
             heading=heading,
             thread_points=behind,
             largest_step=LARGEST_STEP,
         )
-
-
-def _touches(points: Points, obstacle: Disc | Polygon) -> bool:
-    """Return whether a point of shape (m, 2) is in an obstacle."""
-    if isinstance(obstacle, Disc):
-        return bool((np.linalg.norm(points - obstacle.centre, axis=1) < obstacle.radius).any())
-    corners = obstacle.rings[0].astype(np.float32)
-    return any(cv2.pointPolygonTest(corners, (x, y), False) >= 0.0 for x, y in points.tolist())

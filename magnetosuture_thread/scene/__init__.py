@@ -2,15 +2,18 @@
 
 from magnetosuture_thread.scene.definitions import shape_from_mapping
 from magnetosuture_thread.scene.files import read_scene, scene_from_mapping, scene_to_mapping, write_scene
+from magnetosuture_thread.scene.places import WALL, occupant
 from magnetosuture_thread.scene.scene import KINDS, Dish, Scene, SceneShape
 from magnetosuture_thread.scene.shapes import SHAPES
 
 __all__ = [
     "KINDS",
     "SHAPES",
+    "WALL",
     "Dish",
     "Scene",
     "SceneShape",
+    "occupant",
     "read_scene",
     "scene_from_mapping",
     "scene_to_mapping",

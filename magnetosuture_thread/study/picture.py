@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
-from magnetosuture_thread.study.replayed import Instant, Summary
+from magnetosuture_thread.study.replayed import SOLID, Instant, Summary
 
 INK, FAINT = "#22303c", "#7b8794"
 SEEN, TRUTH = "#0f6fc6", "#8a6d00"
@@ -206,7 +206,8 @@ def _draw_error(axes: Axes, times: NDArray[np.float64], instants: list[Instant])
 
 
 def _draw_clearance(axes: Axes, times: NDArray[np.float64], instants: list[Instant]) -> None:
-    clearance = np.array([i.least.get("obstacle", np.nan) for i in instants]) * 1e3
+    least = [[i.least[kind] for kind in SOLID if kind in i.least] for i in instants]
+    clearance = 1e3 * np.array([min(values) if values else np.nan for values in least])
     axes.set_title("least distance of a node from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
     if not np.isfinite(clearance).any():
         axes.text(0.5, 0.5, "no obstacle near the thread", transform=axes.transAxes, ha="center", color=FAINT)

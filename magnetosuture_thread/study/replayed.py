@@ -25,7 +25,8 @@ from magnetosuture_thread.study.currents import CurrentDifference
 from magnetosuture_thread.study.score import prediction_error_percent
 
 # By the number in the message BarrierMargin.
-KINDS = ("connectivity", "compression", "obstacle", "enhanced_connectivity", "stiffness")
+KINDS = ("connectivity", "compression", "obstacle", "enhanced_connectivity", "stiffness", "wall")
+SOLID = ("obstacle", "wall")  # kinds of what a node can touch
 
 
 @dataclass(frozen=True)
@@ -245,9 +246,9 @@ class Collector:
             return
         kind, node = np.asarray(message.kind), np.asarray(message.node)
         clearance = np.asarray(message.clearance)
-        obstacles = kind == KINDS.index("obstacle")
+        near = np.isin(kind, [KINDS.index(solid) for solid in SOLID])
         instant.clearance = np.full(int(node.max(initial=0)) + 1, np.inf)
-        np.minimum.at(instant.clearance, node[obstacles], clearance[obstacles])
+        np.minimum.at(instant.clearance, node[near], clearance[near])
         for entry in message.least:
             instant.least[KINDS[entry.kind]] = entry.clearance
             if entry.clearance < self._least.get(entry.kind, (np.inf,))[0]:

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import Prediction
-from magnetosuture_thread.study.replayed import KINDS, Instant, LeastMargin
+from magnetosuture_thread.study.replayed import KINDS, SOLID, Instant, LeastMargin
 from magnetosuture_thread.study.score import LEAST_SEEN
 from magnetosuture_thread.study.sight import Sight
 
 AT_ONCE = 128  # predictions that are scored together
 ROUNDING = 1e-9  # of a length, by which a node may be past its end
-_OBSTACLE = KINDS.index("obstacle")
+_SOLID = [KINDS.index(kind) for kind in SOLID]
 _NOTHING, _NONE = np.empty((0, 2)), np.empty(0)
 
 
@@ -84,10 +84,10 @@ def _without_clearance(sight: Sight, prediction: Prediction, margins: Margins | 
 
 
 def _clearance(instant: Instant, margins: Margins | None) -> NDArray[np.float64]:
-    """Return the least clearance of an obstacle for each node, inf where none; empty if no node is near any."""
-    if margins is None or KINDS[_OBSTACLE] not in instant.least:
+    """Return the least clearance of an obstacle or the wall for each node, inf where none; empty if none is near."""
+    if margins is None or not any(kind in instant.least for kind in SOLID):
         return _NONE
-    near = margins.kind == _OBSTACLE
+    near = np.isin(margins.kind, _SOLID)
     clearance = np.full(len(instant.vertices), np.inf)
     np.minimum.at(clearance, margins.node[near], margins.clearance[near])
     return clearance
@@ -100,7 +100,7 @@ class Tally:
         length: of the thread [m].
 
     Attributes:
-        contact_frames: those in which the thread touches an obstacle.
+        contact_frames: those in which the thread touches an obstacle or the wall.
     """
 
     def __init__(self, length: float) -> None:

@@ -11,6 +11,7 @@ import yaml
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.parameter_files import EVERY_NODE
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -42,12 +43,12 @@ class Calibration:
     def to_yaml(self) -> str:
         """Return a section of a ROS 2 parameter file for the vision tracker."""
         values = {
-            "dish_diameter": float(self.dish_diameter),
             "dish_centre_px": [round(float(value), 3) for value in self.view.centre_px],
             "metres_per_pixel": float(f"{self.view.metres_per_pixel:.7g}"),
             "camera_rotation": round(float(self.view.rotation), 6),
         }
-        return yaml.safe_dump({VisionTrackerSettings.GROUP: {"ros__parameters": values}}, sort_keys=False)
+        key = f"{EVERY_NODE}/{VisionTrackerSettings.GROUP}"
+        return yaml.safe_dump({key: {"ros__parameters": values}}, sort_keys=False)
 
 
 def calibrate_by_dish(images: Sequence[np.ndarray], dish_diameter: float) -> Calibration:

@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import Picture, prepare
 from magnetosuture_thread.vision.needle.body import SeenNeedle
@@ -64,12 +65,12 @@ def no_pose(state: State, reason: str, view: DishView | None) -> Track:
     return Track(state, reason, 0.0, nothing, nothing, nothing, 0.0, np.empty((0, 0)), np.empty((0, 2)), view)
 
 
-def find_view(gray: np.ndarray, settings: VisionTrackerSettings) -> DishView | None:
+def find_view(gray: np.ndarray, settings: VisionTrackerSettings, dish: Dish) -> DishView | None:
     """Return the view: what of it is given, and the rest by the dish; None if no dish is seen."""
     fixed = settings.fixed_view()
     if fixed is not None:
         return fixed
-    found = find_dish(gray, settings.dish_diameter)
+    found = find_dish(gray, dish.diameter)
     if found is None:
         return None
     scale = settings.metres_per_pixel or found.metres_per_pixel
@@ -92,10 +93,10 @@ def picture_of(
 
 
 def needles_in(
-    picture: Picture, view: DishView, settings: VisionTrackerSettings, toward: np.ndarray | None = None
+    picture: Picture, view: DishView, settings: VisionTrackerSettings, dish: Dish, toward: np.ndarray | None = None
 ) -> tuple[list[SeenNeedle], list[str]]:
     """Find the needles in a picture, in its own pixels; see `find_needles`."""
-    radius, length, width = 0.5 * settings.dish_diameter, settings.needle_length, settings.needle_width
+    radius, length, width = dish.radius, settings.needle_length, settings.needle_width
     return find_needles(picture, _local(view, picture), radius, length, width, toward)
 
 
@@ -104,10 +105,10 @@ def why_none(refused: list[str]) -> str:
     return "no needle in the dish" + (f"; dark things: {', '.join(refused)}" if refused else "")
 
 
-def tracked(picture: Picture, view: DishView, settings: VisionTrackerSettings, needle: SeenNeedle) -> Track:
+def tracked(picture: Picture, view: DishView, settings: VisionTrackerSettings, dish: Dish, needle: SeenNeedle) -> Track:
     """Return what a frame shows whose needle is known, in the picture's own pixels, with the thread's centreline."""
     local = _local(view, picture)
-    reach = 0.5 * settings.dish_diameter / view.metres_per_pixel - WALL_PX
+    reach = dish.radius / view.metres_per_pixel - WALL_PX
     longest = LONGEST * settings.thread_length / view.metres_per_pixel
     walk = find_centreline(picture, needle, longest, local.centre_px, reach)
     heading = view.directions_to_dish(needle.direction_px)
@@ -125,15 +126,15 @@ def tracked(picture: Picture, view: DishView, settings: VisionTrackerSettings, n
     )
 
 
-def look_once(gray: np.ndarray, settings: VisionTrackerSettings) -> Track:
+def look_once(gray: np.ndarray, settings: VisionTrackerSettings, dish: Dish) -> Track:
     """Look at one frame alone."""
-    view = find_view(gray, settings)
+    view = find_view(gray, settings, dish)
     if view is None:
         return no_pose(State.LOST, "no dish in the image", None)
     picture = picture_of(gray, view, settings)
-    needles, refused = needles_in(picture, view, settings)
+    needles, refused = needles_in(picture, view, settings, dish)
     if len(needles) == 1:
-        return tracked(picture, view, settings, needles[0])
+        return tracked(picture, view, settings, dish, needles[0])
     return no_pose(State.LOST, f"{len(needles)} needles in the dish" if needles else why_none(refused), view)
 
 

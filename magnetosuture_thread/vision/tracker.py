@@ -9,6 +9,7 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.dish.watch import DishWatch
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_image, measured_channel
 from magnetosuture_thread.vision.look import (
@@ -55,13 +56,22 @@ class VisionTracker:
 
     Args:
         settings: what to look for.
+        scene: in which.
     """
 
-    def __init__(self, settings: VisionTrackerSettings) -> None:
-        self._settings = settings
-        self._dish = DishWatch(settings)
+    def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
+        self._settings, self._scene = settings, scene
+        self._dish = DishWatch(settings, scene.dish)
         self._shape: tuple[int, ...] = ()
         self.reset()
+
+    def set_scene(self, scene: Scene) -> None:
+        """Take another scene. The needle is still tracked, unless the dish has another size."""
+        other_dish = scene.dish.diameter != self._scene.dish.diameter
+        self._scene = scene
+        if other_dish:
+            self._dish = DishWatch(self._settings, scene.dish)
+            self._last, self._anew = None, []
 
     def reset(self) -> None:
         """Forget the needle and the dish."""
@@ -81,7 +91,7 @@ class VisionTracker:
             InvalidInputError: the image is not of this kind.
         """
         check_image(image)
-        return look_once(measured_channel(image), self._settings)
+        return look_once(measured_channel(image), self._settings, self._scene.dish)
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame.
@@ -116,10 +126,10 @@ class VisionTracker:
         chosen, picture, reason = self._choose(gray, view, time_s)
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
-        found = tracked(picture, view, self._settings, chosen)
+        found = tracked(picture, view, self._settings, self._scene.dish, chosen)
         if picture.gray.shape != gray.shape and self._is_cut(found, picture):
             picture, chosen = _in_whole(picture, chosen, picture_of(gray, view, self._settings))
-            found = tracked(picture, view, self._settings, chosen)
+            found = tracked(picture, view, self._settings, self._scene.dish, chosen)
         ends = np.array([found.tail, found.tip])
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
@@ -153,13 +163,13 @@ class VisionTracker:
             _, angle = self._last.at(time)
             toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
             picture = picture_of(gray, view, self._settings, self._region(gray, view, time))
-            needles, _ = needles_in(picture, view, self._settings, toward)
+            needles, _ = needles_in(picture, view, self._settings, self._scene.dish, toward)
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             if len(within) == 1:
                 self._take(_pose(within[0], picture, view, time), self._last)
                 return within[0], picture, ""
         picture = picture_of(gray, view, self._settings)
-        needles, refused = needles_in(picture, view, self._settings)
+        needles, refused = needles_in(picture, view, self._settings, self._scene.dish)
         if self._last is not None and len(needles) > 1:
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             needles = within if len(within) == 1 else needles

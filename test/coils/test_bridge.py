@@ -17,7 +17,9 @@ from magnetosuture_thread.coils.bridge import Bridge, Outcome
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 PERIOD = 0.005
 READY = DriverState(True)
@@ -29,6 +31,8 @@ class Plant:
     """A bridge under a clock; commands come at 50 Hz and poses at 60, unless they are switched off."""
 
     settings: CoilBridgeSettings = field(default_factory=CoilBridgeSettings)
+    scene: Scene | None = field(default_factory=Scene)
+    thread: bool = True
     time: float = 100.0
     velocity: tuple[float, float] | None = (0.005, 0.002)
     tail: NDArray[np.float64] | None = field(default_factory=lambda: TAIL.copy())
@@ -37,7 +41,7 @@ class Plant:
 
     def __post_init__(self) -> None:
         """Make the bridge, not active yet."""
-        self.bridge = Bridge(self.settings, ArmingLatch())
+        self.bridge = Bridge(self.settings, ArmingLatch(), self.scene)
         self.commands = self.poses = 0
         self._next_command = self._next_pose = self.time
 
@@ -59,14 +63,22 @@ class Plant:
             if self.velocity is not None and self.time >= self._next_command:
                 self.command(self.velocity)
                 self._next_command = self.time + 0.02
+            if self.thread:
+                self.bridge.on_margins(self.time, True, 1.0, self.bridge.scene_version, self.time)
             self.outcomes.append((self.time, self.bridge.step(self.time, self.time, self.driver)))
         return [outcome for _, outcome in self.outcomes[begin:]]
 
-    def command(self, velocity: tuple[float, float], stamp: float | None = None, number: int | None = None) -> None:
+    def command(
+        self,
+        velocity: tuple[float, float],
+        stamp: float | None = None,
+        number: int | None = None,
+        source: str = "needle",
+    ) -> None:
         """Send one command now."""
         self.commands += 1
         stamp = self.time if stamp is None else stamp
-        self.bridge.gate.accept(np.array(velocity), stamp, number or self.commands, self.time, self.time)
+        self.bridge.command(source, np.array(velocity), stamp, number or self.commands, self.time, self.time)
 
 
 def still(outcome: Outcome) -> bool:
@@ -107,6 +119,7 @@ def test_no_false_stops():
                     stamp = plant.time - age
                     plant.bridge.needle.see(TAIL, EAST, stamp, numbers[name], plant.time, plant.time)
                 at[name] = plant.time + float(jitter.uniform(0.04, 0.055))
+        plant.bridge.on_margins(plant.time, True, 1.0, plant.bridge.scene_version, plant.time)
         assert not still(plant.bridge.step(plant.time, plant.time, READY))
 
 
@@ -114,7 +127,7 @@ def test_no_false_stops():
 def test_source_timeout_and_time_to_stop(timeout: float):
     plant = Plant(CoilBridgeSettings(command_timeout=timeout)).ready()
     plant.run(0.5)
-    plant.velocity, last = None, plant.bridge.gate.stamp
+    plant.velocity, last = None, plant.bridge.gates["needle"].stamp
     outcomes = plant.run(1.0)
     assert outcomes[-1].reasons == (f"no command for {timeout:g} s",)
     assert timeout - 3 * PERIOD < stopped_after(plant, last) <= timeout - PERIOD + 1e-9
@@ -207,9 +220,9 @@ def test_stops_are_at_once_and_starts_are_not():
     plant.velocity = (-0.015, 0.0)
     outcomes += plant.run(1.0)
     for before, after in itertools.pairwise(outcomes):
-        assert np.linalg.norm(after.applied - before.applied) <= 0.1 * 2 * PERIOD + 1e-12
+        assert np.linalg.norm(after.filtered - before.filtered) <= 0.1 * 2 * PERIOD + 1e-12
         assert np.abs(after.allocation.currents - before.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
-    steps = [np.linalg.norm(b.applied - a.applied) for a, b in itertools.pairwise(outcomes[1:])]
+    steps = [np.linalg.norm(b.filtered - a.filtered) for a, b in itertools.pairwise(outcomes[1:])]
     assert max(steps) == pytest.approx(0.1 * PERIOD, rel=1e-6)
     assert not still(outcomes[-1])
     plant.velocity = (0.0, 0.0)
@@ -217,7 +230,7 @@ def test_stops_are_at_once_and_starts_are_not():
     assert at_rest[-1].reasons == ()
     assert at_rest[-1].publish
     assert [still(outcome) for outcome in at_rest[4:]] == [True] * (len(at_rest) - 4)
-    assert not any(0.0 < np.linalg.norm(outcome.applied) < 0.014 for outcome in at_rest)
+    assert not any(0.0 < np.linalg.norm(outcome.filtered) < 0.014 for outcome in at_rest)
 
 
 def test_after_a_stop_the_needle_starts_from_rest():
@@ -236,7 +249,7 @@ def test_after_a_stop_the_needle_starts_from_rest():
     plant.bridge.arm(READY)
     plant.command((0.015, 0.0))
     first = plant.run(PERIOD)[0]
-    assert 0.0 < np.linalg.norm(first.applied) <= 0.1 * 2 * PERIOD + 1e-12
+    assert 0.0 < np.linalg.norm(first.filtered) <= 0.1 * 2 * PERIOD + 1e-12
     assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
 
 
@@ -244,10 +257,12 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     settings = CoilBridgeSettings(max_current_slew=100.0, command_timeout=0.1)
     plant = Plant(settings, velocity=(0.015, 0.0)).ready()
     assert np.abs(plant.run(1.0)[-1].allocation.currents).max() > 3.0
-    plant.time += 0.15
+    plant.time += 0.21  # until when the coils have certainly stopped
     plant.bridge.needle.see(TAIL, EAST, plant.time, plant.poses + 1, plant.time, plant.time)
     plant.command((0.015, 0.0))
+    plant.bridge.on_margins(plant.time, True, 1.0, plant.bridge.scene_version, plant.time)
     after = plant.bridge.step(plant.time, plant.time, READY)
+    assert not still(after)
     assert np.abs(after.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
 
 
@@ -262,8 +277,9 @@ def test_a_silence_after_a_rest_is_told_as_any_other():
 def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(monkeypatch: pytest.MonkeyPatch):
     plant = Plant().ready()
     plant.run(0.2)
-    monkeypatch.setattr(plant.bridge, "_allocate", lambda *_: None)
-    assert plant.run(PERIOD)[0].reasons == ("the coils would pull the needle to the wall or an obstacle",)
+    zero = plant.bridge._coils.zero()
+    monkeypatch.setattr(plant.bridge, "_allocate", lambda *_: (zero, "wall"))
+    assert plant.run(PERIOD)[0].reasons == ("stopped by wall: no currents lead away",)
     monkeypatch.undo()
     assert all(still(outcome) for outcome in plant.run(0.08))
     assert not still(plant.run(0.1)[-1])
@@ -272,19 +288,19 @@ def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(mon
 def test_a_late_step_changes_no_more_than_two_in_time():
     plant = Plant(CoilBridgeSettings(max_acceleration=0.1), velocity=(0.015, 0.0)).ready()
     plant.run(0.02)
-    before = plant.outcomes[-1][1].applied
+    before = plant.outcomes[-1][1].filtered
     plant.time += 0.08
     plant.command((0.015, 0.0))
-    after = plant.bridge.step(plant.time, plant.time, READY).applied
+    after = plant.bridge.step(plant.time, plant.time, READY).filtered
     assert np.linalg.norm(after - before) <= 0.1 * 2 * PERIOD + 1e-12
 
 
 def test_currents_stay_within_their_limit_and_saturation_is_said():
-    plant = Plant(CoilBridgeSettings(max_current=1.5, max_speed=0.5), velocity=(0.4, 0.1)).ready()
+    plant = Plant(CoilBridgeSettings(max_current=1.5, max_speed=0.045), velocity=(0.4, 0.1)).ready()
     outcomes = plant.run(1.0)
     assert max(np.abs(outcome.allocation.currents).max() for outcome in outcomes) <= 1.5
     assert outcomes[-1].allocation.saturated
-    assert np.linalg.norm(outcomes[-1].allocation.velocity) < np.linalg.norm(outcomes[-1].applied)
+    assert np.linalg.norm(outcomes[-1].allocation.velocity) < np.linalg.norm(outcomes[-1].filtered)
 
 
 def test_two_that_command_at_once_stop_it_until_one_is_silent():
@@ -317,11 +333,13 @@ def test_the_needle_never_comes_closer_than_it_may(
 
     Also where poses come late, and seldom; both in periods.
     """
-    settings = CoilBridgeSettings(disc_obstacles=obstacles)
-    plant = Plant(settings, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
+    settings = CoilBridgeSettings()
+    posts = (SceneShape("post", "instrument", Disc(obstacles[:2], obstacles[2])),) if obstacles else ()
+    scene = Scene(Dish(0.035), posts)
+    plant = Plant(settings, scene, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
     plant.tail = None
     tail, heading = TAIL - np.array([0.004, 0.0]), EAST
-    needle, workspace = settings.needle(), settings.workspace()
+    needle, safety = settings.needle().kinematics, settings.safety_filter(scene)
     least = np.inf
     poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
     for number in range(1, 1000):
@@ -330,16 +348,10 @@ def test_the_needle_never_comes_closer_than_it_may(
             then, old_tail, old_heading = poses[number - 1 - latency]
             plant.bridge.needle.see(old_tail, old_heading, then, number, plant.time, plant.time)
         outcome = plant.run(PERIOD)[0]
-        # As the bridge has it: along the chord the needle is driven, across it turns about its middle.
-        e = needle.chord_direction(heading)
-        n = np.array([-e[1], e[0]])
-        middle = tail + 0.5 * needle.chord * e + float(outcome.allocation.velocity @ e) * PERIOD * e
-        angle = float(outcome.allocation.velocity @ n) / (0.5 * needle.chord) * PERIOD
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        heading = turn @ heading
-        tail = middle - 0.5 * needle.chord * (turn @ e)
-        least = min(least, workspace.clearance(tail, heading))
-    assert least > settings.keep_out - 5e-6
+        moved = needle.body_velocity(heading, outcome.allocation.velocity)
+        tail, heading = needle.moved(tail, heading, *moved, PERIOD)
+        least = min(least, safety.clearance(tail, heading))
+    assert least > settings.keep_out - 1e-9
     assert least < 0.003  # it did get there
 
 
@@ -368,10 +380,11 @@ def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: p
         {"autostart": "armed", "driver": "roboclaw"},
         {"max_acceleration": -1.0},
         {"rate": 0.0},
-        {"roboclaw_timeout": 0.0},
+        {"driver_timeout": 0.0},
         {"roboclaw_answer_timeout": 0.02},
         {"roboclaw_answer_timeout": 1.5},
-        {"keep_out": 0.03},
+        {"keep_out": 0.0},
+        {"without_prediction": "go on"},
     ],
 )
 def test_bad_settings_are_refused(change: dict[str, object]):
@@ -385,27 +398,195 @@ def test_10000_hostile_inputs_and_not_one_current_outside_of_the_limits():
     settings = CoilBridgeSettings(max_current_slew=500.0)
     plant = Plant(settings, velocity=None, tail=None).ready()
     odd = np.array([0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 0.01, -0.02, 1e-6])
-    before, driven = np.zeros(4), 0
+    before, driven, tail = np.zeros(4), 0, np.zeros(2)
     number = {"command": 0, "pose": 0}
     for k in range(10_000):
         plant.time += float(source.choice([0.0, 1e-4, PERIOD, 0.03]))
         hostile = source.uniform() < 0.3
         stamp = plant.time + (float(source.choice([-1e9, -1.0, 0.2, 1e9])) if hostile and k % 3 == 0 else 0.0)
         values = source.choice(odd, 4) if hostile else np.array([*source.uniform(-0.03, 0.03, 2), 1.0, 0.0])
+        tail = np.clip(tail + source.uniform(-2e-4, 2e-4, 2), -0.006, 0.006)
         name = "command" if k % 2 else "pose"
         number[name] += int(source.choice([-5, 0, 200])) if source.uniform() < 0.002 else 1
         try:
             if name == "command":
-                plant.bridge.gate.accept(values[:2], stamp, number[name], plant.time, plant.time)
+                plant.bridge.command("needle", values[:2], stamp, number[name], plant.time, plant.time)
             else:
-                plant.bridge.needle.see(0.4 * values[:2], values[2:], stamp, number[name], plant.time, plant.time)
+                where = 0.4 * values[:2] if hostile else tail
+                plant.bridge.needle.see(where, values[2:], stamp, number[name], plant.time, plant.time)
         except InvalidInputError:
             pass
+        plant.bridge.on_margins(plant.time, True, 1.0, plant.bridge.scene_version, plant.time)
         currents = plant.bridge.step(plant.time, plant.time, READY).allocation.currents
         assert np.all(np.isfinite(currents))
         assert np.abs(currents).max() <= settings.max_current
         if currents.any():
-            assert np.abs(currents - before).max() <= settings.max_current_slew * 2 * PERIOD + 1e-9
+            # Towards zero the filter may take any share off, as a stop does.
+            change = settings.max_current_slew * 2 * PERIOD + 1e-9
+            assert (currents <= np.maximum(before + change, 0.0)).all()
+            assert (currents >= np.minimum(before - change, 0.0)).all()
         before, driven = currents, driven + bool(currents.any())
         assert plant.bridge.latch.fault == ""
     assert driven > 500  # there was something to go wrong
+
+
+def test_without_a_scene_it_does_not_arm():
+    plant = Plant(scene=None)
+    plant.bridge.latch.activate()
+    with pytest.raises(InvalidInputError, match="no scene"):
+        plant.bridge.arm(READY)
+    plant.bridge.set_scene(Scene())
+    plant.bridge.arm(READY)
+    assert not still(plant.run(0.2)[-1])
+    plant.bridge.set_scene(None)
+    assert plant.run(PERIOD)[0].reasons[0] == "no scene"
+
+
+def test_another_scene_holds_from_the_next_step_on():
+    plant = Plant(velocity=(0.01, 0.0)).ready()
+    before = plant.run(0.2)[-1]
+    post = SceneShape("post", "instrument", Disc((0.0065, 0.0), 0.002))
+    plant.bridge.set_scene(Scene(Dish(), (post,)))
+    after = plant.run(PERIOD)[0]
+    assert before.active == ()
+    assert after.scene_version == Scene(Dish(), (post,)).version != before.scene_version
+    assert "post" in after.active
+    assert np.linalg.norm(after.applied) < 0.6 * np.linalg.norm(before.applied)
+
+
+def test_a_scene_without_room_leaves_the_one_before():
+    plant = Plant().ready()
+    with pytest.raises(ConfigurationError, match="room for the needle"):
+        plant.bridge.set_scene(Scene(Dish(0.006)))
+    assert plant.bridge.scene == Scene()
+    assert not still(plant.run(0.2)[-1])
+
+
+def test_an_operator_takes_over_by_commanding_and_gives_back_by_silence():
+    plant = Plant(velocity=(0.005, 0.0)).ready()
+    assert (plant.run(0.2)[-1].source, plant.outcomes[-1][1].overridden) == ("needle", "")
+    for k in range(20):
+        plant.command((0.0, 0.004), number=9000 + k, source="operator")
+        plant.commands -= 1
+        outcome = plant.run(PERIOD)[0]
+        assert (outcome.source, outcome.overridden) == ("operator", "needle")
+        assert outcome.commanded.tolist() == [0.0, 0.004]
+    assert plant.run(0.12)[-1].source == "needle"
+    assert plant.outcomes[-1][1].commanded.tolist() == [0.005, 0.0]
+
+
+def test_an_operator_may_take_over_from_two_that_dispute_the_needle():
+    plant = Plant().ready()
+    plant.run(0.2)
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        plant.command((-0.01, 0.0), number=7777)
+    plant.velocity = None
+    assert plant.run(PERIOD)[0].reasons == ("several publishers of needle/servo_cv at once",)
+    plant.command((0.0, 0.004), number=1, source="operator")
+    assert plant.run(PERIOD)[0].source == "operator"
+
+
+def test_two_operators_at_once_stop_the_needle_whoever_else_commands():
+    plant = Plant().ready()
+    plant.command((0.0, 0.004), number=1, source="operator")
+    plant.run(0.1)
+    with pytest.raises(InvalidInputError, match="operator/servo_cv"):
+        plant.command((0.0, 0.004), number=7777, source="operator")
+    assert plant.run(0.05)[-1].reasons == ("several publishers of operator/servo_cv at once",)
+
+
+def test_without_a_prediction_it_stops_and_says_so():
+    plant = Plant(thread=False).ready()
+    outcome = plant.run(0.2)[-1]
+    assert still(outcome)
+    assert (outcome.reasons, outcome.active) == (("no thread prediction yet",), ("no prediction",))
+    plant.thread = True
+    assert not still(plant.run(0.1)[-1])
+    plant.thread = False
+    assert not still(plant.run(0.45)[-1])
+    assert plant.run(0.1)[-1].reasons == ("no thread prediction for 0.5 s",)
+
+
+def test_without_a_prediction_it_may_go_on_slowly():
+    settings = CoilBridgeSettings(without_prediction="slow", speed_without_prediction=0.002)
+    plant = Plant(settings, thread=False, velocity=(0.01, 0.0)).ready()
+    outcome = plant.run(0.3)[-1]
+    assert outcome.reasons == ()
+    assert np.linalg.norm(outcome.filtered) == pytest.approx(0.002)
+    assert outcome.active == ("no prediction", "speed")
+
+
+def test_an_invalid_prediction_leaves_the_last_valid_one_until_that_is_old():
+    plant = Plant(thread=False).ready()
+    plant.run(0.02)
+    plant.bridge.on_margins(plant.time, True, 0.5, plant.bridge.scene_version, plant.time)
+    for _ in range(8):
+        plant.bridge.on_margins(plant.time, False, 1.0, plant.bridge.scene_version, plant.time)
+        assert plant.run(0.05)[-1].slowdown == 0.5
+    for _ in range(4):
+        plant.bridge.on_margins(plant.time, False, 1.0, plant.bridge.scene_version, plant.time)
+        plant.run(0.05)
+    assert plant.outcomes[-1][1].reasons == ("no thread prediction for 0.5 s",)
+    for slowdown in (float("nan"), -0.1, 1.5):
+        with pytest.raises(InvalidInputError, match="slowdown"):
+            plant.bridge.on_margins(plant.time, True, slowdown, "", plant.time)
+
+
+def test_friction_slows_the_needle():
+    plant = Plant(thread=False, velocity=(0.01, 0.0)).ready()
+    for _ in range(40):
+        plant.bridge.on_margins(plant.time, True, 0.5, plant.bridge.scene_version, plant.time)
+        outcome = plant.run(PERIOD)[0]
+    assert outcome.commanded.tolist() == [0.01, 0.0]
+    assert outcome.filtered.tolist() == pytest.approx([0.005, 0.0])
+    assert (outcome.slowdown, outcome.active) == (0.5, ("friction",))
+
+
+def test_model_and_bridge_on_different_scenes_for_half_a_second_stop_the_needle():
+    plant = Plant(thread=False).ready()
+
+    def run(duration: float, version: str) -> Outcome:
+        for _ in range(round(duration / PERIOD)):
+            plant.bridge.on_margins(plant.time, True, 1.0, version, plant.time)
+            plant.run(PERIOD)
+        return plant.outcomes[-1][1]
+
+    mine = plant.bridge.scene_version
+    assert not still(run(0.2, mine))
+    assert not still(run(0.45, "0123"))
+    assert run(0.1, "0123").reasons == (f"scene: thread_model has 0123, coil_bridge has {mine}",)
+    assert not still(run(0.05, mine))
+    assert run(0.6, "").reasons == (f"scene: thread_model has none, coil_bridge has {mine}",)
+
+
+def test_a_needle_that_is_commanded_to_move_and_rests_says_what_stops_it():
+    """Against the wall, head on, by the filter."""
+    plant = Plant(velocity=(0.01, 0.0)).ready()
+    keep = plant.settings.keep_out
+    plant.tail = np.array([Scene().dish.radius - keep - plant.settings.needle_length, 0.0])
+    for outcome in plant.run(0.5)[4:]:
+        assert still(outcome)
+        assert outcome.reasons == ("stopped by wall",)
+        assert "wall" in outcome.active
+        assert outcome.commanded.tolist() == [0.01, 0.0]
+
+
+def test_a_pose_outside_of_the_dish_stops_the_needle_until_poses_agree_again():
+    plant = Plant().ready()
+    plant.run(0.2)
+    inside = plant.tail
+    plant.tail = np.array([0.014, 0.0])
+    with pytest.raises(InvalidInputError, match="from the dish's centre"):
+        plant.run(0.05)
+    plant.tail = None
+    outcome = plant.run(PERIOD)[0]
+    assert still(outcome)
+    assert outcome.reasons[0].startswith("needle pose not believed: its tip is 0.021 m from the dish's centre")
+    plant.tail, refused = inside, 0
+    for _ in range(40):
+        try:
+            plant.run(PERIOD)
+        except InvalidInputError:
+            refused += 1
+    assert refused == 4
+    assert not still(plant.run(0.1)[-1])

@@ -7,38 +7,34 @@ import pytest
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
-SQUARE = (0.004, 0.004, 0.008, 0.004, 0.008, 0.008, 0.004, 0.008)
-HOLE = (0.005, 0.005, 0.007, 0.005, 0.007, 0.007, 0.005, 0.007)
-
-
-def test_obstacles_are_discs_then_polygons_with_their_holes():
-    settings = CoilBridgeSettings(
-        disc_obstacles=(-0.005, 0.0, 0.001), polygon_obstacles=SQUARE + HOLE, polygon_sizes=(4, -4)
-    )
-    disc, polygon = settings.obstacles()
-    assert disc == Disc((-0.005, 0.0), 0.001)
-    assert isinstance(polygon, Polygon)
-    assert len(polygon.outline) == 4  # sharp, as it is no thread that lies against it
-    assert len(polygon.holes) == 1
+def test_the_filter_has_dish_shapes_and_keep_out():
+    settings = CoilBridgeSettings(keep_out=0.001, approach_rate=2.0)
+    post = SceneShape("post", "instrument", Disc((-0.006, 0.0), 0.001))
+    safety, east = settings.safety_filter(Scene(Dish(0.035), (post,))), np.array([1.0, 0.0])
+    assert safety.clearance(np.array([0.0, 0.0]), east) == pytest.approx(0.005)
+    assert safety.hold_time == pytest.approx(0.205)
+    found = safety.filter(np.array([0.02, 0.0]), np.array([0.0085, 0.0]), east).filtered
+    np.testing.assert_allclose(found, [2.0 * 0.001, 0.0], atol=1e-5)
 
 
-def test_the_workspace_has_dish_obstacles_and_clearance():
-    settings = CoilBridgeSettings(disc_obstacles=(-0.005, 0.0, 0.001), keep_out=0.001, approach_rate=5.0)
-    workspace, east = settings.workspace(), np.array([1.0, 0.0])
-    assert workspace.clearance(np.array([0.0, 0.0]), east) == pytest.approx(0.004)
-    found = workspace.safe_velocity(np.array([0.02, 0.0]), np.array([0.0085, 0.0]), east)
-    np.testing.assert_allclose(found, [5.0 * 0.001, 0.0], atol=1e-12)
+def test_a_scene_without_room_for_the_needle_is_refused():
+    with pytest.raises(ConfigurationError, match=r"scene\.dish\.diameter: .* more than 0\.008 m, room for the needle"):
+        CoilBridgeSettings().safety_filter(Scene(Dish(0.0079)))
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"polygon_obstacles": SQUARE}, r"coil_bridge\.polygon_sizes: .* 4 in all"),
-        ({"polygon_obstacles": SQUARE, "polygon_sizes": (-4,)}, "an outline before its holes"),
-        ({"disc_obstacles": (0.0, 0.0, -0.001)}, r"coil_bridge\.disc_obstacles: got -0\.001, .* positive radius"),
-        ({"keep_out": 0.0145}, r"coil_bridge\.keep_out: got 0\.0145, expected less than 0\.014 m"),
+        ({"keep_out": 0.00015}, r"coil_bridge\.keep_out: got 0\.00015, .* 0\.0002 m, half of coil_bridge\.needle_width"),
+        ({"max_speed": 0.5}, r"coil_bridge\.max_speed: got 0\.5, .* max_speed x \(driver_timeout \+ 1 / rate\)"),
+        ({"driver_timeout": 1.0}, r"coil_bridge\.max_speed: got 0\.02, expected at most 0\.00995 m/s"),
+        (
+            {"rate": 15.0, "driver_timeout": 0.1, "command_timeout": 0.5, "pose_timeout": 0.5},
+            r"coil_bridge\.driver_timeout: got 0\.1, expected at least 0\.133333 s, 2 periods",
+        ),
         ({"approach_rate": 250.0}, r"coil_bridge\.approach_rate: got 250\.0, expected at most .* 200 1/s"),
         ({"coil_angles": (0.0, 1.0)}, "at least 3 coils"),
         ({"coil_model": "points"}, "one of loops, dipoles"),

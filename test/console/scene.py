@@ -116,11 +116,14 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
                 *(block(name, corners) for name, corners in zip(("left", "right"), BLOCKS, strict=True)),
             ],
         },
-        "steering": {
-            "asked": [0.0, 0.0],
-            "passed": [0.0, 0.0],
+        "filter": {
+            "source": "operator",
+            "commanded": [0.0, 0.0],
+            "filtered": [0.0, 0.0],
+            "applied": [0.0, 0.0],
             "slowdown": factor,
-            "held_off": False,
+            "active": [],
+            "overridden": "",
             "reason": "",
             "age": 0.01,
         },
@@ -130,8 +133,8 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "emergency_stopped": False,
             "reasons": [],
             "commanded": [0.0, 0.0],
+            "filtered": [0.0, 0.0],
             "applied": [0.0, 0.0],
-            "reached": [0.0, 0.0],
             "saturated": False,
             "driver": "simulated",
             "driver_ready": True,
@@ -172,9 +175,9 @@ class RecordingGraph:
     def steer(self, velocity: tuple[float, float]) -> None:
         """Keep a command."""
         self.commands.append((time.monotonic(), velocity))
-        if self.shown["steering"]:
-            factor = self.shown["steering"]["slowdown"]
-            self.shown["steering"].update(asked=list(velocity), passed=[entry * factor for entry in velocity])
+        if self.shown["filter"]:
+            factor = self.shown["filter"]["slowdown"]
+            self.shown["filter"].update(commanded=list(velocity), filtered=[entry * factor for entry in velocity])
 
     async def act(self, action: str) -> str:
         """Keep what is asked of the bridge, and be what it then is."""

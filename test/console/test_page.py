@@ -391,9 +391,9 @@ WHY = [
     ("bridge", {"age": 4.0}, "Coil bridge silent for 4"),
     ("tracker", {"state": "lost", "reason": "no needle in sight"}, "Needle lost: no needle in sight"),
     ("needle", {"age": 2.0}, "No needle pose for 2"),
-    ("steering", {"asked": [0.003, 0.0], "reason": "no prediction"}, "The needle rests: no prediction"),
-    ("steering", {"asked": [0.003, 0.0], "held_off": True}, "Held off: an obstacle is in the way"),
-    ("bridge", {"applied": [0.003, 0.0], "reached": [0.0021, 0.0]}, "Moving at 2.1 mm/s"),
+    ("filter", {"commanded": [0.003, 0.0], "reason": "no prediction"}, "The needle rests: no prediction"),
+    ("filter", {"commanded": [0.003, 0.0], "active": ["ring"]}, "The needle rests: held by ring"),
+    ("bridge", {"filtered": [0.003, 0.0], "applied": [0.0021, 0.0]}, "Moving at 2.1 mm/s"),
 ]
 
 
@@ -412,7 +412,7 @@ def test_what_is_silent_and_what_was_never_heard_is_said(operator: Operator):
     expect(row).to_contain_text("silent")
     expect(row).to_contain_text("nothing for 9")
     expect(row).to_have_class("stale")
-    for part in ("needle", "tracker", "predicted", "margins", "steering", "bridge"):
+    for part in ("needle", "tracker", "predicted", "margins", "filter", "bridge"):
         shown[part] = None
     shown.update(seen=[], obstacles=[], nodes={})
     expect(operator.page.locator("#headline")).to_have_text("Nothing heard from the coil bridge yet")

@@ -258,12 +258,12 @@ def test_a_page_that_comes_later_gets_the_frame_that_stands():
 def test_numbers_that_are_not_finite_reach_the_page_as_null():
     async def test(here: Console) -> None:
         here.graph.shown["margins"]["least"]["obstacle"] = math.inf
-        here.graph.shown["bridge"]["reached"] = [math.nan, 0.0]
+        here.graph.shown["bridge"]["applied"] = [math.nan, 0.0]
         page = await here.page()
         await until(lambda: page.of("state"))
         shown = page.of("state")[-1]["graph"]
         assert shown["margins"]["least"]["obstacle"] is None
-        assert shown["bridge"]["reached"] == [None, 0.0]
+        assert shown["bridge"]["applied"] == [None, 0.0]
 
     run(test)
 

@@ -207,7 +207,7 @@ async def steer_and_stop(page: Page, currents: Inbox, recordings: Path) -> None:
     await page.until(lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
     assert abs(tail(page)[1] - before[1]) < 1e-3
     await page.until(lambda: any(page.graph["bridge"]["current"]), "currents")
-    assert page.graph["steering"]["asked"] == [0.005, 0.0]
+    assert page.graph["filter"]["commanded"] == [0.005, 0.0]
     assert await page.ask("pause", still=True) == ""
     await page.until(lambda: page.host["paused"] and page.graph["needle"]["age"] > 0.5, "no poses any more")
     await page.until(lambda: not any(page.graph["bridge"]["current"]), "no currents without poses")
@@ -274,8 +274,8 @@ def test_a_person_steers_the_simulated_rig(tmp_path: Path):
     with running("petri_35mm_polyamide", "--record", str(recordings)) as console:
         domain = int(console.find(r"ROS domain (\d+)"))
         url = console.find(r"open (http://127\.0\.0\.1:\d+/#token=only-for-this-test-0123)$")
-        for name in ("vision_tracker", "thread_model"):  # this machine may allow no priority
-            console.find(rf"({name}): (real time, priority 5|ordinary; real-time priority 5 refused .*)$")
+        # This machine may allow no priority.
+        console.find(r"perception: (real time, priority 5|ordinary; real-time priority 5 refused .*)$")
         with wire(domain) as currents:
             asyncio.run(use(url, currents))
         assert console.end() == 0
@@ -296,7 +296,7 @@ def test_a_person_watches_a_bag():
             assert not page.host["can_record"]
             assert await page.ask("take") == ""
             assert "nothing steers it" in await page.ask("act", action="arm")
-            assert "nothing steers it" in page.graph["steering"]["reason"]
+            assert "nothing steers it" in page.graph["filter"]["reason"]
             before = page.graph["time"]
             await page.until(lambda: page.graph["time"] > before, "time to go on")
             assert await page.ask("pause", still=True) == ""

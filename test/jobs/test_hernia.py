@@ -15,7 +15,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.jobs.hernia import hernia, read_steering, start_of
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.hernia.run import HerniaRun, replay_steering
+from magnetosuture_thread.study.hernia.run import HerniaRun, point_filter, replay_steering
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 STEERING = EXAMPLES / "hernia_steering"
@@ -25,7 +25,8 @@ STEERING = EXAMPLES / "hernia_steering"
 def run() -> HerniaRun:
     """The steering that ships, replayed."""
     setup = read_setup("hernia_ring")
-    return replay_steering(setup.model, start_of(setup), read_steering(Bag(STEERING)))
+    needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
+    return replay_steering(setup.model, start_of(setup), read_steering(Bag(STEERING)), needle)
 
 
 def instants(run: HerniaRun) -> list[dict[str, Any]]:
@@ -35,8 +36,8 @@ def instants(run: HerniaRun) -> list[dict[str, Any]]:
 
 def test_the_thread_is_the_papers_and_lies_in_the_dish(run: HerniaRun):
     assert run.settings.segments == 40
-    assert len(run.settings.obstacles()) == 3
-    radius = 0.5 * read_setup("hernia_ring").vision.dish_diameter
+    assert len(run.scene.shapes) == 3
+    radius = run.scene.dish.radius
     assert max(float(np.linalg.norm(i.prediction.vertices, axis=1).max()) for i in run.instants) < radius
 
 
@@ -63,7 +64,7 @@ def test_six_instants_tell_the_papers_story(run: HerniaRun):
 
 
 def test_the_thread_goes_around_the_ring_and_is_tight_on_it(run: HerniaRun):
-    ring = run.settings.obstacles()[0]
+    ring = run.scene.obstacles[0]
     vertices = run.nearest(55.0).prediction.vertices
     assert isinstance(ring, Polygon)
     centre = np.mean(ring.rings[0], axis=0)

@@ -22,6 +22,7 @@ from magnetosuture_thread.jobs.calibrate_camera import calibrate_camera
 from magnetosuture_thread.jobs.frames import FrameSource
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.track import settings_with, track
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 from magnetosuture_thread.study.track_table import track_table
@@ -78,7 +79,7 @@ def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytes
 
 
 def test_single_files_are_taken_in_their_order():
-    seen = track([SAMPLES / "frame_03.png", SAMPLES / "frame_00.png"], VisionTrackerSettings())
+    seen = track([SAMPLES / "frame_03.png", SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene())
     assert [frame.name for frame in seen] == ["frame_03.png", "frame_00.png"]
     assert all(frame.track.state is State.TRACKED for frame in seen)
 
@@ -91,7 +92,7 @@ def test_files_of_one_name_are_told_apart_and_each_has_its_overlay(tmp_path: Pat
     for file in files:
         file.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(file), image)
-    seen = track(files, VisionTrackerSettings(), overlay=tmp_path / "drawn")
+    seen = track(files, VisionTrackerSettings(), Scene(), overlay=tmp_path / "drawn")
     names = ["a/frame.png", "b/frame.png", "f.png", "f.jpg", "f.png (2)", "f_2.png", "a/x/g.png", "b/x/g.png"]
     assert [frame.to_json()["file"] for frame in seen] == names
     drawn = ["a_frame", "a_x_g", "b_frame", "b_x_g", "f", "f_2", "f_3", "f_4"]
@@ -100,7 +101,7 @@ def test_files_of_one_name_are_told_apart_and_each_has_its_overlay(tmp_path: Pat
 
 def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
     video = tmp_path / "seen.mp4"
-    seen = track([short_bag], VisionTrackerSettings(), overlay=video)
+    seen = track([short_bag], VisionTrackerSettings(), Scene(), overlay=video)
     assert [frame.track.state for frame in seen] == [State.SEARCHING] * 2 + [State.TRACKED] * 28
     row = seen[5].to_json()
     assert row["file"].startswith("/camera/image_raw/compressed ")
@@ -112,9 +113,9 @@ def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
 
 def test_an_overlay_video_has_the_rate_of_the_bag(tmp_path: Path, straight_pull: ReferenceTrajectory):
     record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "slow", duration=0.8, rate=7.0)
-    track([tmp_path / "slow"], VisionTrackerSettings(), overlay=tmp_path / "seen.mp4")
+    track([tmp_path / "slow"], VisionTrackerSettings(), Scene(), overlay=tmp_path / "seen.mp4")
     assert rate_of(tmp_path / "seen.mp4") == pytest.approx(7.0, abs=0.01)
-    track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), overlay=tmp_path / "pictures.mp4")
+    track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene(), overlay=tmp_path / "pictures.mp4")
     assert rate_of(tmp_path / "pictures.mp4") == pytest.approx(30.0)
 
 
@@ -142,7 +143,7 @@ def test_of_broken_frames_in_a_bag_the_json_says_null(
 
 
 def test_what_is_no_number_is_null_and_the_table_leaves_it_empty():
-    (frame,) = track([SAMPLES / "frame_00.png"], VisionTrackerSettings())
+    (frame,) = track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene())
     nothing = np.full(2, np.nan)
     broken = replace(
         frame.track,
@@ -175,7 +176,7 @@ def test_paths_without_frames_are_refused_in_one_line(
 
 def test_a_bag_among_pictures_is_refused(short_bag: Path):
     with pytest.raises(BagError, match="expected it alone"):
-        track([SAMPLES / "frame_00.png", short_bag], VisionTrackerSettings())
+        track([SAMPLES / "frame_00.png", short_bag], VisionTrackerSettings(), Scene())
 
 
 def test_what_of_the_view_is_given_is_taken():
@@ -244,7 +245,7 @@ def test_a_damaged_bag_is_said(tmp_path: Path):
     file = tmp_path / "bag" / "bag_0.mcap"
     file.write_bytes(file.read_bytes()[:-40])
     said: list[str] = []
-    track([file], VisionTrackerSettings(), say=said.append)
+    track([file], VisionTrackerSettings(), Scene(), say=said.append)
     assert any("is damaged" in line for line in said)
 
 

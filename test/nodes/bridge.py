@@ -8,6 +8,7 @@ import numpy as np
 from geometry_msgs.msg import TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from magnetosuture_msgs.msg import SafetyMargins
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import SetBool, Trigger
@@ -15,17 +16,28 @@ from std_srvs.srv import SetBool, Trigger
 from magnetosuture_thread.interface import ARM
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+from magnetosuture_thread.scene import read_scene
 
 EAST = np.array([1.0, 0.0])
 TAIL = np.array([-0.0035, 0.0])
+SCENE = "dish_35mm"
 LONG = {"command_timeout": 1.0, "pose_timeout": 1.0}  # one command and one pose last through a test
+READY = {"scene": SCENE, "prediction_timeout": 5.0}  # and so do the thread's margins
 
 
 def armed(graph, **parameters: Any) -> Any:
     """Return a bridge that passes commands."""
-    node = graph.add(CoilBridgeNode, autostart="armed", **parameters)
+    node = graph.add(CoilBridgeNode, autostart="armed", **{**READY, **parameters})
     graph.wait(lambda: node.station.latch.armed, "the bridge to be armed")
+    predict(graph)
     return node
+
+
+def predict(graph, slowdown: float = 1.0, version: str | None = None) -> None:
+    """Publish the thread's margins, of the bridge's scene unless another version is named."""
+    version = read_scene(SCENE).version if version is None else version
+    margins = SafetyMargins(header=messages.header(graph.now()), valid=True, slowdown=slowdown, scene_version=version)
+    graph.publish(topics.MARGINS, margins)
 
 
 def command(graph, x: float = 0.01, y: float = 0.0) -> TwistStamped:
@@ -34,7 +46,8 @@ def command(graph, x: float = 0.01, y: float = 0.0) -> TwistStamped:
 
 
 def drive(graph, x: float = 0.005, y: float = 0.0) -> TwistStamped:
-    """Say where the needle is, then ask for a velocity; return that command."""
+    """Say where needle and thread are, then command a velocity; return that command."""
+    predict(graph)
     graph.publish(topics.NEEDLE_POSE, messages.pose_message(graph.now(), TAIL, EAST))
     asked = command(graph, x, y)
     graph.publish(topics.NEEDLE_COMMAND, asked)

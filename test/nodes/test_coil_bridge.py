@@ -33,12 +33,12 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
     graph.wait(lambda: any(setpoint.twist.linear.x == full for setpoint in setpoints), "setpoint")
 
     def following() -> list[Any]:
-        return [state for state in states if state.armed and not state.reasons and state.reached.x == full]
+        return [state for state in states if state.armed and not state.reasons and state.applied.x == full]
 
-    graph.wait(following, "the state, with the velocity reached")
+    graph.wait(following, "the state, with the velocity applied")
     state = following()[-1]
     assert state.state == CoilBridgeState.STATE_ACTIVE
-    assert state.commanded.x == state.applied.x == 0.005
+    assert state.commanded.x == state.filtered.x == 0.005
     assert (state.driver, state.driver_ready) == ("recording", True)
 
 
@@ -174,8 +174,8 @@ def test_currents_stay_within_their_limit_and_saturation_is_said(graph):
     drive(graph, x=9.0)
     graph.wait(lambda: any(m.saturated for m in states), "saturation")
     assert max(np.abs(a).max() for a in applied(node)) <= 1.5
-    reached = next(m for m in states if m.saturated)
-    assert 0.0 < reached.reached.x < reached.applied.x
+    saturated = next(m for m in states if m.saturated)
+    assert 0.0 < saturated.applied.x < saturated.filtered.x
 
 
 def test_two_publishers_at_once_stop_the_needle(graph):

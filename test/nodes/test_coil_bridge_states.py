@@ -17,6 +17,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from test.nodes.bridge import (
     LONG,
+    READY,
     applied,
     arm,
     armed,
@@ -49,7 +50,7 @@ def test_its_state_is_logged_before_its_loop_runs(graph, capfd):
 
 
 def test_it_starts_active_but_disarmed_and_arming_lets_commands_pass(graph):
-    node = graph.add(CoilBridgeNode, **LONG)
+    node = graph.add(CoilBridgeNode, **LONG, **READY)
     states = graph.listen(topics.BRIDGE_STATE)
     drive(graph)
     graph.wait(lambda: reasons(states).startswith("disarmed"), "the reason")
@@ -91,7 +92,7 @@ def test_an_emergency_stop_is_latched_and_a_reset_leaves_it_disarmed(graph):
 
 @pytest.mark.parametrize("how_far", ["unconfigured", "inactive"])
 def test_inactive_passes_nothing(graph, how_far):
-    node = graph.add(CoilBridgeNode, autostart=how_far, **LONG)
+    node = graph.add(CoilBridgeNode, autostart=how_far, **LONG, **READY)
     states = graph.listen(topics.BRIDGE_STATE)
     assert stage(graph) == how_far
     drive(graph)
@@ -108,7 +109,7 @@ def test_inactive_passes_nothing(graph, how_far):
 
 
 def test_the_lifecycle_there_and_back(graph):
-    node = graph.add(CoilBridgeNode, autostart="unconfigured", **LONG)
+    node = graph.add(CoilBridgeNode, autostart="unconfigured", **LONG, **READY)
     assert change(graph, Transition.TRANSITION_CONFIGURE)
     assert change(graph, Transition.TRANSITION_ACTIVATE)
     assert arm(graph).success
@@ -148,7 +149,7 @@ def test_a_reset_never_arms_whatever_came_between(graph):
 
 
 def test_a_stop_calls_off_what_would_arm_by_itself(graph):
-    node = graph.add(CoilBridgeNode, driver="simulated", autostart="armed", **LONG)
+    node = graph.add(CoilBridgeNode, driver="simulated", autostart="armed", **LONG, **READY)
     assert press(graph, EMERGENCY_STOP).success
     graph.listen(topics.RIG_CURRENTS)
     graph.wait(lambda: node.station.driver.state().ready, "the rig to be found")

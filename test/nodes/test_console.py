@@ -35,6 +35,7 @@ from magnetosuture_thread.nodes.console_tap import ConsoleTap
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
+from test.nodes.margins import no_margins
 
 SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
@@ -141,7 +142,7 @@ def test_a_held_graph_is_told_nothing_but_a_stop(graph, console):
     console.held = "starting petri"
     assert act(console, "arm") == "starting petri"
     console.steer((0.003, 0.0))
-    assert console.state()["steering"]["reason"] == "starting petri"
+    assert console.state()["filter"]["reason"] == "starting petri"
     console.held = ""
     graph.wait(lambda: heard(0.002), "another wish")
     assert {wish.twist.linear.x for wish in wishes} == {0.001, 0.002}
@@ -157,7 +158,7 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     scene = scene_messages.scene_message(stamp, read_scene("dish_35mm_post"))
     pose = messages.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
     path = messages.PathMaker().message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
-    margins = thread_messages.invalid_margins(stamp, "no pose")
+    margins = no_margins(stamp, "no pose")
     tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
     tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["seen"], "the seen thread")

@@ -14,15 +14,16 @@ from geometry_msgs.msg import Point
 from magnetosuture_msgs.msg import (
     BarrierMargin,
     CoilBridgeState,
+    FilterState,
     PredictedThread,
     SafetyMargins,
-    SteeringState,
     TrackerState,
 )
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes import console_messages, messages, scene_messages, thread_messages
+from magnetosuture_thread.nodes import console_messages, messages, scene_messages
 from magnetosuture_thread.scene import read_scene
+from test.nodes.margins import no_margins
 from test.scene.scenes import every_shape
 
 STAMP = Time(sec=12)
@@ -94,7 +95,7 @@ def test_of_each_node_the_least_clearance_of_wall_and_shapes():
 
 
 def test_margins_that_are_not_valid_have_no_number():
-    told = plain(console_messages.margins(thread_messages.invalid_margins(STAMP, "no pose")))
+    told = plain(console_messages.margins(no_margins(STAMP, "no pose")))
     assert (told["valid"], told["reason"], told["clearance"], told["least"]) == (False, "no pose", [], {})
     assert told["friction"]["state"] == "unknown"
 
@@ -134,14 +135,17 @@ def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
     assert len(json.dumps(heard)) < 10_000  # 30 times a second, for every page
 
 
-def test_the_steering():
-    message = SteeringState(slowdown=0.9, held_off=True, reason="")
-    message.asked.x, message.passed.y = 0.005, 0.004
-    assert plain(console_messages.steering(message)) == {
-        "asked": [0.005, 0.0],
-        "passed": [0.0, 0.004],
+def test_the_filter_state():
+    message = FilterState(source="operator", slowdown=0.9, active=["friction", "ring"], overridden="needle", reason="")
+    message.commanded.x, message.filtered.y, message.applied.y = 0.005, 0.004, 0.003
+    assert plain(console_messages.filter_state(message)) == {
+        "source": "operator",
+        "commanded": [0.005, 0.0],
+        "filtered": [0.0, 0.004],
+        "applied": [0.0, 0.003],
         "slowdown": 0.9,
-        "held_off": True,
+        "active": ["friction", "ring"],
+        "overridden": "needle",
         "reason": "",
     }
 

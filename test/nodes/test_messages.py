@@ -127,7 +127,7 @@ def test_the_bags_and_the_graph_have_the_same_own_messages():
         topics.MARGINS,
         topics.CURRENTS,
         topics.BRIDGE_STATE,
-        topics.STEERING_STATE,
+        topics.FILTER_STATE,
         topics.TRACKER_STATE,
         *topics.SETTINGS,
     ):

@@ -23,7 +23,7 @@ from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 
 
 def test_every_setting_is_a_described_parameter(graph):
-    node = graph.add(ThreadModelNode, segments=30, length=0.02)
+    node = graph.add(ThreadModelNode, segments=30, thread_length=0.02)
     for about in described(ThreadModelSettings):
         descriptor = node.describe_parameter(about.name)
         assert descriptor.read_only == (about.name in FIXED)
@@ -31,12 +31,12 @@ def test_every_setting_is_a_described_parameter(graph):
         if about.quantity.unit:
             assert about.quantity.unit in descriptor.description
     assert node.get_parameter("segments").value == 30
-    assert node.get_parameter("length").value == 0.02
+    assert node.get_parameter("thread_length").value == 0.02
     assert node.get_parameter("material").value == "polyamide_7_0"
-    assert node.describe_parameter("length").floating_point_range[0].to_value == 2.0
+    assert node.describe_parameter("thread_length").floating_point_range[0].to_value == 2.0
     assert node.describe_parameter("segments").integer_range[0].from_value == 3
     # An empty list knows of what it is one.
-    assert node.describe_parameter("disc_obstacles").type == node.get_parameter("disc_obstacles").type_.value == 8
+    assert node.describe_parameter("gravity").type == node.get_parameter("gravity").type_.value == 8
     assert node.describe_parameter("held_nodes").type == node.get_parameter("held_nodes").type_.value == 7
 
 
@@ -45,9 +45,9 @@ def test_what_stays_for_good_is_read_only_and_says_why(graph):
     assert "compiled when it starts" in node.describe_parameter("formulation").additional_constraints
     assert not node.set_parameters([Parameter("formulation", value="paper")])[0].successful
     tracker = graph.add(VisionTrackerNode)
-    refused = tracker.set_parameters([Parameter("dish_diameter", value=0.05)])[0]
+    refused = tracker.set_parameters([Parameter("needle_length", value=0.01)])[0]
     assert not refused.successful
-    assert tracker.get_parameter("dish_diameter").value == 0.035
+    assert tracker.get_parameter("needle_length").value == 0.007
 
 
 @dataclass(frozen=True)
@@ -187,10 +187,10 @@ def test_other_nodes_can_ask_for_the_description(graph):
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"lenght": 0.02}, "thread_model.lenght: got 0.02, expected one of .*did you mean length"),
-        ({"length": 19.0}, r"thread_model\.length: got 19\.0, expected a number from 0\.001 to 2 m"),
-        ({"length": "19 mm"}, "thread_model.length: got '19 mm'"),
-        ({"disc_obstacles": [0.0, 0.1]}, "a multiple of 3 numbers"),
+        ({"thread_lenght": 0.02}, "thread_model.thread_lenght: got 0.02, expected one of .*did you mean thread_length"),
+        ({"thread_length": 19.0}, r"thread_model\.thread_length: got 19\.0, expected a number from 0\.001 to 2 m"),
+        ({"thread_length": "19 mm"}, "thread_model.thread_length: got '19 mm'"),
+        ({"gravity": [0.0, 0.1, 0.2]}, "a multiple of 2 numbers"),
         ({"material": "steel"}, "expected one of polyamide_7_0, silk_6_0"),
     ],
 )
@@ -200,6 +200,15 @@ def test_a_node_does_not_start_with_a_bad_parameter(graph, parameters, words):
 
 
 def test_whole_numbers_are_taken_for_real_ones(graph):
-    node = graph.add(ThreadModelNode, viscosity=2, disc_obstacles=[1, 0, 1])
+    node = graph.add(ThreadModelNode, viscosity=2, attachment_offset=[0, 0])
     assert node.get_parameter("viscosity").value == 2.0
-    assert list(node.get_parameter("disc_obstacles").value) == [1.0, 0.0, 1.0]
+    assert list(node.get_parameter("attachment_offset").value) == [0.0, 0.0]
+
+
+def test_what_nodes_share_and_this_one_does_not_know_is_left_aside(graph):
+    node = graph.add(VisionTrackerNode, viscosity=0.3, driver_timeout=0.5, needle_length=0.004)
+    assert node.get_parameter("needle_length").value == 0.004
+    assert not node.has_parameter("viscosity")
+    assert not node.has_parameter("driver_timeout")
+    with pytest.raises(ConfigurationError, match=r"vision_tracker\.viscositee: got 0\.3"):
+        graph.add(VisionTrackerNode, viscositee=0.3)

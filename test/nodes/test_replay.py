@@ -16,10 +16,11 @@ from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE
-from magnetosuture_thread.nodes import messages, replay, replay_time, thread_messages, topics
+from magnetosuture_thread.nodes import messages, replay, replay_time, topics
 from magnetosuture_thread.nodes.replay import LiveReplay
 from magnetosuture_thread.nodes.replay_losses import Losses
 from magnetosuture_thread.nodes.replay_time import Timeline
+from test.nodes.margins import no_margins
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pyte
     def answer(message: Any) -> None:
         asked.append(message)
         if len(asked) % 2:
-            margins.publish(thread_messages.invalid_margins(message.header.stamp, "for a test"))
+            margins.publish(no_margins(message.header.stamp, "for a test"))
 
     graph.probe.create_subscription(topics.NEEDLE_POSE.message, topics.NEEDLE_POSE.name, answer, 100)
     graph.probe.create_subscription(topics.CLOCK.message, topics.CLOCK.name, lambda message: None, 100)

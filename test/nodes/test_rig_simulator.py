@@ -19,7 +19,7 @@ from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.nodes.rig_time import RigTime
 
-SMALL = {"thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
+SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
 
 def currents(graph, *values: float) -> CoilCurrents:

@@ -15,7 +15,7 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import stamp_of
-from magnetosuture_thread.nodes.scene_follower import MAX_MESSAGE_BYTES, SceneFollower, received_scene
+from magnetosuture_thread.nodes.scene_follower import MAX_MESSAGE_BYTES, SceneFollower, initial_scene, received_scene
 from magnetosuture_thread.nodes.scene_messages import scene_message
 from magnetosuture_thread.scene import Scene, read_scene, shape_from_mapping, write_scene
 from test.scene.scenes import every_shape
@@ -31,7 +31,7 @@ class FollowerNode(Node):
         self.health = Health(self)
         self.changes: list[Scene] = []
         self.refusal: ConfigurationError | None = None
-        self.follower = SceneFollower(self, self.health, file, self.take)
+        self.follower = SceneFollower(self, self.health, initial_scene(file), self.take)
 
     def take(self, scene: Scene) -> None:
         """Take a scene, or refuse it."""

@@ -35,7 +35,7 @@ def states(diagnostics) -> list[str]:
 
 
 def test_a_frame_becomes_a_pose_and_a_centreline_with_its_stamp(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode, confirm_frames=1)
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, threads = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.SEEN_THREAD)
     stamp = graph.now()
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), stamp))
@@ -53,7 +53,7 @@ def test_a_frame_becomes_a_pose_and_a_centreline_with_its_stamp(graph, camera, t
 
 
 def test_every_frame_gets_a_state_and_a_pose_comes_once_three_agree(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode)
+    graph.add(VisionTrackerNode, scene="dish_35mm")
     poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
     image = frame(camera, thread_arc)
     for index in range(4):
@@ -76,7 +76,7 @@ def test_every_frame_gets_a_state_and_a_pose_comes_once_three_agree(graph, camer
 
 
 def test_of_frames_that_wait_only_the_newest_two_are_tracked(graph, camera, thread_arc, monkeypatch):
-    node = graph.add(VisionTrackerNode, confirm_frames=1)
+    node = graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     tracking = graph.listen(topics.TRACKER_STATE)
     begun, go = threading.Event(), threading.Event()
     look = node._session.on_image
@@ -97,7 +97,7 @@ def test_of_frames_that_wait_only_the_newest_two_are_tracked(graph, camera, thre
 
 
 def test_a_raw_image_is_taken_too(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode, image_transport="raw", confirm_frames=1)
+    graph.add(VisionTrackerNode, scene="dish_35mm", image_transport="raw", confirm_frames=1)
     poses = graph.listen(topics.NEEDLE_POSE)
     image = frame(camera, thread_arc)
     message = Image(height=480, width=640, step=1920, encoding="bgr8", data=image.tobytes())
@@ -107,7 +107,7 @@ def test_a_raw_image_is_taken_too(graph, camera, thread_arc):
 
 
 def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode, confirm_frames=1)
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
     tracking = graph.listen(topics.TRACKER_STATE)
     far = np.array([0.5, 0.5])
@@ -123,7 +123,7 @@ def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
 
 
 def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode, confirm_frames=1)
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
     tracking = graph.listen(topics.TRACKER_STATE)
     for count, data in enumerate((b"", b"no image", b"\xff\xd8\xff\xe0" + bytes(40)), 1):
@@ -139,7 +139,7 @@ def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_a
 
 
 def test_a_camera_that_falls_silent_is_noticed(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode, confirm_frames=1)
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))

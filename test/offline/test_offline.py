@@ -33,9 +33,9 @@ from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState
 from magnetosuture_thread.offline.messages import header, make, path_message, pose_message
-from magnetosuture_thread.offline.packing import packed_margins, packed_prediction
 from magnetosuture_thread.offline.predictions import predictions, sights
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
+from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
@@ -292,17 +292,19 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
     assert margins is not None
     store = typestore()
     for material in ("polyamide_7_0", "", "x", "xyz"):
-        data = packed_prediction(12 * 10**9 + 34, prediction, material)
+        data = packed_prediction((12, 34), prediction, material, scene_version=material)
         message: Any = store.deserialize_cdr(data, PREDICTED_THREAD.type_name)
         assert bytes(store.serialize_cdr(message, PREDICTED_THREAD.type_name)) == data
         assert (message.material, message.header.stamp.nanosec, message.step_time) == (material, 34, 0.0)
+        assert message.scene_version == material
         assert np.array_equal([[p.x, p.y] for p in message.vertices], prediction.vertices)
         assert np.array_equal(message.stretch, prediction.stretch)
     squeezed = Friction(FrictionState.PULLED, (2, 5, 6), 0.729)
     for given in (margins, replace(margins, touching=(3, 4)), replace(margins, friction=squeezed), None):
-        data = packed_margins(7, given, "" if given else "for a reason")
+        data = packed_margins((0, 7), given, "" if given else "for a reason", scene_version="abc")
         message = store.deserialize_cdr(data, MARGINS.type_name)
         assert bytes(store.serialize_cdr(message, MARGINS.type_name)) == data
+        assert message.scene_version == "abc"
         assert message.valid == (given is not None)
         assert message.contact_state == (0 if given is None else 2 if given.touching else 1)
         friction = given.friction if given else UNKNOWN

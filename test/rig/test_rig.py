@@ -8,15 +8,23 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 EASTWARDS = np.array([4.0, 0.0, -2.0, 0.0])
 
 
-def rig(**changes: Any) -> Rig:
-    """Return a rig whose needle points east, with a straight thread behind it."""
-    return Rig(RigSettings(**{"needle_start": (0.003, 0.0, 0.0), "thread_segments": 20, **changes}))
+def scene(*geometries: Disc | Polygon, diameter: float = 0.035, kind: str = "instrument") -> Scene:
+    """Return a dish with shapes of one kind."""
+    return Scene(Dish(diameter), tuple(SceneShape(f"shape_{n}", kind, one) for n, one in enumerate(geometries)))
+
+
+def rig(*geometries: Disc | Polygon, diameter: float = 0.035, **changes: Any) -> Rig:
+    """Return a rig whose needle points east, with a straight thread behind it, among shapes."""
+    settings = RigSettings(**{"needle_start": (0.003, 0.0, 0.0), "thread_segments": 20, **changes})
+    return Rig(settings, scene(*geometries, diameter=diameter))
 
 
 def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
@@ -43,7 +51,7 @@ def test_without_current_nothing_moves():
 
 
 def test_a_power_stage_that_hears_nothing_switches_off():
-    made = rig(coil_timeout=0.2)
+    made = rig(driver_timeout=0.2)
     made.apply(EASTWARDS, 0.0)
     made.advance(0.2)
     there = made.look(0.2).tail
@@ -53,7 +61,7 @@ def test_a_power_stage_that_hears_nothing_switches_off():
 
 
 def test_the_time_of_switching_off_does_not_depend_on_when_one_looks():
-    often, once = rig(coil_timeout=0.2), rig(coil_timeout=0.2)
+    often, once = rig(driver_timeout=0.2), rig(driver_timeout=0.2)
     for made in (often, once):
         made.apply(EASTWARDS, 0.0)
     for time in np.arange(0.01, 1.0, 0.01):
@@ -73,7 +81,7 @@ def test_a_stuck_coil_keeps_its_current_whatever_it_is_told():
 
 
 def test_a_stuck_coil_does_not_keep_the_others_on():
-    made = rig(faults=("coil_stuck 0.1 5.0",), coil_timeout=0.2)
+    made = rig(faults=("coil_stuck 0.1 5.0",), driver_timeout=0.2)
     made.apply(EASTWARDS, 0.0)
     made.advance(1.0)
     assert made.currents.tolist() == [4.0, 0.0, 0.0, 0.0]
@@ -126,20 +134,10 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
     [
         ({"needle_start": (0.0, 0.0)}, "a multiple of 3"),
         ({"needle_start": ()}, "x, y"),
-        ({"needle_start": (0.012, 0.0, 0.0)}, "a needle in the dish"),
-        ({"needle_start": (0.0, 0.0, 0.0)}, "a thread in the dish"),
-        ({"disc_obstacles": (-0.005, -0.004, 0.002)}, "a thread in the dish, off the obstacles"),
-        ({"polygon_obstacles": (0.005, -0.01, 0.007, -0.01, 0.006, 0.0), "polygon_sizes": (3,)}, "off the obstacles"),
         ({"needle_curvature": 500.0}, "a half circle"),
         ({"faults": ("sun 1 2",)}, "KIND START DURATION"),
         ({"faults": (3,)}, "a list of texts"),
-        ({"polygon_sizes": (3,)}, "corners of each outline, 0 in all"),
-        (
-            {"polygon_obstacles": (0.005, -0.01, 0.007, -0.01, 0.006, -0.008), "polygon_sizes": (-3,)},
-            "before its holes",
-        ),
-        ({"obstacle_looks": ("tissue",)}, "for each of 0 obstacles"),
-        ({"disc_obstacles": (0.01, 0.01, 0.001), "obstacle_looks": ("gold",)}, "one of silicone, tissue, hernia"),
+        ({"obstacle_looks": ("gold",)}, "one of silicone, tissue, hernia"),
         ({"thread_attachment": "sewn"}, "pinned, glued"),
         ({"viscosity": 0.0}, "from 0.0001"),
         ({"power_stage": "battery"}, "topic, roboclaw"),
@@ -152,12 +150,26 @@ def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], words: s
         RigSettings(**changes)
 
 
+@pytest.mark.parametrize(
+    ("shapes", "changes", "words"),
+    [
+        ((), {"needle_start": (0.012, 0.0, 0.0)}, "a needle in the dish, off the obstacles: it would be in wall"),
+        ((), {"needle_start": (0.0, 0.0, 0.0)}, "a thread in the dish, off the obstacles: it would be in wall"),
+        ((Disc((-0.005, 0.0), 0.002),), {}, "a thread in the dish, off the obstacles: it would be in shape_0"),
+        ((Disc((-0.00501, 0.0), 1e-6),), {}, "a thread in the dish"),  # between two points of the thread
+        ((Polygon(((0.005, -0.01), (0.007, -0.01), (0.006, 0.001))),), {}, "a needle in the dish, off the obstacles"),
+        ((), {"obstacle_looks": ("tissue",)}, "one for each of the scene's 0 shapes"),
+    ],
+)
+def test_a_start_or_looks_that_do_not_fit_the_scene_are_refused(
+    shapes: tuple[Disc | Polygon, ...], changes: dict[str, Any], words: str
+):
+    with pytest.raises(ConfigurationError, match=words):
+        rig(*shapes, **changes)
+
+
 def test_obstacles_are_drawn_and_felt():
-    made = rig(
-        disc_obstacles=(0.013, 0.0, 0.002),
-        polygon_obstacles=(-0.01, 0.005, 0.0, 0.005, -0.005, 0.01),
-        polygon_sizes=(3,),
-    )
+    made = rig(Disc((0.013, 0.0), 0.002), Polygon(((-0.01, 0.005), (0.0, 0.005), (-0.005, 0.01))))
     for time in np.arange(0.0, 3.0, 0.1):
         made.apply(EASTWARDS, float(time))
     frame = made.look(3.0)
@@ -170,21 +182,69 @@ def test_obstacles_are_drawn_and_felt():
     assert frame.image[inside[1], inside[0], 0] < plain[inside[1], inside[0], 0] - 15
 
 
-def square(half: float) -> tuple[float, ...]:
+def push(made: Rig, begin: float, end: float) -> np.ndarray:
+    """Push the needle east for a while; return its tip."""
+    for time in np.arange(begin, end, 0.1):
+        made.apply(EASTWARDS, float(time))
+    frame = made.look(end)
+    return np.asarray(frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)]))
+
+
+def test_another_scene_is_felt_seen_and_has_another_dish_from_then_on():
+    made = rig()
+    plain = made.look(0.0).image
+    made.set_scene(scene(Disc((0.0135, 0.0), 0.001), diameter=0.04))
+    assert push(made, 0.1, 3.0)[0] == pytest.approx(0.0125, abs=3e-4)  # 0.0175 m without the post
+    drawn = made.look(3.0).image
+    assert plain is not None
+    assert drawn is not None
+    u, v = made.camera.view.to_pixels(np.array([0.0135, 0.0])).round().astype(int)
+    assert drawn[v, u].sum() < plain[v, u].sum() - 15
+    assert made.camera.view.metres_per_pixel == pytest.approx(0.04 / (0.9115 * 480))
+    assert made.faults.lifted(0.0).tolist() == [0.0, 0.0]
+    made.set_scene(scene(diameter=0.04))
+    assert push(made, 3.1, 8.0)[0] > 0.0190
+
+
+def test_a_scene_in_which_needle_or_thread_would_be_in_something_is_refused_and_nothing_changes():
+    made = rig()
+    before, camera = made.scene, made.camera
+    for other, words in (
+        (scene(Disc((0.005, 0.0), 0.001)), "got shape_0 where the needle is"),
+        (scene(Disc((-0.01, 0.0005), 0.001)), "got shape_0 where the thread is"),
+        (scene(diameter=0.03), "got wall where the thread is"),
+        (scene(diameter=0.019), "got wall where the needle is"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            made.set_scene(other)
+        assert made.scene is before
+        assert made.camera is camera
+    assert push(made, 0.1, 1.0)[0] > 0.011
+
+
+def test_a_thread_around_a_post_does_not_keep_other_shapes_from_being_added():
+    """Chords of the thread cut the post's edge."""
+    post = Disc((-0.003, 0.0011), 0.001)
+    made = rig(post, thread_start_curvature=0.0)
+    made.set_scene(scene(post, Disc((0.0, 0.01), 0.001)))
+    assert made.scene.names == ("shape_0", "shape_1")
+
+
+def square(half: float) -> tuple[tuple[float, float], ...]:
     """Return the corners of a square around (0.013, 0)."""
-    return tuple(np.ravel([(0.013 + half * x, half * y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]).tolist())
+    return tuple((0.013 + half * x, half * y) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
 
 
 def test_a_hole_is_seen_and_nothing_gets_into_it():
-    obstacles = {"polygon_obstacles": square(0.002) + square(0.0012), "polygon_sizes": (4, -4)}
-    made = rig(**obstacles)
+    holed = Polygon(square(0.002), (square(0.0012),))
+    made = rig(holed)
     for time in np.arange(0.0, 3.0, 0.1):
         made.apply(EASTWARDS, float(time))
     frame = made.look(3.0)
     tip = frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)])
     assert tip[0] == pytest.approx(0.011, abs=3e-4)
-    solid = rig(polygon_obstacles=square(0.002), polygon_sizes=(4,)).look(0.0).image
-    plain, ring = rig().look(0.0).image, rig(**obstacles).look(0.0).image
+    solid = rig(Polygon(square(0.002))).look(0.0).image
+    plain, ring = rig().look(0.0).image, rig(holed).look(0.0).image
     assert plain is not None
     assert solid is not None
     assert ring is not None
@@ -197,22 +257,15 @@ def test_a_hole_is_seen_and_nothing_gets_into_it():
 
 
 def test_a_needle_does_not_start_in_a_hole():
-    corners = square(0.012)
+    holed = Polygon(square(0.012), (square(0.01),))
     with pytest.raises(ConfigurationError, match="off the obstacles"):
-        rig(
-            needle_start=(0.012, 0.0, 0.0),
-            needle_length=0.002,
-            thread_length=0.002,
-            dish_diameter=0.06,
-            polygon_obstacles=corners + square(0.01),
-            polygon_sizes=(4, -4),
-        )
+        rig(holed, needle_start=(0.012, 0.0, 0.0), needle_length=0.002, thread_length=0.002, diameter=0.06)
 
 
 def test_tissue_is_pink_and_a_hernia_darker_and_redder_but_neither_is_dark_to_the_tracker():
     """The tracker measures on green, and takes what has less than 0.55 of the floor's for a needle's steel."""
     kinds = ("silicone", "tissue", "hernia")
-    made = {look: rig(disc_obstacles=(0.0, 0.009, 0.002), obstacle_looks=(look,)) for look in kinds}
+    made = {look: rig(Disc((0.0, 0.009), 0.002), obstacle_looks=(look,)) for look in kinds}
     u, v = made["tissue"].camera.view.to_pixels(np.array([0.0002, 0.0087])).round().astype(int)
     seen = {}
     for look, one in made.items():
@@ -226,3 +279,13 @@ def test_tissue_is_pink_and_a_hernia_darker_and_redder_but_neither_is_dark_to_th
     assert redness["hernia"] > redness["tissue"] + 0.05 > floor[2] / floor[1] + 0.15
     assert seen["hernia"].sum() < seen["tissue"].sum() - 40.0
     assert min(bgr[1] for bgr in seen.values()) > 0.65 * floor[1]
+
+
+def test_what_a_shape_is_says_how_it_looks_where_nobody_says_otherwise():
+    settings = RigSettings(needle_start=(0.003, 0.0, 0.0))
+    tissue, post = (scene(Disc((0.0, 0.009), 0.002), kind=kind) for kind in ("tissue", "instrument"))
+    u, v = settings.view(post).to_pixels(np.array([0.0002, 0.0087])).round().astype(int)
+    behind = np.array([[0.0, 0.0], [-0.01, 0.0]])
+    images = [settings.camera(one).render(np.zeros(2), 0.0, behind) for one in (tissue, post)]
+    pink, pale = (image[v - 4 : v + 5, u - 4 : u + 5].reshape(-1, 3).mean(axis=0) for image in images)
+    assert pink[2] / pink[1] > pale[2] / pale[1] + 0.05

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.configuration import load_setup
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.parameter_files import load_setup
 from magnetosuture_thread.vision.calibration import CORNERS, calibrate_by_dish, calibrate_by_markers
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import Pose, render

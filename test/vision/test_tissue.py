@@ -30,18 +30,18 @@ def setup() -> Setup:
 @pytest.fixture(scope="module")
 def camera(setup: Setup) -> DishCamera:
     """Return the set-up's own camera, which shows the needle 33 pixels long."""
-    return setup.rig.camera()
+    return setup.rig.camera(setup.scene)
 
 
 @pytest.fixture(scope="module")
 def fine_camera(setup: Setup) -> DishCamera:
     """Return a camera that shows the needle 44 pixels long."""
-    return replace(setup.rig, camera_width=1280, camera_height=960).camera()
+    return replace(setup.rig, camera_width=1280, camera_height=960).camera(setup.scene)
 
 
 def assert_measured(setup: Setup, camera: DishCamera, tail: np.ndarray, heading: float, thread: np.ndarray) -> float:
     """Assert that one frame gives the needle's pose to 2 pixels and 3 degrees; return how far it is turned [rad]."""
-    seen = VisionTracker(setup.vision).look(camera.render(tail, heading, thread))
+    seen = VisionTracker(setup.vision, setup.scene).look(camera.render(tail, heading, thread))
     assert seen.state is State.TRACKED, seen.reason
     assert np.linalg.norm(seen.tail - tail) < 2.0 * camera.view.metres_per_pixel
     turned = (np.arctan2(seen.heading[1], seen.heading[0]) - heading + np.pi) % (2.0 * np.pi) - np.pi

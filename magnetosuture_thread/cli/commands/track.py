@@ -60,11 +60,13 @@ def run(options: argparse.Namespace) -> int:
 
     console = make_console()
     say = sayer(console)
-    settings = settings_with(read_setup(options.setup).vision, options.metres_per_pixel, options.centre)
+    setup = read_setup(options.setup)
+    settings = settings_with(setup.vision, options.metres_per_pixel, options.centre)
     with progress(console, "track") as advance:
         frames = track(
             options.frames,
             settings,
+            setup.scene,
             overlay=options.overlay,
             remap=dict(options.remap),
             say=say,

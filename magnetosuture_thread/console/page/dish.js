@@ -176,13 +176,13 @@ export class Dish {
   }
 
   #drawVelocities(graph, since, maxSpeed) {
-    const { steering } = graph;
+    const { filter } = graph;
     const points = this.needlePoints(graph);
-    if (!points || !steering || steering.age + since > STALE) return;
+    if (!points || !filter || filter.age + since > STALE) return;
     const tip = points[points.length - 1];
     const scale = (ARROW * this.diameter * this.placement.scale) / maxSpeed;
-    this.#arrow(tip, steering.asked, scale, 2, [6, 4]);
-    this.#arrow(tip, steering.passed, scale, 4.5, []);
+    this.#arrow(tip, filter.commanded, scale, 2, [6, 4]);
+    this.#arrow(tip, filter.filtered, scale, 4.5, []);
   }
 
   #arrow(from, velocity, scale, width, dash) {

@@ -19,10 +19,10 @@ export class Plots {
         { of: (s) => s.slowdown, colour: RESTING, label: "speed factor", dash: [4, 3] },
       ], 2, (s) => (isNumber(s.count) ? `${plural(s.count, "node")}, × ${s.slowdown.toFixed(2)}` : "no data")),
       plot("speed", [
-        { of: (s) => s.asked, colour: VELOCITY, label: "asked", dash: [5, 3] },
-        { of: (s) => s.passed, colour: VELOCITY, label: "passed" },
-        { of: (s) => s.reached, colour: FREE, label: "reached", dash: [1.5, 3] },
-      ], 2, (s) => figure(s.reached, 1, "mm/s")),
+        { of: (s) => s.commanded, colour: VELOCITY, label: "commanded", dash: [5, 3] },
+        { of: (s) => s.filtered, colour: VELOCITY, label: "filtered" },
+        { of: (s) => s.applied, colour: FREE, label: "applied", dash: [1.5, 3] },
+      ], 2, (s) => figure(s.applied, 1, "mm/s")),
       plot("currents", COILS.map((colour, coil) => ({ of: (s) => s.currents[coil], colour, label: `coil ${coil + 1}` })), 1,
         (s) => (s.currents.length ? `up to ${figure(Math.max(...s.currents.map(Math.abs)), 2, "A")}` : "no data")),
     ];
@@ -34,7 +34,7 @@ export class Plots {
     const last = this.samples[this.samples.length - 1];
     if (last && (time < last.time || time > last.time + SPAN)) this.samples = [];
     if (last && time === last.time) return;
-    const { margins, steering, bridge } = graph;
+    const { margins, filter, bridge } = graph;
     const least = leastClearance(margins);
     const milli = (value) => (isNumber(value) ? 1e3 * value : null);
     this.samples.push({
@@ -42,7 +42,7 @@ export class Plots {
       clearance: milli(least),
       count: margins?.valid ? margins.friction.nodes.length : null,
       slowdown: margins?.valid ? margins.friction.slowdown : null,
-      asked: milli(length(steering?.asked)), passed: milli(length(steering?.passed)), reached: milli(length(bridge?.reached)),
+      commanded: milli(length(filter?.commanded)), filtered: milli(length(filter?.filtered)), applied: milli(length(filter?.applied)),
       currents: bridge?.measured_current?.length ? bridge.measured_current : bridge?.current ?? [],
     });
     let old = 0;

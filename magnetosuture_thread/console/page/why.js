@@ -26,15 +26,13 @@ export function whyAtRest(view) {
   const tracker = graph.tracker;
   if (tracker && tracker.state !== "tracked") return verdict("error", `Needle ${tracker.state}${tracker.reason ? `: ${tracker.reason}` : ""}`, others(bridge, []));
   if (graph.needle && graph.needle.age + since > SILENT) return verdict("error", `No needle pose for ${seconds(graph.needle.age + since)}`, others(bridge, []));
-  const steering = graph.steering && graph.steering.age + since < SILENT ? graph.steering : null;
-  const reached = length(bridge.reached) ?? 0;
+  const filter = graph.filter && graph.filter.age + since < SILENT ? graph.filter : null;
+  const filtered = length(bridge.filtered) ?? 0;
   const applied = length(bridge.applied) ?? 0;
-  if (applied > MOVES) return moving(reached, bridge, steering, graph);
-  if (steering?.reason) return verdict("warn", `The needle rests: ${steering.reason}`, others(bridge, []));
-  if (steering && (length(steering.asked) ?? 0) > MOVES) {
-    const held = steering.held_off && (length(steering.passed) ?? 0) < MOVES;
-    if (held) return verdict("warn", "Held off: an obstacle is in the way", ["Steer another way."]);
-    return verdict("warn", "The needle rests", others(bridge, []));
+  if (filtered > MOVES) return moving(applied, bridge, filter, graph);
+  if (filter && (length(filter.commanded) ?? 0) > MOVES) {
+    const why = filter.reason || (filter.active.length ? `held by ${filter.active.join(", ")}` : "");
+    return verdict("warn", why ? `The needle rests: ${why}` : "The needle rests", others(bridge, [filter.reason]));
   }
   if (view.held) return verdict("warn", "A key is held, but nothing has come of it", others(bridge, []));
   if (lease && lease.holder === view.me) return verdict("rest", "Ready: nothing is held", ["Hold an arrow key, or drag from the needle."]);
@@ -42,17 +40,19 @@ export function whyAtRest(view) {
   return verdict("rest", `The needle rests: ${who.toLowerCase()}`, [view.commands ? "Take steering to move it." : "This page only watches: it was opened without the token."]);
 }
 
-function moving(reached, bridge, steering, graph) {
+function moving(applied, bridge, filter, graph) {
   const notes = [];
   const friction = graph.margins?.valid ? graph.margins.friction : null;
-  const slowdown = steering?.slowdown ?? 1;
+  const slowdown = filter?.slowdown ?? 1;
   if (isNumber(slowdown) && slowdown < 0.999) {
     const count = friction?.nodes.length ?? 0;
     notes.push(`Slowed to ${(100 * slowdown).toFixed(0)} % by friction${count ? ` at ${plural(count, "node")}` : ""}.`);
   }
-  if (steering?.held_off) notes.push("Turned aside by an obstacle.");
+  const limits = (filter?.active ?? []).filter((name) => name !== "friction");
+  if (limits.length) notes.push(`Limited by ${limits.join(", ")}.`);
+  if (filter?.overridden) notes.push(`Commands of the input ${filter.overridden} are overridden.`);
   if (bridge.saturated) notes.push("The coils are at their limit.");
-  return verdict(notes.length ? "warn" : "ok", `Moving at ${speedText(reached)}`, notes);
+  return verdict(notes.length ? "warn" : "ok", `Moving at ${speedText(applied)}`, notes);
 }
 
 const first = (list, otherwise) => list?.[0] ?? otherwise;

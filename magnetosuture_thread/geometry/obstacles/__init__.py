@@ -5,13 +5,14 @@ from __future__ import annotations
 from magnetosuture_thread.geometry.obstacles.closest import closest_on_triangles
 from magnetosuture_thread.geometry.obstacles.disc import Disc
 from magnetosuture_thread.geometry.obstacles.mesh import Mesh
-from magnetosuture_thread.geometry.obstacles.near import SurroundingsData, find_near
+from magnetosuture_thread.geometry.obstacles.near import WALL, SurroundingsData, find_near, wall_contact
 from magnetosuture_thread.geometry.obstacles.pack import Obstacle
 from magnetosuture_thread.geometry.obstacles.polygon import Polygon
 from magnetosuture_thread.geometry.obstacles.surroundings import Contacts, Surroundings
 from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
 
 __all__ = [
+    "WALL",
     "Contacts",
     "Disc",
     "Mesh",
@@ -23,4 +24,5 @@ __all__ = [
     "closest_on_triangles",
     "find_near",
     "triangulate",
+    "wall_contact",
 ]

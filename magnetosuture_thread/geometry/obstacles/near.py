@@ -14,6 +14,8 @@ from magnetosuture_thread.geometry.polyline import Points
 
 BALL, EDGES, FACES = range(3)
 """Kinds of obstacles."""
+WALL = -1
+"""Stands for the dish wall where contacts are numbered by obstacle."""
 
 
 class SurroundingsData(NamedTuple):
@@ -23,6 +25,7 @@ class SurroundingsData(NamedTuple):
 
     Attributes:
         reach: greatest distance of a contact [m].
+        wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
         frames: shape (o + 1, 6): low corner of the grid (3) [m], 1 / cell size [1/m], growth [m], 0; of a
             ball its centre (3) [m], 0, 0, its radius [m].
         tables: shape (o + 1, 8): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
@@ -34,6 +37,7 @@ class SurroundingsData(NamedTuple):
     """
 
     reach: float
+    wall_radius: float
     frames: NDArray[np.float64]
     tables: NDArray[np.int64]
     spokes: NDArray[np.int64]
@@ -112,6 +116,20 @@ def _ball(
 
 
 @compiled
+def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float]:
+    """Return the distance of a point from a round wall about the origin, positive inside, and its gradient.
+
+        sd(x) = R - |x|,    grad sd = -x / |x|
+
+    In space the wall is a cylinder along z. At its centre every direction is as good; there it is -x.
+    """
+    away = math.sqrt(x * x + y * y)
+    if away > 0.0:
+        return radius - away, -x / away, -y / away
+    return radius, -1.0, 0.0
+
+
+@compiled
 def _contacts(
     x: float,
     y: float,
@@ -167,7 +185,7 @@ def find_near(
         points: shape (m, d) [m].
         data: `Surroundings.data`.
         node: index of the point, shape (c,), c rows of room.
-        obstacle: index of the obstacle, shape (c,).
+        obstacle: index of the obstacle, `WALL` for the wall, shape (c,).
         distance: signed distance, shape (c,) [m].
         outward: gradient of the signed distance, shape (c, d).
         nearest: whether the row is the nearest of its point and obstacle, shape (c,).
@@ -176,9 +194,19 @@ def find_near(
         The number of contacts, or -1 when there are more than the arrays have room for.
     """
     count = 0
+    # Nearer to the centre than this, a point has no contact with the wall: most points pay for one comparison.
+    inner = data.wall_radius - data.reach
+    inner_square = inner * inner if inner > 0.0 else -1.0
     for i in range(len(points)):
         x, y = points[i, 0], points[i, 1]
         z = points[i, 2] if points.shape[1] == 3 else 0.0
+        if x * x + y * y > inner_square:
+            wall_distance, wall_x, wall_y = wall_contact(x, y, data.wall_radius)
+            before = count
+            count = put(count, count, wall_distance, wall_x, wall_y, 0.0, distance, outward)
+            if count < 0:
+                return -1
+            node[before], obstacle[before], nearest[before] = i, WALL, True
         cell = cell_of(x, y, z, 0, data)
         if cell < 0:
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -46,7 +47,7 @@ class _Tape:
         return np.concatenate([np.empty(0, kind), *self._parts]).astype(kind)
 
 
-def pack(shapes: Sequence[Obstacle], reach: float, dimension: int) -> SurroundingsData:
+def pack(shapes: Sequence[Obstacle], reach: float, dimension: int, wall_radius: float = math.inf) -> SurroundingsData:
     """Return all obstacles with their grids in flat arrays.
 
     Each obstacle has a grid of its own over its surroundings, so that its cells fit its features; a grid over
@@ -56,6 +57,7 @@ def pack(shapes: Sequence[Obstacle], reach: float, dimension: int) -> Surroundin
         shapes: the obstacles, all of this dimension.
         reach: greatest distance of a contact; at least TOUCHING is taken [m].
         dimension: 2 or 3.
+        wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
     """
     # A point on the boundary is found at reach 0 too, whichever way its distance is rounded.
     reach = max(reach, TOUCHING)
@@ -93,7 +95,13 @@ def pack(shapes: Sequence[Obstacle], reach: float, dimension: int) -> Surroundin
             _add_cells(index, *fill(over, low, high, np.empty((len(low), 0, dimension)))),
         ]
     data = SurroundingsData(
-        reach, frames, tables, spokes, np.asarray(numbers.array(np.float64)), np.asarray(index.array(np.int32))
+        reach,
+        float(wall_radius),
+        frames,
+        tables,
+        spokes,
+        np.asarray(numbers.array(np.float64)),
+        np.asarray(index.array(np.int32)),
     )
     for o in features:
         _mark_inside(o, data, data.entries, np.empty(0), np.empty((0, dimension)))

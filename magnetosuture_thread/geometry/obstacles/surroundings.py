@@ -22,12 +22,12 @@ _ROOM = 256  # contacts that `near` has room for at first
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Where points are near obstacles: k rows, in the order of nodes, then obstacles.
+    """Where points are near obstacles or the dish wall: k rows, in the order of nodes, then obstacles.
 
     Attributes:
         node: index of the point, shape (k,).
-        obstacle: index of the obstacle, shape (k,).
-        distance: signed distance, negative inside, shape (k,) [m].
+        obstacle: index of the obstacle, `WALL` for the dish wall, shape (k,).
+        distance: signed distance, negative inside of an obstacle and beyond the wall, shape (k,) [m].
         outward: gradient of the signed distance, unit vectors, shape (k, d).
         nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
     """
@@ -44,34 +44,41 @@ class Contacts:
 
 
 class Surroundings:
-    """Obstacles that do not move, and what of them is near.
+    """Obstacles that do not move and the round wall of the dish about the origin, and what of them is near.
 
     Args:
         shapes: the obstacles: discs, polygons (in the plane only) and meshes (in space only).
         reach: greatest distance at which a boundary is near, not negative [m].
         dimension: 2 or 3.
+        wall_radius: inner radius of the wall, in space a cylinder along z; inf without a wall [m].
 
     Attributes:
         shapes: the obstacles.
         reach: greatest distance at which a boundary is near [m].
         dimension: 2 or 3.
+        wall_radius: inner radius of the wall [m].
         data: the same for compiled code, see `find_near`.
 
     Raises:
         ConfigurationError: when a shape is not of this dimension, or a number is not in its bounds.
     """
 
-    def __init__(self, shapes: Sequence[Obstacle], reach: float, dimension: int = 2) -> None:
+    def __init__(
+        self, shapes: Sequence[Obstacle], reach: float, dimension: int = 2, wall_radius: float = math.inf
+    ) -> None:
         if dimension not in (2, 3):
             raise ConfigurationError("surroundings.dimension", dimension, "2 or 3")
         if not (math.isfinite(reach) and reach >= 0.0):
             raise ConfigurationError("surroundings.reach", reach, "a number of at least 0 m")
+        if not wall_radius > 0.0:
+            raise ConfigurationError("surroundings.wall_radius", wall_radius, "a number above 0 m, or inf")
         self.shapes = tuple(shapes)
         self.reach = float(reach)
         self.dimension = dimension
+        self.wall_radius = float(wall_radius)
         for i, shape in enumerate(self.shapes):
             _check(f"surroundings.shapes[{i}]", shape, dimension)
-        self.data = pack(self.shapes, self.reach, dimension)
+        self.data = pack(self.shapes, self.reach, dimension, self.wall_radius)
         self._room = _ROOM
 
     def near(self, points: Points) -> Contacts:
@@ -83,6 +90,8 @@ class Surroundings:
         within reach: one at a straight wall of many edges, two in a corner that reaches around it. A point
         inside has one row, the nearest, however deep it is. Exactly on the boundary the distance is 0 and
         the direction the normal. A point that is not a number has no row.
+
+        The wall has one row for each point within reach, and for each beyond it, before those of the obstacles.
 
         Args:
             points: shape (m, d) [m].

@@ -4,6 +4,7 @@ from magnetosuture_thread.model.barriers.connectivity import Compression, Connec
 from magnetosuture_thread.model.barriers.obstacle import ObstacleAvoidance, SquaredObstacleAvoidance
 from magnetosuture_thread.model.barriers.rows import NO_OBSTACLE, Barrier, BarrierKind, BarrierRows
 from magnetosuture_thread.model.barriers.stiffness import Stiffness
+from magnetosuture_thread.model.barriers.wall import WallAvoidance
 
 __all__ = [
     "NO_OBSTACLE",
@@ -16,4 +17,5 @@ __all__ = [
     "ObstacleAvoidance",
     "SquaredObstacleAvoidance",
     "Stiffness",
+    "WallAvoidance",
 ]

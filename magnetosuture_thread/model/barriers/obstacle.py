@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import WALL, Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers.rows import BarrierKind, BarrierRows
 
@@ -38,13 +38,14 @@ class ObstacleAvoidance:
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
         found = self.surroundings.near(positions)
-        value = found.distance[found.nearest] - self.distance
+        chosen = found.nearest & (found.obstacle != WALL)
+        value = found.distance[chosen] - self.distance
         return BarrierRows(
             kind=BarrierKind.OBSTACLE,
-            nodes=found.node[found.nearest][:, None],
-            obstacle=found.obstacle[found.nearest],
+            nodes=found.node[chosen][:, None],
+            obstacle=found.obstacle[chosen],
             value=value,
-            gradient=found.outward[found.nearest][:, None, :],
+            gradient=found.outward[chosen][:, None, :],
             clearance=value,
         )
 
@@ -72,16 +73,17 @@ class SquaredObstacleAvoidance:
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
         found = self.surroundings.near(positions)
-        signed = found.distance[found.nearest]
+        chosen = found.nearest & (found.obstacle != WALL)
+        signed = found.distance[chosen]
         value, slope = np.empty(len(signed)), np.empty(len(signed))
         for k in range(len(signed)):
             value[k], slope[k] = squared_barrier(signed[k], self.distance)
         return BarrierRows(
             kind=BarrierKind.OBSTACLE,
-            nodes=found.node[found.nearest][:, None],
-            obstacle=found.obstacle[found.nearest],
+            nodes=found.node[chosen][:, None],
+            obstacle=found.obstacle[chosen],
             value=value,
-            gradient=(slope[:, None] * found.outward[found.nearest])[:, None, :],
+            gradient=(slope[:, None] * found.outward[chosen])[:, None, :],
             clearance=signed - self.distance,
         )
 

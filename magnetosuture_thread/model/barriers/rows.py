@@ -27,6 +27,7 @@ class BarrierKind(IntEnum):
     OBSTACLE = 2
     ENHANCED_CONNECTIVITY = 3
     STIFFNESS = 4
+    WALL = 5
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@
                          grad h_enh,i' u >= -alpha h_enh,i - s_i       enhanced connectivity, W_con
                          grad V_i' u     <= -gamma V_i + s_i           stiffness, W_stiff
                          grad h_obs' u   >= -alpha h_obs               obstacles, hard
+                         grad h_wall' u  >= -alpha h_wall              the wall of the dish, hard
 
 in units of the segment length D, so that weights and gains mean the same for each thread; the paper leaves
 that open. v_i is the node's velocity over the last step. Where the lead moves first (`lead_ahead`), x_0 in
@@ -15,7 +16,8 @@ obstacle function is signed, see `SquaredObstacleAvoidance`, and where it is bel
 stands for it, with a compliance of 1e-7: its own gradient vanishes on the surface, and nodes that are inside
 of two obstacles at once could not obey two hard rows. What the paper leaves open, alpha, gamma,
 W_stiff of each material and the lead's order, is in `PaperOptions`; a gain is never taken higher than 1 / dt,
-where the discrete step would overshoot the barrier.
+where the discrete step would overshoot the barrier. The wall is new: what its rows leave outside, of second order
+in a node's way along it, is moved in to it along its normal; the dish is convex, so no two nodes get farther apart.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import Surroundings, SurroundingsData
+from magnetosuture_thread.geometry.obstacles import WALL, Surroundings, SurroundingsData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import (
     BarrierRows,
@@ -35,10 +37,12 @@ from magnetosuture_thread.model.barriers import (
     EnhancedConnectivity,
     ObstacleAvoidance,
     Stiffness,
+    WallAvoidance,
 )
 from magnetosuture_thread.model.barriers.connectivity import distance_barrier
 from magnetosuture_thread.model.barriers.obstacle import squared_barrier
 from magnetosuture_thread.model.barriers.stiffness import stiffness_function
+from magnetosuture_thread.model.barriers.wall import moved_inside
 from magnetosuture_thread.model.formulations.step import (
     DEPTH_REACHED,
     ROW_REACH,
@@ -86,7 +90,7 @@ class PaperFormulation:
 
     Args:
         thread: the thread; of its mechanics only the rest shape counts.
-        surroundings: obstacles [m]; their reach is that of the margins.
+        surroundings: obstacles and wall [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
         options: what the paper sets or leaves open.
@@ -106,7 +110,9 @@ class PaperFormulation:
         self.dimension = dimension
         self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
         self._options = options or PaperOptions()
-        self._near = Surroundings(surroundings.shapes, ROW_REACH * thread.segment_length, dimension)
+        reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
+        self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
+        self._room_radius = (wall_radius - 0.5 * thread.diameter) / thread.segment_length
         self._rest = rest_distances(thread.rest_turns)
         self._rows = 3 * thread.segments - 2
         self._memory = Memory.of(nodes, dimension, self._rows, 2 * nodes)
@@ -146,6 +152,7 @@ class PaperFormulation:
         self._memory.multipliers[:count] = solution.multipliers
         remember_push(self._memory.node, solution.multipliers[self._rows :], self._memory.push)
         end = moved + interval * solution.velocities
+        moved_inside(end, known, self._room_radius)
         after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
         # The hard barriers, h(x + dt u) >= (1 - alpha dt) h(x), where the obstacles themselves are.
         depth = self._depth(after.positions, known)
@@ -156,7 +163,7 @@ class PaperFormulation:
         return StepSolution(after, solution.solver, status, solution.residuals, 1, converged)
 
     def _depth(self, positions: Points, known: NDArray[np.bool_]) -> float:
-        """Return the greatest depth of a free node in an obstacle [m]."""
+        """Return the greatest depth of a free node in an obstacle or the wall [m]."""
         near = self._near.near(positions)
         clearance = near.distance[~known[near.node]] - 0.5 * self._thread.diameter
         return max(0.0, -float(clearance.min(initial=0.0)))
@@ -170,12 +177,13 @@ class PaperFormulation:
 
         Connectivity may give way, as the paper's has slack; what is left of it is what the margins say.
         """
-        unit = self._thread.segment_length
+        unit, radius = self._thread.segment_length, 0.5 * self._thread.diameter
         return [
             Connectivity(unit).rows(positions),
             EnhancedConnectivity(unit).rows(positions),
             Stiffness(unit * self._rest).rows(positions),
-            ObstacleAvoidance(self._surroundings, 0.5 * self._thread.diameter).rows(positions),
+            ObstacleAvoidance(self._surroundings, radius).rows(positions),
+            WallAvoidance(self._surroundings.wall_radius, radius, self._surroundings.reach).rows(positions),
         ]
 
 
@@ -219,7 +227,7 @@ def _assemble(
     contacts, depth = contact_rows(memory, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
     for r in range(rows, rows + contacts):
         clearance = memory.value[r]
-        if clearance > 0.0:
+        if clearance > 0.0 and memory.obstacle[r - rows] != WALL:
             # grad h' u >= -alpha h, divided by the slope: the row's own size does not matter, it is hard.
             value, slope = squared_barrier(clearance + radius / unit, radius / unit)
             memory.lower[r] = -gain * value / slope

@@ -2,7 +2,7 @@
 
     minimise over u   1/2 sum_i (a u_i - v_i)' Z_i (a u_i - v_i) / a  +  E_bend(x + dt u) / dt
     subject to        |x_i - x_{i-1}| = the chord of a segment  (connectivity and compression together)
-                      h_obs >= 0                                (obstacles, hard)
+                      h_obs >= 0,  h_wall >= 0                  (obstacles and the wall of the dish, hard)
 
 in units of the segment length D and of the drag (or mass / dt + drag) of one segment. The driven nodes,
 the needle's tail among them, have moved before the step and are no unknowns.
@@ -33,7 +33,8 @@ from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
-from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance
+from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance, WallAvoidance
+from magnetosuture_thread.model.barriers.wall import moved_inside
 from magnetosuture_thread.model.formulations.rod_program import Rod
 from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, go_on, take
 from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState
@@ -50,7 +51,7 @@ class RodFormulation:
 
     Args:
         thread: the thread.
-        surroundings: obstacles [m]; their reach is that of the margins.
+        surroundings: obstacles and wall [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
 
@@ -64,7 +65,9 @@ class RodFormulation:
         nodes, dimension = thread.segments + 1, surroundings.dimension
         self.dimension = dimension
         self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
-        self._near = Surroundings(surroundings.shapes, ROW_REACH * thread.segment_length, dimension)
+        reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
+        self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
+        self._room_radius = (wall_radius - 0.5 * thread.diameter) / thread.segment_length
         medium, glued = thread.medium, thread.attachment is Attachment.GLUED
         if len(medium.gravity) not in (0, dimension):
             raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
@@ -133,6 +136,8 @@ class RodFormulation:
             worst, solves = worst.or_worse(solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
+        if off > 1.0:
+            moved_inside(motion.about, motion.known, self._room_radius)  # whatever else holds: nothing passes the wall
         end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
@@ -152,10 +157,12 @@ class RodFormulation:
 
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
         """Return every barrier; see `Formulation`."""
+        radius = 0.5 * self._thread.diameter
         return [
             Connectivity(self._thread.segment_length).rows(positions),
             Compression(self.rest_lengths(positions, heading)).rows(positions),
-            ObstacleAvoidance(self._surroundings, 0.5 * self._thread.diameter).rows(positions),
+            ObstacleAvoidance(self._surroundings, radius).rows(positions),
+            WallAvoidance(self._surroundings.wall_radius, radius, self._surroundings.reach).rows(positions),
         ]
 
 

@@ -14,8 +14,8 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Vector
 
-ROW_REACH = 1.0  # segments; obstacles farther from a node than this have no row in the program
-DEPTH_REACHED = 1e-7  # m; a node deeper in an obstacle than is asked for is not where its barrier holds
+ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
+DEPTH_REACHED = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
 PUSHING_OUT = 1e-7  # compliance of a contact that has to push a node out
 
 
@@ -216,10 +216,12 @@ def contact_rows(
 ) -> tuple[int, float]:
     """Write the rows  n' u >= (-h(y) - n' (x - y)) / dt  of the contacts near y, with h = sd(y) - rho.
 
+    In the end their nodes and obstacles, `WALL` among them, are the first of the memory's.
+
     Args:
         memory: written, from a row on.
         row: the first of these rows.
-        surroundings: obstacles [m].
+        surroundings: obstacles and wall [m].
         about: y, shape (n + 1, d) [D].
         start: x, shape (n + 1, d) [D].
         known: nodes that have no rows, as nothing can push them, shape (n + 1,).
@@ -255,7 +257,7 @@ def contact_rows(
         # A node that has to be pushed out may be held in by something else: then as far as it goes.
         memory.compliance[here] = PUSHING_OUT if bound > 0.0 else 0.0
         memory.multipliers[here] = memory.push[i]
-        memory.node[kept] = i
+        memory.node[kept], memory.obstacle[kept] = i, memory.obstacle[c]
         kept += 1
     return kept, depth
 

@@ -35,6 +35,9 @@ LOOKS = {
 }
 
 
+LOOK_OF_KIND = {"tissue": "tissue", "instrument": "silicone", "wall": "silicone"}  # of a scene's shapes
+
+
 @dataclass(frozen=True)
 class Scene:
     """The things before the camera, all in the dish frame [m].

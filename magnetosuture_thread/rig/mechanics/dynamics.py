@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.polyline import Points, chain_along
-from magnetosuture_thread.rig.mechanics.contact import Surface
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
 from magnetosuture_thread.rig.mechanics.field import CoilField
 from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody
 from magnetosuture_thread.rig.mechanics.newton import advance, make_memory
@@ -84,6 +84,7 @@ class RigDynamics:
         self._q[1:3] = start
         self._before, self._last_dt = self._q.copy(), 0.0
         self._largest_step = largest_step
+        self._skin = surface.skin
         self._shapes = surface.packed()
         self._rod = Rod(
             length,
@@ -104,7 +105,7 @@ class RigDynamics:
             0.5 * needle.diameter + surface.skin,
             (glue, 0.5 * thread.rest_curvature * length**2),
         )
-        self._memory = make_memory(thread.segments, len(self._shapes.discs) + len(self._shapes.corners) + 2)
+        self._memory = make_memory(thread.segments, _contacts(self._shapes))
         self._poles = np.zeros((2, 3))
         self._move, self._held = 0.0, np.zeros(0)
         self.time, self.residual, self.converged = 0.0, 0.0, True
@@ -124,6 +125,11 @@ class RigDynamics:
     def tip(self) -> NDArray[np.float64]:
         """The needle's tip, shape (2,) [m]."""
         return self._tip_of(self._q)
+
+    @property
+    def body(self) -> Points:
+        """Points along the needle's axis, from the tail to the tip, shape (m, 2) [m]."""
+        return np.array([self._q[1:3] + self._turned(self._q, point) for point in self._needle.outline])
 
     @property
     def thread(self) -> Points:
@@ -147,6 +153,20 @@ class RigDynamics:
         bend = rod.bending / rod.segment * float(np.sum(1.0 - np.cos(turns)))
         gap = edges[0] + self._turned(self._q, np.array([rod.segment, self._needle.clamp[1]]))
         return stretch + bend + self._needle.clamp[0] * float(gap @ gap)
+
+    def set_surface(self, surface: Surface) -> None:
+        """Touch other things from now on; needle and thread must be outside of them.
+
+        Raises:
+            ConfigurationError: the surface is not one.
+        """
+        if surface.skin != self._skin:
+            raise ConfigurationError("surface.skin", surface.skin, f"{self._skin:g} m, as before")
+        shapes = surface.packed()
+        self._memory = make_memory(self.properties.segments, _contacts(shapes))
+        self._shapes = shapes
+        # The last two states may be farther apart than a step that touches something can follow.
+        self._before, self._last_dt = self._q.copy(), 0.0
 
     def step(self, currents: ArrayLike, dt: float) -> None:
         """Move on under coil currents, which are held.
@@ -243,6 +263,11 @@ class RigDynamics:
     def _turned(q: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
         c, s = math.cos(q[0]), math.sin(q[0])
         return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def _contacts(shapes: Shapes) -> int:
+    """Return with how many things one point can have to do at once at the most."""
+    return len(shapes.discs) + len(shapes.corners) + 2
 
 
 def _finite(name: str, given: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:

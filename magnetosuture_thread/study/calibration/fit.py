@@ -119,7 +119,7 @@ class Objective:
         settings = [self.settings(x) for x in points]
         found = self._replays.of(settings, self.which)
         passages = [self._replays.passages[index] for index in self.which]
-        length = self.base.length
+        length = self.base.thread_length
         return [[self._distance(v, p, length) for v, p in zip(vertices, passages, strict=True)] for vertices in found]
 
     def fit(self, start: Array | None = None, scale: float = np.inf) -> Solution:
@@ -191,7 +191,7 @@ class Objective:
         settings = self.settings(x)
         passages = [self._replays.passages[index] for index in self.which]
         pairs = zip(self._replays.of([settings], self.which)[0], passages, strict=True)
-        return float(np.mean([mean_error(errors(v, p.targets, settings.length)) for v, p in pairs]))
+        return float(np.mean([mean_error(errors(v, p.targets, settings.thread_length)) for v, p in pairs]))
 
     def _solution(self, x: Array, cost: float, scale: float) -> Solution:
         return Solution(self.settings(x), self.parameters, x, self.residuals(x), self.jacobian(x), scale, cost)

@@ -108,7 +108,7 @@ def _reason(solution: Solution, index: int, effect: float, half: float) -> str:
 
 def _too_short(solution: Solution, index: int, passages: Sequence[Passage]) -> str:
     """Return in words that the stiffness acts on too small a part of the thread; empty if it does not."""
-    parameter, length = solution.parameters[index], solution.settings.length
+    parameter, length = solution.parameters[index], solution.settings.thread_length
     speed = min(passage.speed for passage in passages)
     if parameter is not STIFFNESS_OVER_DRAG or speed <= 0.0:
         return ""

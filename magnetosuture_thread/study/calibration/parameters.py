@@ -111,7 +111,7 @@ def _stiffness_bounds(settings: Settings) -> tuple[float, float]:
 
 
 def _curvature_bounds(settings: Settings) -> tuple[float, float]:
-    most = min(2000.0, 0.99 * SHARPEST_TURN * settings.segments / settings.length)
+    most = min(2000.0, 0.99 * SHARPEST_TURN * settings.segments / settings.thread_length)
     return -most, most
 
 
@@ -125,11 +125,11 @@ def _offset(index: int, name: str) -> Parameter:
         return replace(settings, attachment_offset=tuple(both) if any(both) else ())
 
     def bounds(settings: Settings) -> tuple[float, float]:
-        most = min(0.01, OFFSET_MOST * settings.length)
+        most = min(0.01, OFFSET_MOST * settings.thread_length)
         return -most, most
 
     def counts(settings: Settings) -> float:
-        return OFFSET_COUNTS * settings.length
+        return OFFSET_COUNTS * settings.thread_length
 
     return Parameter(f"offset {name}", OFFSET, "m", "plain", read, write, bounds, counts, counts)
 
@@ -176,8 +176,8 @@ REST_CURVATURE = Parameter(
     _plain("rest_curvature"),
     _replaced("rest_curvature"),
     _curvature_bounds,
-    lambda settings: 1.0 / settings.length,  # by which the thread turns by one radian on its whole length
-    lambda settings: 1.0 / settings.length,
+    lambda settings: 1.0 / settings.thread_length,  # by which the thread turns by one radian on its whole length
+    lambda settings: 1.0 / settings.thread_length,
 )
 DAMPING = Parameter(
     "kappa",

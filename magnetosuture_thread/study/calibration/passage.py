@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.study.score import LEAST_SEEN
 from magnetosuture_thread.study.sight import Sight
 
@@ -47,6 +48,7 @@ class Passage:
         truths: the same of the truth, if the bag says it; else not a number.
         against: what the targets are, `seen` or `truth`.
         simulated: what of it is simulated; empty if nothing says so.
+        scene: that the thread moves in; None if it is not known.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Passage:
     truths: Points
     against: str = "seen"
     simulated: str = ""
+    scene: Scene | None = None
 
     @property
     def known(self) -> Flags:
@@ -99,7 +102,12 @@ class _Run:
 
 
 def passage_of(
-    name: str, sights: Iterable[Sight], settings: ThreadModelSettings, against: str = "seen", simulated: str = ""
+    name: str,
+    sights: Iterable[Sight],
+    settings: ThreadModelSettings,
+    against: str = "seen",
+    simulated: str = "",
+    scene: Scene | None = None,
 ) -> Passage:
     """Return what one bag's sights say, as arrays.
 
@@ -109,6 +117,7 @@ def passage_of(
         settings: the thread's length and number of nodes.
         against: what the prediction is to be compared with, `seen` or `truth`.
         simulated: what of it is simulated.
+        scene: that the thread moves in.
 
     Raises:
         BagError: there is no needle, no thread, no truth where it is asked for, too little of them, or nothing moves.
@@ -137,8 +146,9 @@ def passage_of(
         np.array([truth for _, _, truth in kept]),
         against,
         simulated,
+        scene,
     )
-    _check_motion(passage, settings.length)
+    _check_motion(passage, settings.thread_length)
     return passage
 
 
@@ -193,7 +203,7 @@ def _share_known(curve: Points) -> float:
 
 def at_nodes(curve: Points, settings: ThreadModelSettings) -> Points:
     """Return X(s_i) at s_i = i L / n for i = 1 ... n, shape (n, 2); not a number past the curve's end."""
-    at = settings.length * np.arange(1, settings.segments + 1) / settings.segments
+    at = settings.thread_length * np.arange(1, settings.segments + 1) / settings.segments
     if len(curve) < 2 or not np.isfinite(curve).all():
         return np.full((len(at), 2), np.nan)
     points = points_at(curve, at)

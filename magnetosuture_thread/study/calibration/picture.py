@@ -73,7 +73,7 @@ def _draw_scene(axes: Axes, calibration: Calibration, course: Course) -> None:
     passage = course.passage
     whole = np.flatnonzero(passage.known.mean(axis=1) >= np.quantile(passage.known.mean(axis=1), 0.5))
     chosen = whole[np.linspace(0, len(whole) - 1, min(INSTANTS, len(whole))).astype(int)]
-    for shape in calibration.settings.obstacles():
+    for shape in passage.scene.obstacles if passage.scene is not None else ():
         if isinstance(shape, Disc):
             centre, radius = (1e3 * shape.centre[0], 1e3 * shape.centre[1]), 1e3 * shape.radius
             axes.add_patch(Circle(centre, radius, facecolor=OBSTACLE, edgecolor=INK, linewidth=0.8))
@@ -90,7 +90,7 @@ def _draw_scene(axes: Axes, calibration: Calibration, course: Course) -> None:
         axes.plot(before[:, 0], before[:, 1], color=INK, linewidth=0.9, linestyle=(0, (4, 2)), label=labels[1])
         axes.plot(after[:, 0], after[:, 1], color=AFTER, linewidth=1.4, label=labels[2])
         axes.plot(1e3 * tail[0], 1e3 * tail[1], "o", color=INK, markersize=4)
-        if all(float(np.linalg.norm(tail - other)) > CLOSE * calibration.settings.length for other in labelled):
+        if all(float(np.linalg.norm(tail - other)) > CLOSE * calibration.settings.thread_length for other in labelled):
             labelled.append(tail)
             text = f"{passage.times[k]:.0f} s"
             axes.annotate(text, 1e3 * tail, xytext=(5, 4), textcoords="offset points", fontsize=8, color=INK)
@@ -108,7 +108,7 @@ def _draw_scene(axes: Axes, calibration: Calibration, course: Course) -> None:
 
 def _draw_time(axes: Axes, calibration: Calibration, courses: Sequence[Course]) -> None:
     """Draw the prediction error over time, one bag after the other."""
-    length, begin = calibration.settings.length, 0.0
+    length, begin = calibration.settings.thread_length, 0.0
     lowest, highest = np.inf, 0.0
     for index, course in enumerate(courses):
         times = begin + course.passage.times
@@ -133,7 +133,7 @@ def _draw_time(axes: Axes, calibration: Calibration, courses: Sequence[Course]) 
 
 def _draw_along(axes: Axes, calibration: Calibration, courses: Sequence[Course]) -> None:
     """Draw the distance across the thread from needle to end, mean over all bags and frames."""
-    length = calibration.settings.length
+    length = calibration.settings.thread_length
     lowest, highest = np.inf, 0.0
     for kind, colour in (("before", BEFORE), ("after", AFTER)):
         total, count = 0.0, 0

@@ -33,7 +33,7 @@ def replay(passage: Passage, settings: ThreadModelSettings) -> Points:
     slots = {int(frame): slot for slot, frame in enumerate(passage.frames)}
     stamps = passage.stamps.tolist()
     for leg, end, initial in zip(passage.legs, [*passage.legs[1:], len(stamps)], passage.initials, strict=True):
-        session, last = ThreadSession(settings), nothing
+        session, last = ThreadSession(settings, passage.scene), nothing
         for _ in session.on_seen(stamps[leg], initial):
             pass
         for index in range(leg, end):
@@ -166,7 +166,7 @@ class Replays:
             for settings, vertices in zip(many, result, strict=True):
                 if settings not in self._errors:
                     pairs = zip(vertices, self.passages, strict=True)
-                    means = [mean_error(errors(v, passage.targets, settings.length)) for v, passage in pairs]
+                    means = [mean_error(errors(v, passage.targets, settings.thread_length)) for v, passage in pairs]
                     self._errors[settings] = float(np.mean(means))
                     self.best.offer(settings, self._errors[settings], vertices)
         self._told(len(missing))

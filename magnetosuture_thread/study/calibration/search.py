@@ -84,7 +84,8 @@ def calibrate(
         raise ConfigurationError("thread_model.medium", settings.medium, "liquid: what is fitted is bending over drag")
     replays = Replays(passages, run, best)
     stages = Stages(replays.best, progress, say)
-    ThreadSession(settings)  # which says what is wrong with the obstacles, if anything is
+    for scene in dict.fromkeys(passage.scene for passage in passages):
+        ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
     replays.tell(stages.told)
     return _Search(replays, settings, parameters, both, stages).go()
 
@@ -108,7 +109,7 @@ def unfinished(
     if found.attachment != settings.attachment:
         attachment = AttachmentVerdict(found.attachment, settings.attachment, {}, looked=False)
     courses = [Course(*parts) for parts in zip(passages, best.first, best.vertices, strict=True)]
-    scores, simulated = scores_of(courses, settings.length), tuple(passage.simulated for passage in passages)
+    scores, simulated = scores_of(courses, settings.thread_length), tuple(passage.simulated for passage in passages)
     against = passages[0].against
     done = Calibration(found, settings, against, estimates, attachment, scores, simulated, best.replays, finished=False)
     return done, courses
@@ -151,7 +152,7 @@ class _Search:
                 for index, (verdict, status) in enumerate(zip(verdicts, statuses, strict=True))
             ),
             attachment,
-            scores_of(courses, self.start.length, held_out),
+            scores_of(courses, self.start.thread_length, held_out),
             tuple(passage.simulated for passage in passages),
             self.replays.best.replays,
         )
@@ -225,7 +226,7 @@ class _Search:
     def _error(self, settings: ThreadModelSettings) -> float:
         """Return the mean distance across the thread [% of length]."""
         pairs = zip(self.replays.of([settings])[0], self.replays.passages, strict=True)
-        return float(np.mean([100.0 * np.abs(across(v, p, settings.length))[p.known].mean() for v, p in pairs]))
+        return float(np.mean([100.0 * np.abs(across(v, p, settings.thread_length))[p.known].mean() for v, p in pairs]))
 
     def _held_out(self, settings: ThreadModelSettings, fitted: Sequence[Parameter], scale: float, index: int) -> Points:
         """Return what is predicted of a passage by a fit to the others."""

@@ -12,7 +12,7 @@ from magnetosuture_thread.study.calibration.result import FIXED, IDENTIFIED, Cal
 
 WIDTH = 118
 # Of the thread and its liquid, what gives the fitted numbers their meaning; with 0 the material's diameter counts.
-GIVEN = ("material", "diameter", "length", "segments", "viscosity", "wetted_fraction")
+GIVEN = ("material", "diameter", "thread_length", "segments", "viscosity", "wetted_fraction")
 UNITS = {"elastic_modulus": "Pa", "rest_curvature": "1/m", OFFSET: "m, along and left"}
 STIFFNESS = (
     "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
@@ -23,7 +23,7 @@ STIFFNESS = (
 
 def to_yaml(calibration: Calibration) -> str:
     """Return the text of the file, the same for the same calibration."""
-    lines = [*_header(calibration), "thread_model:", "  ros__parameters:"]
+    lines = [*_header(calibration), "/**/thread_model:", "  ros__parameters:"]
     settings = calibration.settings
     if settings.formulation != "rod":
         lines.append(f"    formulation: {settings.formulation}")

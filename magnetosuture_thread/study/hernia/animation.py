@@ -16,13 +16,12 @@ FASTER = 6  # than it happened
 PICTURES = 8  # a second
 
 
-def draw_animation(path: Path, run: HerniaRun, dish_diameter: float) -> None:
+def draw_animation(path: Path, run: HerniaRun) -> None:
     """Draw the run, faster than it happened, and write it as GIF.
 
     Args:
         path: of the file.
         run: what to draw.
-        dish_diameter: [m]
     """
     figure = Figure(figsize=(4.6, 5.0), dpi=96, facecolor="white")
     count = math.floor(run.instants[-1].time / FASTER * PICTURES) + 1
@@ -32,7 +31,7 @@ def draw_animation(path: Path, run: HerniaRun, dish_diameter: float) -> None:
             instant = run.nearest(k * FASTER / PICTURES)
             figure.clear()
             axes = figure.add_axes((0.0, 0.0, 1.0, 0.9))
-            draw_dish(axes, run.settings.obstacles(), dish_diameter)
+            draw_dish(axes, run.scene)
             draw_thread(axes, instant)
             figure.text(0.03, 0.955, caption(instant), fontsize=10.5, color=INK)
             words = f"{instant.time:.0f} s, shown {FASTER} times as fast; simulated, the thread model alone"

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.model.friction import Friction, FrictionState, friction_colour
 from magnetosuture_thread.study.hernia.run import HerniaRun
 from magnetosuture_thread.study.hernia.scene import INK, caption, draw_dish, draw_thread
@@ -19,15 +18,13 @@ NODE_COLOURS = ("#0b3c5d", "#1f77b4", "#2a9d8f", "#8ab17d", "#e9a03b")
 TOP = 6.0e-3  # m; barriers beyond are not drawn
 
 
-def draw_hernia(path: Path, run: HerniaRun, dish_diameter: float) -> None:
+def draw_hernia(path: Path, run: HerniaRun) -> None:
     """Draw the picture and write it as PNG.
 
     Args:
         path: of the picture.
         run: what to draw.
-        dish_diameter: [m]
     """
-    obstacles = run.settings.obstacles()
     figure = Figure(figsize=(13.2, 13.2), dpi=100, facecolor="white")
     figure.text(0.03, 0.975, "A needle steered by hand around a hernia, simulated", fontsize=14, color=INK)
     figure.text(
@@ -42,20 +39,14 @@ def draw_hernia(path: Path, run: HerniaRun, dish_diameter: float) -> None:
     for index, instant in enumerate(run.shown):
         column, row = index % 3, index // 3
         axes = figure.add_axes((0.02 + 0.325 * column, 0.618 - 0.315 * row, 0.31, 0.295))
-        draw_dish(axes, obstacles, dish_diameter)
+        draw_dish(axes, run.scene)
         draw_thread(axes, instant)
         axes.set_title(f"{instant.time:.0f} s: {caption(instant)}", fontsize=10, color=INK, pad=2)
-    for index, obstacle in enumerate(obstacles):
+    for index, shape in enumerate(run.scene.shapes):
         axes = figure.add_axes((0.045 + 0.325 * index, 0.15, 0.275, 0.125))
-        _draw_barriers(axes, run, index, _name(index, obstacle), times)
+        _draw_barriers(axes, run, index, shape.name.replace("_", " "), times)
     _draw_friction(figure.add_axes((0.045, 0.04, 0.925, 0.07)), run, times)
     figure.savefig(path)
-
-
-def _name(index: int, obstacle: Disc | Polygon) -> str:
-    if isinstance(obstacle, Polygon) and obstacle.holes:
-        return "the ring"
-    return f"obstacle {index}, tissue"
 
 
 def _draw_key(figure: Figure) -> None:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.safety import NeedleSafetyFilter
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.study.hernia.steered import SteeredInstant, SteeredThread
 
 RATE = 33.0  # Hz, of the paper's simulation
@@ -96,13 +98,15 @@ class HerniaRun:
     """A whole run.
 
     Attributes:
-        settings: of thread and obstacles.
+        settings: of the thread.
+        scene: dish and shapes.
         instants: one a step, by time; the first is the start.
         barriers: h_obs of the first nodes, shape (steps + 1, nodes, obstacles) [m].
         chord_depths: how deep the middles of chords are at each step, negative outside, shape (steps + 1,) [m].
     """
 
     settings: ThreadModelSettings
+    scene: Scene
     instants: Sequence[SteeredInstant]
     barriers: NDArray[np.float64]
     chord_depths: NDArray[np.float64]
@@ -145,10 +149,22 @@ class HerniaRun:
         )
 
 
+def point_filter(scene: Scene, keep_out: float, approach_rate: float) -> NeedleSafetyFilter:
+    """Return the filter of a needle that is a point and gets a new command in every step.
+
+    Args:
+        scene: dish and shapes.
+        keep_out: least distance of the needle from wall and shapes [m].
+        approach_rate: share of that distance by which it may approach [1/s].
+    """
+    return NeedleSafetyFilter(scene, keep_out=keep_out, approach_rate=approach_rate, hold_time=1.0 / RATE)
+
+
 def replay_steering(
     settings: ThreadModelSettings,
     centreline: Points,
     steering: Steering,
+    needle: NeedleSafetyFilter,
     progress: Callable[[float], None] = lambda share: None,
 ) -> HerniaRun:
     """Steer a thread as recorded.
@@ -157,6 +173,7 @@ def replay_steering(
         settings: of thread and obstacles.
         centreline: where the thread lies at the start, from the needle on, shape (m, 2) [m].
         steering: what was asked for.
+        needle: see `point_filter`.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -164,15 +181,15 @@ def replay_steering(
         InvalidInputError: the thread cannot begin there, or a velocity cannot be used.
         SolverError: a step had no solution.
     """
-    around = Surroundings(settings.obstacles(), _FAR)
-    instants = list(_steps(SteeredThread(settings, centreline), steering, progress))
+    around = Surroundings(needle.scene.obstacles, _FAR)
+    instants = list(_steps(SteeredThread(settings, centreline, needle), steering, progress))
     radius, obstacles = 0.5 * settings.thread().diameter, len(around.shapes)
     barriers = np.array(
         [_distances(around, instant.prediction.vertices[1 : 1 + FIRST_NODES], obstacles) for instant in instants]
     )
     middles = [0.5 * (i.prediction.vertices[1:] + i.prediction.vertices[:-1]) for i in instants]
     depths = np.array([-_distances(around, points, obstacles).min(initial=_FAR) for points in middles])
-    return HerniaRun(settings, instants, barriers - radius, depths)
+    return HerniaRun(settings, needle.scene, instants, barriers - radius, depths)
 
 
 def _steps(thread: SteeredThread, steering: Steering, progress: Callable[[float], None]) -> Iterator[SteeredInstant]:
@@ -192,13 +209,13 @@ def _distances(around: Surroundings, points: Points, obstacles: int) -> NDArray[
 
 
 def _words(instant: SteeredInstant) -> dict[str, Any]:
-    friction, steered = instant.margins.friction, instant.steered
+    friction, command = instant.margins.friction, instant.command
     return {
         "time": instant.time,
         "state": friction.state.name.lower(),
         "friction_nodes": list(friction.nodes),
         "slowdown": friction.slowdown,
-        "asked": steered.asked.tolist() if steered else [0.0, 0.0],
-        "passed": steered.passed.tolist() if steered else [0.0, 0.0],
+        "asked": command.commanded.tolist() if command else [0.0, 0.0],
+        "passed": command.filtered.tolist() if command else [0.0, 0.0],
         "needle": instant.prediction.vertices[0].tolist(),
     }

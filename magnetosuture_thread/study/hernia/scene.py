@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import matplotlib
 
 matplotlib.use("Agg")
@@ -13,8 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, PathPatch
 from matplotlib.path import Path as Outline
 
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.friction import FrictionState, friction_colour
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.study.hernia.steered import SteeredInstant
 
 FLOOR, RIM = "#f4f1ec", "#c9c3ba"
@@ -25,11 +24,11 @@ ROOM = 0.04  # of the dish's diameter, around it
 REACH = 1.2  # s of its way, by which an arrow shows a velocity
 
 
-def draw_dish(axes: Axes, obstacles: Sequence[Disc | Polygon], dish_diameter: float) -> None:
-    """Draw the dish and its obstacles, in millimetres; a shape with a hole is a ring, and darker."""
-    radius = 0.5e3 * dish_diameter
+def draw_dish(axes: Axes, scene: Scene) -> None:
+    """Draw the dish and its shapes, in millimetres; a shape with a hole is a ring, and darker."""
+    radius = 1e3 * scene.dish.radius
     axes.add_patch(Circle((0.0, 0.0), radius, facecolor=FLOOR, edgecolor=RIM, linewidth=1.4))
-    for obstacle in obstacles:
+    for obstacle in scene.obstacles:
         if isinstance(obstacle, Disc):
             centre = (1e3 * obstacle.centre[0], 1e3 * obstacle.centre[1])
             axes.add_patch(Circle(centre, 1e3 * obstacle.radius, facecolor=TISSUE, edgecolor=EDGE))
@@ -58,8 +57,8 @@ def draw_thread(axes: Axes, instant: SteeredInstant, scale: float = 1.0) -> None
             *under.T, "o", color=colour, markersize=4.6 * scale, markeredgecolor="white", markeredgewidth=0.7 * scale
         )
     x, y = points[0]
-    if instant.steered is not None:
-        for velocity, style in ((instant.steered.asked, (0, (1.5, 1.2))), (instant.steered.passed, "solid")):
+    if instant.command is not None:
+        for velocity, style in ((instant.command.commanded, (0, (1.5, 1.2))), (instant.command.filtered, "solid")):
             if velocity.any():
                 dx, dy = REACH * 1e3 * velocity
                 arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1 * scale, "linestyle": style}

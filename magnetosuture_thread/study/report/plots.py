@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.study.replayed import KINDS
+from magnetosuture_thread.study.replayed import KINDS, SOLID
 from magnetosuture_thread.study.report.account import Account
 from magnetosuture_thread.study.report.moments import Moment
 from magnetosuture_thread.study.report.timeline import Column, broken, thinned
@@ -68,8 +68,8 @@ def _bands(lost: Sequence[Sequence[float]]) -> list[list[float]]:
 def _columns(account: Account) -> dict[str, Column]:
     """Return the columns in the units of the plots: %, mm, µm, ms."""
     table = account.predicted
-    scales = {"stretch": 100.0, "step_time": 1e3, "margin_obstacle": 1e3}
-    scales |= {f"margin_{kind}": 1e6 for kind in KINDS if kind != "obstacle"}
+    scales = {"stretch": 100.0, "step_time": 1e3, **{f"margin_{kind}": 1e3 for kind in SOLID}}
+    scales |= {f"margin_{kind}": 1e6 for kind in KINDS if kind not in SOLID}
     columns = {name: scales.get(name, 1.0) * table.column(name) for name in table.names}
     columns["stretch"] = np.maximum(columns["stretch"], LEAST_STRETCH)
     return columns
@@ -100,11 +100,14 @@ def _plots(account: Account, predicted: Mapping[str, Column], looked: Mapping[st
     yield {
         "id": "obstacle",
         "y": "distance [mm]",
-        "series": _series(predicted, [("margin_obstacle", "obstacle", "good", "")]),
+        "series": _series(
+            predicted,
+            [(f"margin_{kind}", kind, colour, "") for kind, colour in zip(SOLID, ("good", "kind5"), strict=True)],
+        ),
         "zero": True,
     }
     kinds = [
-        (f"margin_{kind}", kind.replace("_", " "), f"kind{k}", "") for k, kind in enumerate(KINDS) if kind != "obstacle"
+        (f"margin_{kind}", kind.replace("_", " "), f"kind{k}", "") for k, kind in enumerate(KINDS) if kind not in SOLID
     ]
     yield {"id": "lengths", "y": "margin [µm]", "series": _series(predicted, kinds), "zero": True}
     yield {

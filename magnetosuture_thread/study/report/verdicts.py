@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from magnetosuture_thread.study.replayed import LeastMargin, Spread
+from magnetosuture_thread.study.replayed import SOLID, LeastMargin, Spread
 from magnetosuture_thread.study.report.figures import About, Figures
 
 GOOD, MIDDLING, BAD, NONE = "good", "middling", "bad", "none"
@@ -77,8 +77,9 @@ def _margins(about: About, figures: Figures) -> list[Headline]:
         return [Headline("least margin", "none", "no prediction converged", NONE, "not known")]
     worst = min(figures.least.values(), key=lambda least: least.clearance - _allowed(about, least))
     holds = [_holds(about, least) for least in figures.least.values()]
-    if all(holds) and "obstacle" in figures.least:
-        worst = figures.least["obstacle"]
+    solid = [figures.least[kind] for kind in SOLID if kind in figures.least]
+    if all(holds) and solid:
+        worst = min(solid, key=lambda least: least.clearance)
     touching = f"; touches in {_frames_of(figures.contact_frames)}" if figures.contact_frames else ""
     name = f"least margin, {worst.kind.replace('_', ' ')}"
     detail = f"at {worst.time:.2f} s, node {worst.node}{touching}"
@@ -92,7 +93,7 @@ def _margins(about: About, figures: Figures) -> list[Headline]:
 
 def _allowed(about: About, least: LeastMargin) -> float:
     """Return what a margin may be at the least, within the solvers' tolerance [m]."""
-    return -TOUCH if least.kind == "obstacle" else -EXACT * about.length / max(about.segments, 1)
+    return -TOUCH if least.kind in SOLID else -EXACT * about.length / max(about.segments, 1)
 
 
 def _holds(about: About, least: LeastMargin) -> bool:

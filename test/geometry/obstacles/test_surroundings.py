@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle, Polygon, Surroundings, find_near
+from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Surroundings, find_near
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 # An L: its only reflex corner is (0.01, 0.01).
@@ -186,6 +186,22 @@ def test_too_small_arrays_are_told():
     assert len(ring.near(points)) == 800
 
 
+def test_the_wall_is_a_contact_of_its_own_before_the_obstacles():
+    points = np.array([[0.0, 0.0], [0.045, 0.0], [0.0, -0.06], [np.nan, 0.0], [np.inf, 0.0]])
+    contacts = Surroundings([Disc((0.044, 0.0), 1e-3)], 0.01, wall_radius=0.05).near(points)
+    np.testing.assert_array_equal(contacts.node, [1, 1, 2])
+    np.testing.assert_array_equal(contacts.obstacle, [WALL, 0, WALL])
+    np.testing.assert_allclose(contacts.distance, [0.005, 0.0, -0.01], atol=1e-15)
+    np.testing.assert_allclose(contacts.outward[[0, 2]], [[-1.0, 0.0], [0.0, 1.0]], atol=1e-15)
+    assert contacts.nearest.all()
+    centre = Surroundings([], 0.1, 3, 0.05).near(np.array([[0.0, 0.0, 0.7]]))
+    assert centre.distance.tolist() == [0.05]
+    room = (np.empty(1, np.int64), np.empty(1, np.int64), np.empty(1), np.empty((1, 2)), np.empty(1, np.bool_))
+    data = Surroundings([], 0.01, wall_radius=0.05).data
+    assert find_near(points[1:2], data, *room) == 1
+    assert find_near(points[1:3], data, *room) == -1
+
+
 def test_nothing_is_near_nothing():
     assert len(Surroundings([], 0.01).near(np.zeros((3, 2)))) == 0
     assert len(Surroundings([SQUARE], 0.01).near(np.zeros((0, 2)))) == 0
@@ -207,6 +223,12 @@ def test_nothing_is_near_nothing():
 def test_shapes_must_fit(shapes, reach: float, dimension: int, reason: str):
     with pytest.raises(ConfigurationError, match=reason):
         Surroundings(shapes, reach, dimension)
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, np.nan])
+def test_a_wall_must_have_a_radius(radius: float):
+    with pytest.raises(ConfigurationError, match="wall_radius"):
+        Surroundings([], 0.1, 2, radius)
 
 
 def test_points_must_fit():

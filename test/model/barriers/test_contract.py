@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from magnetosuture_thread.model.barriers import (
     ObstacleAvoidance,
     SquaredObstacleAvoidance,
     Stiffness,
+    WallAvoidance,
 )
 
 
@@ -37,6 +40,7 @@ def barriers(dimension: int) -> list[Barrier]:
         ObstacleAvoidance(surroundings, 0.05),
         SquaredObstacleAvoidance(surroundings, 0.05),
         Stiffness(np.linspace(1.5, 2.0, 7)),
+        WallAvoidance(2.5, 0.05, 50.0),
     ]
 
 
@@ -124,6 +128,32 @@ def test_the_needle_has_a_margin_too_and_far_pairs_have_none():
     rows = ObstacleAvoidance(near, 0.0).rows(around_a_disc(1.5, 2.5, 3.5))
     np.testing.assert_array_equal(rows.nodes, [[0], [1]])
     np.testing.assert_array_equal(rows.obstacle, [0, 0])
+
+
+def test_the_wall_is_a_circle_and_in_space_a_cylinder():
+    plane = np.array([[0.0, 0.0], [1.5, 0.0], [0.0, 1.75], [-3.0, 0.0]])
+    rows = WallAvoidance(2.0, 0.25, 0.5).rows(plane)
+    np.testing.assert_array_equal(rows.nodes, [[1], [2], [3]])
+    np.testing.assert_allclose(rows.value, [0.25, 0.0, -1.25], atol=1e-15)
+    np.testing.assert_allclose(rows.gradient[:, 0], [[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]], atol=1e-15)
+    space = np.column_stack([plane, [5.0, -3.0, 0.0, 1.0]])
+    above = WallAvoidance(2.0, 0.25, 0.5).rows(space)
+    np.testing.assert_array_equal(above.value, rows.value)
+    assert (above.gradient[:, 0, 2] == 0.0).all()
+    assert len(WallAvoidance(math.inf, 0.25, 0.5).rows(plane).value) == 0
+
+
+def test_a_wall_row_forbids_nothing_that_the_circle_allows():
+    random = np.random.default_rng(1)
+    barrier = WallAvoidance(2.0, 0.1, 50.0)
+    about, inside = random.normal(size=(200, 2)), random.normal(size=(200, 2))
+    inside *= (1.9 * random.uniform(size=(200, 1)) ** 0.1) / np.linalg.norm(inside, axis=1, keepdims=True)
+    rows = barrier.rows(about)
+    linear = rows.value + np.einsum("ij,ij->i", rows.gradient[:, 0], inside - about)
+    assert linear.min() > -1e-12
+    left = linear - barrier.rows(inside).value  # what the row leaves outside of the circle
+    way = np.linalg.norm(inside - about, axis=1)
+    assert (left <= way**2 / (2.0 * np.linalg.norm(about, axis=1)) + 1e-12).all()
 
 
 def test_no_obstacle_gives_no_rows():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -47,9 +48,10 @@ def formulated(
     solver: str = "banded",
     dimension: int = 2,
     paper: PaperOptions | None = None,
+    wall: float = math.inf,
 ) -> Formulation:
-    """Return a formulation of a thread among obstacles; margins reach 5 cm."""
-    surroundings = Surroundings(obstacles, 0.05, dimension)
+    """Return a formulation of a thread among obstacles, in a dish of a radius; margins reach 5 cm."""
+    surroundings = Surroundings(obstacles, 0.05, dimension, wall)
     return make_formulation(name, thread, surroundings, make_solver(solver, TOLERANCE), TOLERANCE, paper)
 
 

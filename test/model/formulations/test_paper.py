@@ -127,7 +127,7 @@ def test_no_node_enters_an_obstacle_and_one_inside_is_pushed_out(obstacle: Disc 
     formulation = formulated(thread, (obstacle,), name="paper", paper=PaperOptions.tuned(0.01))
 
     def least(positions: np.ndarray) -> float:
-        rows = formulation.margins(positions, east())[-1]
+        rows = formulation.margins(positions, east())[-2]
         assert rows.kind is BarrierKind.OBSTACLE
         return float(rows.clearance[rows.nodes[:, 0] > 0].min(initial=np.inf))
 
@@ -149,7 +149,7 @@ def test_a_long_step_does_not_overshoot_a_barrier(interval: float):
     formulation = formulated(thread, (Disc((-0.009, 0.0025), 0.0015),), name="paper", paper=PaperOptions.tuned(0.01))
     way = 4e-5 / DT * interval * np.array([0.0, 1.0])
     for done in followed(formulation, straight(thread), lambda k: k * way, int(300 * DT / interval), interval):
-        rows = formulation.margins(done.state.positions, east())[-1]
+        rows = formulation.margins(done.state.positions, east())[-2]
         assert rows.clearance[rows.nodes[:, 0] > 0].min(initial=1.0) > -5e-6
         assert stretch(thread, done.state.positions) < 0.3
 

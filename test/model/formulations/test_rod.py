@@ -332,7 +332,7 @@ def test_ends_pulled_apart_by_more_than_the_thread_are_survived():
 def test_margins_are_in_si_units():
     thread = polyamide()
     positions = straight(thread) * 1.1
-    found, short, obstacle = formulated(thread, (Disc((0.0, 0.01), 0.004),)).margins(positions, east())
+    found, short, obstacle, _ = formulated(thread, (Disc((0.0, 0.01), 0.004),)).margins(positions, east())
     unit = thread.segment_length
     np.testing.assert_allclose(found.clearance, -0.1 * unit)
     np.testing.assert_allclose(short.value, 0.5 * 0.21 * unit**2)

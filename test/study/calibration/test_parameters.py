@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.configuration import load_setup
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.parameter_files import load_setup
 from magnetosuture_thread.study.calibration.parameters import (
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,

@@ -7,9 +7,11 @@ import pytest
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.friction import FrictionState
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.study.hernia.run import HerniaRun, Steering, replay_steering
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.study.hernia.run import HerniaRun, Steering, point_filter, replay_steering
 from magnetosuture_thread.study.hernia.steered import SteeredThread
 
 # A gate of two discs with 1.6 mm between them, 4 mm ahead of the needle.
@@ -19,10 +21,10 @@ SETTINGS = from_mapping(
         "disc_obstacles": [0.004, 0.0018, 0.001, 0.004, -0.0018, 0.001],
         "friction_threshold": 1.2e-3,
         "friction_averaging": 0.0,
-        "needle_clearance": 3e-4,
-        "needle_length": 0.007,  # which does not count: the needle is a point
     },
 )
+POSTS = tuple(SceneShape(f"post_{k}", "instrument", Disc((0.004, y), 0.001)) for k, y in enumerate((0.0018, -0.0018)))
+NEEDLE = point_filter(Scene(Dish(0.06), POSTS), 3e-4, 10.0)
 LINE = np.column_stack([-np.linspace(0.0, 0.019, 50), np.zeros(50)])
 
 
@@ -35,7 +37,7 @@ def steering(*parts: tuple[float, float, float]) -> Steering:
 @pytest.fixture(scope="module")
 def through() -> HerniaRun:
     """A needle that is drawn through the gate, waits, and is pressed against a disc."""
-    return replay_steering(SETTINGS, LINE, steering((3.0, 3e-3, 0.0), (1.0, 0.0, 0.0), (2.0, -3e-3, 2e-3)))
+    return replay_steering(SETTINGS, LINE, steering((3.0, 3e-3, 0.0), (1.0, 0.0, 0.0), (2.0, -3e-3, 2e-3)), NEEDLE)
 
 
 def test_a_needle_goes_where_it_is_told_and_slower_under_friction(through: HerniaRun):
@@ -43,19 +45,21 @@ def test_a_needle_goes_where_it_is_told_and_slower_under_friction(through: Herni
     assert states[0] is FrictionState.FREE
     assert states.index(FrictionState.PULLED) < states.index(FrictionState.RESTING)
     for last, instant in zip(through.instants[:-1], through.instants[1:], strict=True):
-        assert instant.steered is not None
+        assert instant.command is not None
         before = last.margins.friction.slowdown
-        assert instant.steered.slowdown == before
+        assert instant.command.slowdown == before
         moved = (instant.prediction.vertices[0] - last.prediction.vertices[0]) * 33.0
-        np.testing.assert_allclose(moved, instant.steered.passed, atol=1e-9)
-        if not instant.steered.held_off:
-            np.testing.assert_allclose(instant.steered.passed, before * instant.steered.asked, atol=1e-9)
+        np.testing.assert_allclose(moved, instant.command.filtered, atol=1e-9)
+        if set(instant.command.active) <= {"friction"}:
+            np.testing.assert_allclose(instant.command.filtered, before * instant.command.commanded, atol=1e-9)
     assert min(instant.margins.friction.slowdown for instant in through.instants) < 0.9
 
 
 def test_neither_needle_nor_thread_enters(through: HerniaRun):
     summary = through.summary("gate")
-    assert any(instant.steered is not None and instant.steered.held_off for instant in through.instants)
+    assert any(
+        instant.command is not None and set(instant.command.active) - {"friction"} for instant in through.instants
+    )
     assert summary.deepest < 1e-6
     assert summary.stretch < 0.01
     centres = np.array([[0.004, 0.0018], [0.004, -0.0018]])
@@ -81,7 +85,7 @@ def test_a_command_holds_for_a_tenth_of_a_second():
 
 
 def test_the_same_steering_gives_the_same_run(through: HerniaRun):
-    again = SteeredThread(SETTINGS, LINE)
+    again = SteeredThread(SETTINGS, LINE, NEEDLE)
     for k in range(1, 120):
         again.step(1.0 / 33.0, steering((3.0, 3e-3, 0.0), (1.0, 0.0, 0.0)).at((k - 1) / 33.0))
         np.testing.assert_array_equal(again.now.prediction.vertices, through.instants[k].prediction.vertices)
@@ -89,7 +93,7 @@ def test_the_same_steering_gives_the_same_run(through: HerniaRun):
 
 def test_a_velocity_in_another_unit_is_refused():
     with pytest.raises(InvalidInputError, match="at most 1 m/s"):
-        SteeredThread(SETTINGS, LINE).step(0.03, np.array([3.0, 0.0]))
+        SteeredThread(SETTINGS, LINE, NEEDLE).step(0.03, np.array([3.0, 0.0]))
 
 
 def test_the_figures_are_plain_json(through: HerniaRun):

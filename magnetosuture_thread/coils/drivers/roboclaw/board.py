@@ -61,7 +61,7 @@ class Board:
     ) -> None:
         self._port, self._address, self._name, self._hurries = port, address, name, hurries
         self._coils = (2 * number, 2 * number + 1)
-        self._timeout = round(10.0 * settings.roboclaw_timeout)  # in tenths of a second
+        self._timeout = round(10.0 * settings.driver_timeout)  # in tenths of a second
         self._most, self._limit = settings.max_current, round(100.0 * settings.max_current)
         self._resistances = np.array(settings.resistances()[2 * number : 2 * number + 2])
         self._device: Any = Basicmicro(port.name, port.baudrate, retries=1)

@@ -35,7 +35,7 @@ class RoboClawDriver:
     each board and each attempt to write to it, so that a stop gets in between.
 
     Every board holds a limit of its own on the currents, and stops by itself when it hears nothing for
-    `roboclaw_timeout`; a board that does not confirm both is never ready. It is asked for both again and again,
+    `driver_timeout`; a board that does not confirm both is never ready. It is asked for both again and again,
     with two boards on a line within about a second: one whose supply breaks down forgets them, which is a loss
     however soon it is back.
 
@@ -110,9 +110,9 @@ def _boards_by_port(settings: CoilBridgeSettings, coils: int) -> dict[str, dict[
     if addresses and len(addresses) != len(ports):
         expected = f"one for each of the {len(ports)} roboclaw_ports, or none"
         raise DriverError(NAME, f"roboclaw_addresses has {len(addresses)}, expected {expected}")
-    tenths = 10.0 * settings.roboclaw_timeout
+    tenths = 10.0 * settings.driver_timeout
     if abs(tenths - round(tenths)) > 1e-6:
-        raise DriverError(NAME, f"roboclaw_timeout is {settings.roboclaw_timeout:g}, expected tenths of a second")
+        raise DriverError(NAME, f"driver_timeout is {settings.driver_timeout:g}, expected tenths of a second")
     if settings.roboclaw_baud_rate < SLOWEST:
         expected = f"at least {SLOWEST}, so that answers come in time"
         raise DriverError(NAME, f"roboclaw_baud_rate is {settings.roboclaw_baud_rate}, expected {expected}")

@@ -123,7 +123,7 @@ def patient(port: ExchangePort) -> None:
 
 def board(port: ExchangePort, tenths: int = 2, hurries: bool = False) -> Board:
     """Return the board on a line."""
-    return Board(port, 0, 128, "board 0", CoilBridgeSettings(roboclaw_timeout=0.1 * tenths), lambda: hurries)
+    return Board(port, 0, 128, "board 0", CoilBridgeSettings(driver_timeout=0.1 * tenths), lambda: hurries)
 
 
 def give(made: Board, *currents: float) -> None:

@@ -37,7 +37,7 @@ import numpy as np
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
-driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=sys.argv[1:], roboclaw_timeout=0.3))
+driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=sys.argv[1:], driver_timeout=0.3))
 driver.open()
 while True:
     driver.apply(np.array([3.0, -6.0, 1.5, 0.0]))
@@ -89,7 +89,7 @@ def test_currents_beyond_the_limit_are_cut_at_it(bench):
 
 
 def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
-    driver = bench.open(command_timeout=0.1, roboclaw_timeout=1.0)
+    driver = bench.open(command_timeout=0.1, driver_timeout=1.0)
     bench.wait(lambda: driver.apply(np.array(CURRENTS)) or bench.duties(0) == DUTIES[0], "the duties")
     bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
     (zero_at, _) = bench.boards[0].timeline[-1]
@@ -102,7 +102,7 @@ def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
 
 
 def test_what_stays_in_force_is_written_often_enough(bench):
-    driver = bench.open(patience=60.0, roboclaw_timeout=0.5, **PATIENT)
+    driver = bench.open(patience=60.0, driver_timeout=0.5, **PATIENT)
     driver.apply(np.array(CURRENTS))
     bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
     since = bench.boards[0].timeline[0][0]
@@ -362,7 +362,7 @@ def test_two_boards_can_share_a_port(bench):
 
 
 def test_closing_leaves_zero_and_the_port_free(bench):
-    driver = bench.open(roboclaw_timeout=1.0)
+    driver = bench.open(driver_timeout=1.0)
     with bench.held(driver, *CURRENTS):
         bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties")
     driver.close()
@@ -474,7 +474,7 @@ def test_a_port_that_is_not_there_is_waited_for(bench):
             "has 1, expected one for each of the 2",
         ),
         ({"roboclaw_ports": ("/dev/a", "/dev/a")}, "two boards on /dev/a have address 128"),
-        ({"roboclaw_ports": ("/dev/a", "/dev/b"), "roboclaw_timeout": 0.25}, "0.25, expected tenths of a second"),
+        ({"roboclaw_ports": ("/dev/a", "/dev/b"), "driver_timeout": 0.25}, "0.25, expected tenths of a second"),
         ({"roboclaw_ports": ("/dev/a", "/dev/b"), "roboclaw_baud_rate": 9600}, "9600, expected at least 38400"),
     ],
 )

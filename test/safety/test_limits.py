@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.limits import approached, shortened
+from magnetosuture_thread.safety.limits import approached, shortened
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0), (1e-320, 0.0), (3.0, -4.0), (1e308, 1e308), (-1e-5, 2e-5)])

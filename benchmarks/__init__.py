@@ -1,0 +1,1 @@
+"""Benchmarks: measurements that are too long for the test suite. Run one by  python -m benchmarks NAME."""

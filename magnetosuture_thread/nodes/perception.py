@@ -1,0 +1,55 @@
+"""Vision tracker and thread model in one process: the prediction follows the frame without a way between.
+
+    perception --ros-args --params-file SETUP
+
+Both nodes have their names, topics and parameters as if each ran alone, and publish the same to the last bit. What the
+tracker sees is published, and handed to the model by a call.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
+
+
+def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
+    """Return the two nodes, so that the model hears the tracker; by topics only where these have other names.
+
+    Args:
+        options: for both nodes of rclpy.
+
+    Raises:
+        MagnetosutureError: one of them cannot be made; the other is destroyed.
+    """
+    tracker = VisionTrackerNode(**options)
+    try:
+        model = ThreadModelNode(listens=False, **options)
+    except BaseException:
+        tracker.destroy_node()
+        raise
+    if tracker.get_name() == model.get_name():
+        name = model.get_name()
+        tracker.destroy_node()
+        model.destroy_node()
+        raise GraphError(f"two nodes cannot both be named {name}: rename each, as by -r vision_tracker:__node:=NAME")
+    shared = (topics.NEEDLE_POSE.name, topics.SEEN_THREAD.name)
+    if all(tracker.resolve_topic_name(name) == model.resolve_topic_name(name) for name in shared):
+        tracker.hand_to(model)
+    else:
+        model.listen()
+    return tracker, model
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the nodes as a program."""
+    return run(perception, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,328 @@
+"""The barriers: which tip velocity, nearest to the one commanded, keeps the needle clear of wall and shapes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.half_planes import project_within
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
+from magnetosuture_thread.geometry.obstacles.search import search_edges
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.safety.certificate import NOTHING, WALL, safe_time
+from magnetosuture_thread.safety.packed_scene import PackedScene, polygon_distance
+
+LEAN, DEPTH = 0.1, 1e-5  # rad and m; so far beyond its bound, a point that slides leaves at this angle
+MAX_ROWS = 2048
+PASSES = 4  # of the projection, each with what the motion of the one before bends into and meets
+STUCK = 1e-9  # of the velocity commanded; less is none
+ACTIVE = 1e-6  # of the speed; a barrier that leaves less room than this is active
+SURE = 1.0 - 1e-9  # of the certified time, against rounding
+
+
+@compiled
+def measure(
+    points: Points,
+    scene: PackedScene,
+    distances: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> None:
+    """Write the signed distance of each point from each disc, then polygon, (m, s), and its gradient, (m, s, 2)."""
+    nowhere, none, nor = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
+    discs = len(scene.discs)
+    for s in range(distances.shape[1]):
+        guess = -1
+        for i in range(len(points)):
+            x, y = points[i, 0], points[i, 1]
+            if s < discs:
+                qx, qy = x - scene.discs[s, 0], y - scene.discs[s, 1]
+                away = math.hypot(qx, qy)
+                distances[i, s] = away - scene.discs[s, 2]
+                outward[i, s, 0], outward[i, s, 1] = (qx / away, qy / away) if away > 0.0 else (1.0, 0.0)
+            else:
+                found = polygon_distance(x, y, s - discs, guess, scene, nowhere, none, nor)
+                distances[i, s], outward[i, s, 0], outward[i, s, 1], guess = found
+
+
+@compiled
+def find_rows(
+    points: Points,
+    ends_only: bool,
+    reach: float,
+    keep: float,
+    keep_wall: float,
+    scene: PackedScene,
+    distances: NDArray[np.float64],
+    outward: NDArray[np.float64],
+    margin: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    bend: NDArray[np.float64],
+    who: NDArray[np.int64],
+) -> int:
+    """Write a row for every local minimum of a point's distance to the wall or a shape within reach.
+
+    Args:
+        points: that stand for the needle, shape (m, 2) [m].
+        ends_only: see `safe_time`.
+        reach: greatest margin of a row [m].
+        keep: distance from shapes that the margin is counted from [m].
+        keep_wall: the same from the wall [m].
+        scene: packed.
+        distances: see `measure`.
+        outward: see `measure`.
+        margin: h, shape (k,) [m].
+        gradient: of h by the point, unit vectors, shape (k, 2).
+        bend: second derivative of h along the boundary, shape (k,) [1/m].
+        who: index of the point and of the shape, or `WALL`, shape (k, 2).
+
+    Returns:
+        The number of rows. Where there is no room for more, a shape's nearest points are left.
+    """
+    nowhere = np.empty(0, np.int32)
+    found, ways = np.empty(32), np.empty((32, 2))
+    rows, discs, count = 0, len(scene.discs), len(points)
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        away = math.hypot(x, y)
+        if (not ends_only or i == 0 or i == count - 1) and scene.radius - away - keep_wall <= reach:
+            if rows < len(margin) and away > 1e-9:
+                margin[rows], bend[rows] = scene.radius - away - keep_wall, -1.0 / away
+                gradient[rows, 0], gradient[rows, 1] = -x / away, -y / away
+                who[rows, 0], who[rows, 1] = i, WALL
+                rows += 1
+        for s in range(distances.shape[1]):
+            distance = distances[i, s]
+            if distance - keep > reach:
+                continue
+            local = 0
+            if s >= discs and distance > 0.0:
+                polygon, far = s - discs, reach + keep
+                for block in range(scene.polygons[polygon, 0], scene.polygons[polygon, 1]):
+                    bx, by = x - scene.circles[block, 0], y - scene.circles[block, 1]
+                    near = far + scene.circles[block, 2]
+                    if bx * bx + by * by > near * near:
+                        continue
+                    base, edges = scene.ranges[block, 0] * EDGE_WIDTH, scene.ranges[block, 1]
+                    least = local
+                    got = search_edges(x, y, far, scene.edges, base, nowhere, -1, edges, least, found, ways)
+                    local = got.rows if got.rows >= 0 else least
+            if local == 0 or distance <= 0.0:
+                found[0], ways[0, 0], ways[0, 1], local = distance, outward[i, s, 0], outward[i, s, 1], 1
+            for k in range(local):
+                if rows >= len(margin):
+                    break
+                margin[rows] = found[k] - keep
+                gradient[rows, 0], gradient[rows, 1] = ways[k, 0], ways[k, 1]
+                # A disc, or a corner for all that is known here, bends away from the point: that is left out.
+                bend[rows] = 0.0
+                who[rows, 0], who[rows, 1] = i, scene.shapes[s]
+                rows += 1
+    return rows
+
+
+@compiled
+def _projected(
+    vx: float,
+    vy: float,
+    rows: Points,
+    least: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    count: int,
+    lean: bool,
+    given: Points,
+    bounds: NDArray[np.float64],
+    work: Points,
+) -> tuple[bool, float, float]:
+    """Return whether there is a velocity but zero within the rows, and the one nearest to (vx, vy).
+
+    With `lean`, what is beyond its bound has to leave, within a sector around the way out.
+    """
+    speed = math.hypot(vx, vy)
+    used = 0
+    for k in range(count):
+        x, y = rows[k, 0], rows[k, 1]
+        if lean and depth[k] > 0.0:
+            angle = LEAN * min(1.0, depth[k] / DEPTH)
+            c, s = math.cos(angle), math.sin(angle)
+            given[used, 0], given[used, 1], bounds[used] = c * x - s * y, c * y + s * x, max(least[k], 0.0)
+            given[used + 1, 0], given[used + 1, 1], bounds[used + 1] = c * x + s * y, c * y - s * x, max(least[k], 0.0)
+            used += 2
+        elif math.hypot(x, y) * speed > -least[k]:  # else no velocity of this size meets it
+            given[used, 0], given[used, 1], bounds[used] = x, y, least[k]
+            used += 1
+    found = np.empty(2)
+    holds = project_within(np.array([vx, vy]), given[:used], bounds[:used], work[:used], found)
+    if not holds:
+        return False, 0.0, 0.0
+    size = math.hypot(found[0], found[1])
+    if not size > STUCK * speed:
+        return False, 0.0, 0.0
+    shorter = min(1.0, speed / size)
+    return True, shorter * found[0], shorter * found[1]
+
+
+@compiled
+def _tangent(
+    x: float, y: float, what: int, scene: PackedScene, keep: float, keep_wall: float
+) -> tuple[float, float, float]:
+    """Return the way out (2) at a point that meets the wall or a shape, and its margin there [m]."""
+    if what == WALL:
+        away = math.hypot(x, y)
+        return -x / away, -y / away, scene.radius - away - keep_wall
+    discs = len(scene.discs)
+    for s in range(len(scene.shapes)):
+        if scene.shapes[s] != what:
+            continue
+        if s < discs:
+            qx, qy = x - scene.discs[s, 0], y - scene.discs[s, 1]
+            away = max(math.hypot(qx, qy), 1e-12)
+            return qx / away, qy / away, away - scene.discs[s, 2] - keep
+        nowhere, none, nor = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
+        distance, gx, gy, _ = polygon_distance(x, y, s - discs, -1, scene, nowhere, none, nor)
+        return gx, gy, distance - keep
+    return 1.0, 0.0, 0.0
+
+
+@compiled
+def nearest_clear(
+    vx: float,
+    vy: float,
+    points: Points,
+    turning: Points,
+    ends_only: bool,
+    chord_x: float,
+    chord_y: float,
+    turn: float,
+    hold: float,
+    rate: float,
+    keep: float,
+    keep_wall: float,
+    band: float,
+    scene: PackedScene,
+    distances: NDArray[np.float64],
+    outward: NDArray[np.float64],
+    touched: NDArray[np.bool_],
+) -> tuple[float, float]:
+    """Return the velocity nearest to (vx, vy) that the barriers let through and that is certified for the hold.
+
+        grad h . J_p v >= -rate max(h, 0) + (hold / 2) max(0, -h''(v))
+
+    for points p of the needle, with h'' the second derivative of h along the motion of the pass before, so that
+    the needle leans away from what its way bends into and does not have to be slowed down for it. Where that leaves
+    nothing but zero it is left out, and slowing down remains.
+
+    Args:
+        vx: velocity of the tip commanded [m/s].
+        vy: velocity of the tip commanded [m/s].
+        points: see `safe_time`, as the others that are not named here.
+        turning: of the points.
+        ends_only: of the wall.
+        chord_x: of the chord.
+        chord_y: of the chord.
+        turn: of the needle.
+        hold: [s].
+        rate: share of the margin by which a point may approach [1/s].
+        keep: from shapes [m].
+        keep_wall: from the wall [m].
+        band: by which the barriers keep farther away than the certificate asks for [m].
+        scene: packed.
+        distances: see `measure`.
+        outward: see `measure`.
+        touched: set for each shape, then the wall, whose barrier changed the velocity.
+    """
+    speed = math.hypot(vx, vy)
+    time, what, where = safe_time(
+        points, turning, ends_only, chord_x, chord_y, turn, vx, vy, hold, keep, keep_wall, scene, distances, outward
+    )
+    swiftest = 0.0
+    for i in range(len(points)):
+        swiftest = max(swiftest, math.hypot(turning[i, 0], turning[i, 1]))
+    reach = math.hypot(1.0, swiftest) * speed / rate
+    margin, gradient, bend = np.empty(MAX_ROWS), np.empty((MAX_ROWS, 2)), np.empty(MAX_ROWS)
+    who = np.empty((MAX_ROWS + PASSES, 2), np.int64)
+    count = find_rows(
+        points,
+        ends_only,
+        reach,
+        keep + band,
+        keep_wall + band,
+        scene,
+        distances,
+        outward,
+        margin,
+        gradient,
+        bend,
+        who,
+    )
+    room = count + PASSES
+    rows, least, depth = np.empty((room, 2)), np.empty(room), np.empty(room)
+    free = time >= hold
+    for k in range(count):
+        i = who[k, 0]
+        along = gradient[k, 0] * chord_x + gradient[k, 1] * chord_y
+        aside = gradient[k, 0] * turning[i, 0] + gradient[k, 1] * turning[i, 1]
+        rows[k, 0], rows[k, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
+        least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
+        free = free and depth[k] <= 0.0 and rows[k, 0] * vx + rows[k, 1] * vy >= least[k]
+    if free:
+        return vx, vy
+    given, bounds, work = np.empty((2 * room, 2)), np.empty(2 * room), np.empty((2 * room, 3))
+    bounded = least.copy()
+    best, bx, by = speed * speed, 0.0, 0.0  # zero, that always is allowed
+    ux, uy, total = vx, vy, count
+    for attempt in range(PASSES):
+        holds, x, y = _projected(vx, vy, rows, bounded, depth, total, True, given, bounds, work)
+        if not holds:
+            holds, x, y = _projected(vx, vy, rows, bounded, depth, total, False, given, bounds, work)
+        if not holds and attempt > 0:
+            holds, x, y = _projected(vx, vy, rows, least, depth, count, False, given, bounds, work)
+        if not holds:
+            break
+        time, ended, where = safe_time(
+            points, turning, ends_only, chord_x, chord_y, turn, x, y, hold, keep, keep_wall, scene, distances, outward
+        )
+        share = 1.0 if time >= hold else SURE * time / hold
+        off = (share * x - vx) ** 2 + (share * y - vy) ** 2
+        if off < best:
+            best, bx, by, ux, uy = off, share * x, share * y, x, y
+            what = ended
+        if share >= 1.0:
+            break
+        across, forwards = -x * chord_y + y * chord_x, x * chord_x + y * chord_y
+        omega = turn * across
+        # What the motion bends into within the hold.
+        for k in range(count):
+            i = who[k, 0]
+            px, py = forwards * chord_x + across * turning[i, 0], forwards * chord_y + across * turning[i, 1]
+            gx, gy = gradient[k, 0], gradient[k, 1]
+            aside = -px * gy + py * gx
+            second = omega * (-gx * py + gy * px) + bend[k] * aside * aside
+            bounded[k] = least[k] + max(0.0, -0.5 * hold * second)
+        # And what it meets: after the hold, the point has to be on the near side of the tangent there.
+        if total < room:
+            px = forwards * chord_x + across * turning[where, 0]
+            py = forwards * chord_y + across * turning[where, 1]
+            half = 0.5 * omega * time
+            way = time * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+            c, s = math.cos(half), math.sin(half)
+            dx, dy = way * (c * px - s * py), way * (s * px + c * py)
+            gx, gy, left = _tangent(points[where, 0] + dx, points[where, 1] + dy, ended, scene, keep, keep_wall)
+            along, aside = gx * chord_x + gy * chord_y, gx * turning[where, 0] + gy * turning[where, 1]
+            rows[total, 0], rows[total, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
+            bent = 0.5 * hold * omega * (-gx * py + gy * px)
+            missing = band - left if left > -band else 0.0  # nothing beyond but to get no nearer
+            bounded[total] = min((gx * dx + gy * dy + missing) / hold - min(bent, 0.0), LEAN * speed)
+            least[total], depth[total] = bounded[total], 0.0
+            who[total, 0], who[total, 1] = where, ended
+            total += 1
+    touched[:] = False
+    if what != NOTHING:
+        touched[what] = True
+    for k in range(total):
+        if rows[k, 0] * vx + rows[k, 1] * vy < least[k] or depth[k] > 0.0:
+            if rows[k, 0] * ux + rows[k, 1] * uy - least[k] <= ACTIVE * speed or depth[k] > 0.0:
+                touched[who[k, 1]] = True
+    return bx, by

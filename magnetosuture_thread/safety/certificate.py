@@ -1,0 +1,267 @@
+"""The certificate: for how long a constant motion of the needle keeps it clear. The guarantee is here, and only here.
+
+A constant motion takes every point p of the needle along an arc of a circle,
+
+    p(t) = p + d(t),    d(t) = t sinc(omega t / 2) R(omega t / 2) v_p
+
+With m = tan(omega t / 2) / (omega / 2), which is t where omega = 0, and v' = v_p turned by a right angle to the left,
+
+    n . d = [ (n . v_p) m + (omega / 2) (n . v') m^2 ] / (1 + omega^2 m^2 / 4)
+    |d|^2 = |v_p|^2 m^2 / (1 + omega^2 m^2 / 4)
+
+so that the time at which the point meets a line or a circle is the root of a quadratic in m, in closed form and
+without steps in time. Points closer to an obstacle than f lie in the discs of radius f around its corners and in the
+strips of width f along its edges; whoever comes from outside enters one of them first.
+
+Source: none; the discs and strips are the Minkowski sum of a polygon's boundary and a disc.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.safety.packed_scene import PackedScene
+
+ROUNDING = 1e-13
+"""What a point that is at its bound may get nearer in one hold, so that rounding does not keep it from sliding [m]."""
+INSIDE = 1e-12
+"""A point this near to a polygon, or inside of it, goes by the side that it has to leave by [m]."""
+WALL, NOTHING = -1, -2
+"""In the place of a shape's index."""
+
+
+@compiled
+def crossings(square: float, linear: float, constant: float, omega: float) -> tuple[float, float]:
+    """Return the times of both roots of  square m^2 + linear m + constant = 0  within a turn, rising; inf for none.
+
+        m = tan(omega t / 2) / (omega / 2)
+
+    Negative roots come after the positive ones, in the second half of the turn; where omega is 0, never.
+    """
+    disc = linear * linear - 4.0 * square * constant
+    if not disc >= 0.0:
+        return np.inf, np.inf
+    q = -0.5 * (linear + math.copysign(math.sqrt(disc), linear))
+    if q == 0.0:
+        return np.inf, np.inf
+    rate = 0.5 * abs(omega)
+    first, second = np.inf, np.inf
+    for k in range(2):
+        m = q / square if k == 0 else constant / q
+        if not rate > 0.0:
+            t = m if m >= 0.0 else np.inf
+        else:
+            t = math.atan(m * rate) / rate if m >= 0.0 else (math.pi + math.atan(m * rate)) / rate
+        if k == 0:
+            first = t
+        else:
+            second = t
+    return (first, second) if first <= second else (second, first)
+
+
+@compiled
+def circle_exit(
+    qx: float, qy: float, room: float, radius: float, vx: float, vy: float, omega: float, outside: bool
+) -> float:
+    """Return when a point that is off a circle by `room` > 0 meets it, inf for never [s].
+
+    Args:
+        qx: of the point from the circle's centre [m].
+        qy: of the point from the circle's centre [m].
+        room: to the circle, with the point's distance from the centre exact [m].
+        radius: of the circle [m].
+        vx: velocity of the point now [m/s].
+        vy: velocity of the point now [m/s].
+        omega: by which that velocity turns [rad/s].
+        outside: whether the point is outside of the circle.
+    """
+    away = radius + room if outside else radius - room
+    c = room * (away + radius)  # the difference of the squares without a difference
+    a = qx * vx + qy * vy
+    b = -qx * vy + qy * vx  # q . (v turned to the left)
+    square = vx * vx + vy * vy + omega * b
+    if outside:
+        return crossings(square + 0.25 * omega * omega * c, 2.0 * a, c, omega)[0]
+    return crossings(-square + 0.25 * omega * omega * c, -2.0 * a, c, omega)[0]
+
+
+@compiled
+def _disc_time(qx: float, qy: float, base: float, keep: float, vx: float, vy: float, omega: float) -> float:
+    """Return when a point gets nearer to a disc of radius `base` than `keep`, or than it is if that is nearer [s]."""
+    away = math.hypot(qx, qy)
+    radius = min(base + keep, away) - ROUNDING
+    if radius <= 0.0:
+        return np.inf  # in the disc's very middle: any way leads out
+    return circle_exit(qx, qy, away - radius, radius, vx, vy, omega, True)
+
+
+@compiled
+def _strip_time(
+    qx: float, qy: float, dx: float, dy: float, length: float, floor: float, vx: float, vy: float, omega: float
+) -> float:
+    """Return when a point enters the strip of width `floor` along the outer side of an edge, inf for never [s].
+
+    Args:
+        qx: of the point from the edge's start [m].
+        qy: of the point from the edge's start [m].
+        dx: unit direction of the edge.
+        dy: unit direction of the edge.
+        length: of the edge [m].
+        floor: width of the strip [m].
+        vx: velocity of the point now [m/s].
+        vy: velocity of the point now [m/s].
+        omega: by which that velocity turns [rad/s].
+    """
+    nx, ny = dy, -dx  # outwards, as the solid is to the left
+    room = nx * qx + ny * qy - floor
+    a, b = nx * vx + ny * vy, -nx * vy + ny * vx
+    first, second = crossings(0.5 * omega * b + 0.25 * omega * omega * room, a, room, omega)
+    # From outside of the line it is crossed inwards first, from within outwards first.
+    t = first if room >= 0.0 else second
+    if t == np.inf:
+        return t
+    half = 0.5 * omega * t
+    reach = t * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+    c, s = math.cos(half), math.sin(half)
+    along = dx * qx + dy * qy + reach * (dx * (c * vx - s * vy) + dy * (s * vx + c * vy))
+    slack = 1e-9 * (1.0 + length)  # beyond the ends is what the corners' discs are for; rounding opens no gap
+    return t if -slack <= along <= length + slack else np.inf
+
+
+@compiled
+def _polygon_time(
+    x: float,
+    y: float,
+    vx: float,
+    vy: float,
+    omega: float,
+    distance: float,
+    gx: float,
+    gy: float,
+    polygon: int,
+    keep: float,
+    limit: float,
+    scene: PackedScene,
+) -> float:
+    """Return when a point gets nearer to a polygon than `keep`, or than it is if that is nearer; `limit` for later [s].
+
+    A point inside must leave by the nearest side: it goes no deeper than it is, and by at most `keep` beyond it.
+    """
+    best = limit
+    if distance <= INSIDE:
+        depth = max(-distance, 0.0)
+        a, b = gx * vx + gy * vy, -gx * vy + gy * vx
+        room = ROUNDING
+        best = min(best, crossings(0.5 * omega * b + 0.25 * omega * omega * room, a, room, omega)[0])
+        return min(best, circle_exit(-depth * gx, -depth * gy, keep, depth + keep, vx, vy, omega, False))
+    floor = min(keep, distance) - ROUNDING
+    speed = math.hypot(vx, vy)
+    for block in range(scene.polygons[polygon, 0], scene.polygons[polygon, 1]):
+        far = scene.circles[block, 2] + floor + speed * best
+        bx, by = x - scene.circles[block, 0], y - scene.circles[block, 1]
+        if bx * bx + by * by > far * far:
+            continue
+        begin = scene.ranges[block, 0]
+        for edge in range(begin, begin + scene.ranges[block, 1]):
+            k = edge * EDGE_WIDTH
+            qx, qy = x - scene.edges[k], y - scene.edges[k + 1]
+            dx, dy, length = scene.edges[k + 4], scene.edges[k + 5], scene.edges[k + 6]
+            travel = speed * best
+            near = floor + travel
+            if qx * qx + qy * qy <= near * near:
+                room = math.hypot(qx, qy) - floor
+                best = min(best, circle_exit(qx, qy, max(room, ROUNDING), floor, vx, vy, omega, True))
+            side, along = dy * qx - dx * qy, dx * qx + dy * qy
+            if abs(side - floor) <= travel and -travel <= along <= length + travel:
+                best = min(best, _strip_time(qx, qy, dx, dy, length, floor, vx, vy, omega))
+    return best
+
+
+@compiled
+def safe_time(
+    points: Points,
+    turning: Points,
+    ends_only: bool,
+    chord_x: float,
+    chord_y: float,
+    turn: float,
+    vx: float,
+    vy: float,
+    hold: float,
+    keep: float,
+    keep_wall: float,
+    scene: PackedScene,
+    distances: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> tuple[float, int, int]:
+    """Return for how long a motion keeps the needle clear, at most `hold`, what ends it, and which point meets it.
+
+    No point of the needle gets closer than `keep` to a shape or `keep_wall` to the wall; one that is closer already
+    gets no closer than it is.
+
+    Args:
+        points: that stand for the needle, shape (m, 2) [m].
+        turning: velocity of each for a tip velocity of 1 m/s across the chord, shape (m, 2).
+        ends_only: whether the first and the last point are the ones nearest to the wall, as of a straight needle.
+        chord_x: unit vector along the chord.
+        chord_y: unit vector along the chord.
+        turn: rate of turning for that velocity [rad/m].
+        vx: velocity of the tip [m/s].
+        vy: velocity of the tip [m/s].
+        hold: [s].
+        keep: least distance of a point from shapes [m].
+        keep_wall: least distance of a point from the wall [m].
+        scene: packed.
+        distances: signed distance of each point from each disc, then polygon, shape (m, s) [m].
+        outward: its gradient, shape (m, s, 2).
+
+    Returns:
+        The time [s]; the index of the shape in the scene, `WALL` or `NOTHING`; the index of the point, and -1 for none.
+    """
+    best, what, where = hold, NOTHING, -1
+    along, across = vx * chord_x + vy * chord_y, -vx * chord_y + vy * chord_x
+    omega = turn * across
+    count, discs = len(points), len(scene.discs)
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        px, py = along * chord_x + across * turning[i, 0], along * chord_y + across * turning[i, 1]
+        speed = math.hypot(px, py)
+        if speed == 0.0:
+            continue
+        if not ends_only or i == 0 or i == count - 1:
+            away = math.hypot(x, y)
+            radius = max(scene.radius - keep_wall, away) + ROUNDING
+            if radius - away <= speed * best:
+                t = circle_exit(x, y, radius - away, radius, px, py, omega, False)
+                if t < best:
+                    best, what, where = t, WALL, i
+        for s in range(distances.shape[1]):
+            if distances[i, s] - keep > speed * best:
+                continue
+            if s < discs:
+                disc = scene.discs[s]
+                t = _disc_time(x - disc[0], y - disc[1], disc[2], keep, px, py, omega)
+            else:
+                t = _polygon_time(
+                    x,
+                    y,
+                    px,
+                    py,
+                    omega,
+                    distances[i, s],
+                    outward[i, s, 0],
+                    outward[i, s, 1],
+                    s - discs,
+                    keep,
+                    best,
+                    scene,
+                )
+            if t < best:
+                best, what, where = t, int(scene.shapes[s]), i
+    return best, what, where

@@ -1,0 +1,304 @@
+"""The needle's safety filter: the last thing that changes a velocity, whoever commanded it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.geometry.arc import needle_points
+from magnetosuture_thread.safety.barriers import SURE, measure, nearest_clear
+from magnetosuture_thread.safety.certificate import NOTHING, safe_time
+from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.limits import approached, shortened
+from magnetosuture_thread.safety.packed_scene import pack_scene
+from magnetosuture_thread.scene import Scene
+
+Vector = NDArray[np.float64]
+
+COARSEST = 5e-4  # m; distance at most between the points that stand for the needle, where that are not too many
+MAX_POINTS = 129
+BAND = 2e-6  # m; by which the barriers keep farther away than the certificate, so that a needle can slide there
+MAX_SPEED = 10.0  # m/s; a faster command is shortened first, as rounding grows with its size
+STUCK = 1e-3  # of the speed commanded; a needle that is left less rests
+WALL_NAME = "wall"
+SPEED, ACCELERATION, FRICTION = "speed", "acceleration", "friction"
+
+
+@dataclass(frozen=True)
+class FilteredCommand:
+    """What the filter makes of one commanded velocity.
+
+    Attributes:
+        commanded: velocity of the tip, shape (2,) [m/s].
+        filtered: after friction, limits and barriers, shape (2,) [m/s].
+        slowdown: by the thread's friction; 1 for none.
+        active: names of the constraints that changed it: "friction", "speed", "acceleration", "wall", or of a shape.
+        reason: why the needle rests although it is commanded to move; empty else.
+    """
+
+    commanded: Vector
+    filtered: Vector
+    slowdown: float = 1.0
+    active: tuple[str, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """What the compiled functions need of the needle in one pose."""
+
+    key: tuple[float, ...]
+    points: Vector
+    turning: Vector
+    chord: tuple[float, float]
+    distances: Vector
+    outward: Vector
+
+
+class NeedleSafetyFilter:
+    """Keeps the needle's axis at a distance from the wall and from every shape of a scene, in sampled time.
+
+    A commanded velocity is slowed by the thread's friction, shortened to the greatest speed, limited in how fast it
+    changes, and then bent aside as little as the barriers ask for,
+
+        min |v - v_commanded|^2    such that    grad h . J_p v >= -rate max(h, 0)      for points p of the needle
+        h = distance of p from the wall or a shape - keep_out,    rate = min(approach_rate, 1 / hold_time)
+
+    The guarantee is not in these rows but in `safe_share`: the share of a velocity that may be held, unchanged as the
+    needle sees it, for the whole of `hold_time` without any point of the axis getting closer than `keep_out`. It is
+    computed in closed form for the arcs on which the points move, not in steps. Whoever gives the needle another
+    velocity than the one filtered, as coil currents do, multiplies it by its own share.
+
+    A needle that is closer already may leave or slide along, and gets no closer; zero is always allowed, and nothing
+    but a command moves the needle, no faster than it was commanded.
+
+    The axis is represented by at most 129 points, a distance s apart. None of them gets closer to a shape than
+    sqrt(keep_out^2 + (1 + |c| keep_out) s^2 / 4), nor to the wall than keep_out + |c| s^2 / 8, with the needle's
+    curvature c: so nothing between two points is closer than keep_out.
+
+    Source: A. D. Ames et al., Control Barrier Functions: Theory and Applications, 2019, section II. Deviation:
+    max(h, 0) for h, so that a measured pose beyond the bound leaves zero feasible; the certificate.
+
+    Args:
+        scene: dish and shapes.
+        keep_out: least distance of the needle's axis from wall and shapes; half of its width is within [m].
+        approach_rate: share of that distance by which the needle may approach [1/s].
+        hold_time: for which a velocity may go on without anybody looking [s].
+        max_speed: of the tip [m/s].
+        max_acceleration: greatest change of the velocity before the barriers [m/s^2].
+        needle_length: along the needle's body; 0 for a point [m].
+        needle_curvature: of its arc, positive to the left of its heading [1/m].
+
+    Raises:
+        ConfigurationError: the needle has no room in the dish.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        keep_out: float,
+        approach_rate: float,
+        hold_time: float,
+        max_speed: float = math.inf,
+        max_acceleration: float = math.inf,
+        needle_length: float = 0.0,
+        needle_curvature: float = 0.0,
+    ) -> None:
+        self.scene, self.keep_out, self.hold_time = scene, keep_out, hold_time
+        self.kinematics = NeedleKinematics(needle_length, needle_curvature)
+        chord = self.kinematics.chord
+        if not keep_out > 0.0:
+            raise ConfigurationError("keep_out", keep_out, "a positive distance [m]")
+        least = chord + 2.0 * keep_out
+        if scene.dish.diameter <= least:
+            expected = f"more than {least:g} m, room for the needle and keep_out on both sides"
+            raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
+        self._rate = min(approach_rate, 1.0 / hold_time)
+        self._max_speed, self._max_acceleration = max_speed, max_acceleration
+        self._straight = abs(needle_curvature) * needle_length < 1e-9
+        if needle_length > 0.0:
+            spacing = max(min(COARSEST, 0.5 * keep_out), needle_length / (MAX_POINTS - 1))
+            body = needle_points(needle_length, needle_curvature, spacing)
+            spacing = needle_length / (len(body.points) - 1)
+            self._points, self._turning, self._turn = body.points, body.turning, 2.0 / chord
+        else:
+            spacing = 0.0
+            self._points, self._turning, self._turn = np.zeros((1, 2)), np.array([[0.0, 1.0]]), 0.0
+        bend = abs(needle_curvature)
+        self._keep = math.sqrt(keep_out**2 + 0.25 * spacing**2 * (1.0 + bend * keep_out))
+        self._keep_wall = keep_out + 0.125 * bend * spacing**2
+        self._packed = pack_scene(scene)
+        self._names = (*scene.names, WALL_NAME)  # so that -1 is the wall
+        self._touched = np.zeros(len(self._names), np.bool_)
+        self._pose: _Pose | None = None
+        # Compiled now, not in the first step.
+        middle, east = np.array([-0.5 * chord, 0.0]), np.array([1.0, 0.0])
+        self.nearest_clear(np.array([1e-3, 0.0]), middle, east)
+        self.safe_share(np.array([1e-3, 0.0]), middle, east)
+
+    def filter(
+        self,
+        commanded: Vector,
+        tail: Vector,
+        heading: Vector,
+        *,
+        slowdown: float = 1.0,
+        max_speed: float = math.inf,
+        previous: Vector | None = None,
+        elapsed: float = math.inf,
+    ) -> FilteredCommand:
+        """Return what is left of a commanded velocity: slowed, limited, and kept clear for the whole hold.
+
+        Args:
+            commanded: velocity of the tip, shape (2,) [m/s].
+            tail: the needle's tail, shape (2,) [m].
+            heading: unit vector along the needle at its tail, shape (2,).
+            slowdown: factor on the speed by the thread's friction, 0 to 1.
+            max_speed: a limit that holds now, besides the filter's own [m/s].
+            previous: velocity that the change is limited from, shape (2,) [m/s]; not limited if None.
+            elapsed: since then [s].
+
+        Raises:
+            InvalidInputError: something is not finite, or the slowdown is not within 0 and 1.
+        """
+        if not 0.0 <= slowdown <= 1.0:
+            raise InvalidInputError("slowdown", slowdown, "a factor from 0 to 1")
+        speed = _speed(commanded)
+        if speed == 0.0:
+            return FilteredCommand(commanded, np.zeros(2), slowdown)
+        active = [FRICTION] if slowdown < 1.0 else []
+        largest = min(self._max_speed, max_speed, MAX_SPEED)
+        velocity = shortened(slowdown * commanded, largest)
+        if slowdown * speed > largest * (1.0 + 1e-12):
+            active.append(SPEED)
+        if previous is not None and math.isfinite(self._max_acceleration):
+            change = self._max_acceleration * elapsed
+            if math.hypot(*(velocity - previous)) > change * (1.0 + 1e-12):
+                velocity = approached(previous, velocity, change)
+                active.append(ACCELERATION)
+        passed, touched = self.nearest_clear(velocity, tail, heading)
+        active += touched
+        if math.hypot(*passed) <= STUCK * math.hypot(*velocity):
+            named = [name for name in active if name not in (SPEED, ACCELERATION)] or active
+            return FilteredCommand(commanded, np.zeros(2), slowdown, tuple(active), held_by(named))
+        return FilteredCommand(commanded, passed, slowdown, tuple(active))
+
+    def nearest_clear(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[Vector, list[str]]:
+        """Return the velocity nearest to one that keeps clear for the hold, and what changed it.
+
+        Args:
+            velocity: of the tip, shape (2,) [m/s]; returned bit for bit where it keeps clear.
+            tail: the needle's tail, shape (2,) [m].
+            heading: unit vector along the needle at its tail, shape (2,).
+
+        Raises:
+            InvalidInputError: something is not finite.
+        """
+        speed = _speed(velocity)
+        pose = self._at(tail, heading)
+        if speed == 0.0:
+            return velocity, []
+        self._touched[:] = False
+        x, y = nearest_clear(
+            float(velocity[0]),
+            float(velocity[1]),
+            pose.points,
+            pose.turning,
+            self._straight,
+            *pose.chord,
+            self._turn,
+            self.hold_time,
+            self._rate,
+            self._keep,
+            self._keep_wall,
+            BAND,
+            self._packed,
+            pose.distances,
+            pose.outward,
+            self._touched,
+        )
+        if not self._touched.any():
+            return velocity, []
+        return np.array([x, y]), [self._names[k] for k in np.flatnonzero(self._touched)]
+
+    def safe_share(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[float, str]:
+        """Return the share of a velocity that keeps clear while it is held for the whole hold time: the guarantee.
+
+        With the share of it the needle goes the same way more slowly, and is at the end of the hold where with all
+        of it it would be when it has to stop.
+
+        Args:
+            velocity: of the tip, shape (2,) [m/s].
+            tail: the needle's tail, shape (2,) [m].
+            heading: unit vector along the needle at its tail, shape (2,).
+
+        Returns:
+            The share, 0 to 1, and the name of what it is for; empty for a share of 1.
+
+        Raises:
+            InvalidInputError: something is not finite.
+        """
+        _speed(velocity)
+        pose = self._at(tail, heading)
+        time, what, _ = safe_time(
+            pose.points,
+            pose.turning,
+            self._straight,
+            *pose.chord,
+            self._turn,
+            float(velocity[0]),
+            float(velocity[1]),
+            self.hold_time,
+            self._keep,
+            self._keep_wall,
+            self._packed,
+            pose.distances,
+            pose.outward,
+        )
+        return (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
+
+    def clearance(self, tail: Vector, heading: Vector) -> float:
+        """Return the signed least distance of the points of the needle's axis from the wall and all shapes [m].
+
+        Raises:
+            InvalidInputError: something is not finite.
+        """
+        pose = self._at(tail, heading)
+        wall = self.scene.dish.radius - float(np.hypot(pose.points[:, 0], pose.points[:, 1]).max())
+        return min(wall, float(pose.distances.min(initial=math.inf)))
+
+    def _at(self, tail: Vector, heading: Vector) -> _Pose:
+        """Return the needle in a pose, with its distances measured; the last pose is remembered."""
+        key = (float(tail[0]), float(tail[1]), float(heading[0]), float(heading[1]))
+        if self._pose is not None and self._pose.key == key:
+            return self._pose
+        size = math.hypot(key[2], key[3])
+        if not (math.isfinite(size) and size > 0.0 and math.isfinite(key[0]) and math.isfinite(key[1])):
+            raise InvalidInputError("pose", list(key), "finite numbers and a direction")
+        c, s = key[2] / size, key[3] / size
+        turn = np.array([[c, s], [-s, c]])  # of rows
+        e = self.kinematics.chord_direction(np.array([c, s]))
+        points = self._points @ turn + tail
+        shapes = len(self._packed.shapes)
+        distances, outward = np.empty((len(points), shapes)), np.empty((len(points), shapes, 2))
+        measure(points, self._packed, distances, outward)
+        self._pose = _Pose(key, points, self._turning @ turn, (float(e[0]), float(e[1])), distances, outward)
+        return self._pose
+
+
+def held_by(names: list[str]) -> str:
+    """Return the reason of a needle that rests at constraints."""
+    return f"stopped by {', '.join(dict.fromkeys(names))}"
+
+
+def _speed(velocity: Vector) -> float:
+    """Return the size of a velocity, once it is known to have one."""
+    x, y = float(velocity[0]), float(velocity[1])
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InvalidInputError("velocity", [x, y], "finite numbers [m/s]")
+    return math.hypot(x, y)

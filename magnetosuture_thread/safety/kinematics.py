@@ -1,0 +1,82 @@
+"""How a velocity of the needle's tip moves the needle: along an arc, and exactly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.geometry.arc import needle_chord
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NeedleKinematics:
+    """A needle that is driven along its chord and turned about the middle of it.
+
+        u = v . e,    omega = (v . n) / (chord / 2)
+        x_middle(t) = x_middle + u t sinc(omega t / 2) R(omega t / 2) e,    heading(t) = R(omega t) heading
+
+    with the tip's velocity v when the motion begins, the unit vector e from tail to tip and n to its left. The
+    velocity is constant as the needle has it, in the frame of its body: currents that do not change pull and turn
+    the needle with it. A needle of length 0 is a point, which goes straight.
+
+    Attributes:
+        length: of the needle along its body; 0 for a point [m].
+        curvature: of its arc, positive to the left of its heading [1/m].
+    """
+
+    length: float
+    curvature: float = 0.0
+
+    @cached_property
+    def _chord(self) -> tuple[float, Vector]:
+        return needle_chord(self.length, self.curvature)
+
+    @property
+    def chord(self) -> float:
+        """Distance from tail to tip [m]."""
+        return self._chord[0]
+
+    def chord_direction(self, heading: Vector) -> Vector:
+        """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
+        return np.asarray(self._chord[1] @ heading)
+
+    def tip(self, tail: Vector, heading: Vector) -> Vector:
+        """Return where the tip is, shape (2,) [m]."""
+        return np.asarray(tail + self.chord * self.chord_direction(heading))
+
+    def body_velocity(self, heading: Vector, velocity: Vector) -> tuple[float, float]:
+        """Return the components of a tip velocity along the chord and across it, to its left [m/s]."""
+        e = self.chord_direction(heading)
+        x, y = float(velocity[0]), float(velocity[1])
+        return float(e[0]) * x + float(e[1]) * y, float(e[0]) * y - float(e[1]) * x
+
+    def moved(
+        self, tail: Vector, heading: Vector, along: float, across: float, duration: float
+    ) -> tuple[Vector, Vector]:
+        """Return tail and heading after a motion.
+
+        Args:
+            tail: shape (2,) [m].
+            heading: unit vector at the tail, shape (2,).
+            along: of the tip's velocity, the part along the chord [m/s].
+            across: the part across it, to its left [m/s].
+            duration: of the motion [s].
+        """
+        e = self.chord_direction(heading)
+        if self.length == 0.0:
+            return tail + duration * np.array([along * e[0] - across * e[1], along * e[1] + across * e[0]]), heading
+        lever = 0.5 * self.chord
+        half = 0.5 * across / lever * duration
+        reach = along * duration * (math.sin(half) / half if half else 1.0)
+        c, s = math.cos(half), math.sin(half)
+        middle = tail + lever * e + reach * np.array([c * e[0] - s * e[1], s * e[0] + c * e[1]])
+        turn = np.array([[c * c - s * s, -2.0 * c * s], [2.0 * c * s, c * c - s * s]])
+        turned = turn @ heading
+        turned /= math.hypot(turned[0], turned[1])
+        return middle - lever * self.chord_direction(turned), turned

@@ -1,0 +1,121 @@
+"""A scene in flat arrays for compiled code: the dish, its discs, and the edges of its polygons in blocks."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, edges_of
+from magnetosuture_thread.geometry.obstacles.search import Nearest, search_edges
+from magnetosuture_thread.scene import Scene
+
+BLOCK = 12
+"""Edges of a polygon that follow one another and share a bounding circle, so that those far away cost one test."""
+
+
+class PackedScene(NamedTuple):
+    """A scene for compiled code. Not to be written to.
+
+    Attributes:
+        radius: of the dish [m].
+        discs: x, y and radius of each disc, shape (d, 3) [m].
+        polygons: for each polygon its first block and the one after its last, shape (p, 2).
+        shapes: index in the scene of each disc, then of each polygon, shape (d + p,).
+        circles: centre and radius of the circle around each block of edges, shape (b, 3) [m].
+        ranges: first edge of each block and the number of its edges, shape (b, 2).
+        edges: rows of `EDGE_WIDTH` numbers, flat, see `features.edges_of`.
+    """
+
+    radius: float
+    discs: NDArray[np.float64]
+    polygons: NDArray[np.int64]
+    shapes: NDArray[np.int64]
+    circles: NDArray[np.float64]
+    ranges: NDArray[np.int64]
+    edges: NDArray[np.float64]
+
+
+def pack_scene(scene: Scene) -> PackedScene:
+    """Return a scene for compiled code."""
+    discs, polygons, of_discs, of_polygons = [], [], [], []
+    circles: list[NDArray[np.float64]] = [np.empty((0, 3))]
+    ranges: list[NDArray[np.int64]] = [np.empty((0, 2), np.int64)]
+    numbers = [np.empty((0, EDGE_WIDTH))]
+    edges = blocks = 0
+    for index, obstacle in enumerate(scene.obstacles):
+        if isinstance(obstacle, Disc):
+            discs.append((*obstacle.centre, obstacle.radius))
+            of_discs.append(index)
+            continue
+        found = edges_of(obstacle).numbers
+        first = np.arange(0, len(found), BLOCK)
+        last = np.minimum(first + BLOCK, len(found))
+        corners = np.concatenate([found[:, 0:2], found[:, 2:4]])
+        low = np.minimum.reduceat(np.minimum(found[:, 0:2], found[:, 2:4]), first)
+        high = np.maximum.reduceat(np.maximum(found[:, 0:2], found[:, 2:4]), first)
+        # Rounding must not leave a corner outside of its circle.
+        radius = 0.5 * np.hypot(*(high - low).T) * (1.0 + 1e-9) + 1e-12 * float(np.abs(corners).max())
+        circles.append(np.column_stack([0.5 * (low + high), radius]))
+        ranges.append(np.column_stack([edges + first, last - first]))
+        polygons.append((blocks, blocks + len(first)))
+        of_polygons.append(index)
+        numbers.append(found)
+        edges, blocks = edges + len(found), blocks + len(first)
+    return PackedScene(
+        scene.dish.radius,
+        np.array(discs, dtype=np.float64).reshape(-1, 3),
+        np.array(polygons, dtype=np.int64).reshape(-1, 2),
+        np.array([*of_discs, *of_polygons], dtype=np.int64),
+        np.ascontiguousarray(np.concatenate(circles)),
+        np.ascontiguousarray(np.concatenate(ranges)),
+        np.concatenate(numbers).ravel(),
+    )
+
+
+@compiled
+def polygon_distance(
+    x: float,
+    y: float,
+    polygon: int,
+    guess: int,
+    scene: PackedScene,
+    nowhere: NDArray[np.int32],
+    distance: NDArray[np.float64],
+    outward: NDArray[np.float64],
+) -> tuple[float, float, float, int]:
+    """Return the signed distance of a point from a polygon, its gradient (2), and the block that is nearest.
+
+    Exact however far the point is, inside and outside: the edge or corner that is nearest of all tells the side.
+
+    Args:
+        x: coordinate of the point [m].
+        y: coordinate of the point [m].
+        polygon: index in `scene.polygons`.
+        guess: a block that may be near, which saves looking at others; -1 for none.
+        scene: packed.
+        nowhere: an empty array.
+        distance: an empty array.
+        outward: an empty array of shape (0, 2).
+    """
+    first, last = scene.polygons[polygon, 0], scene.polygons[polygon, 1]
+    best, block = Nearest(0, np.inf, np.inf, 0.0, 0.0, 0.0), -1
+    if first <= guess < last:
+        base, count = scene.ranges[guess, 0] * EDGE_WIDTH, scene.ranges[guess, 1]
+        best = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, outward)
+        block = guess
+    reach = math.sqrt(best.square)
+    for k in range(first, last):
+        dx, dy, radius = x - scene.circles[k, 0], y - scene.circles[k, 1], scene.circles[k, 2]
+        far = reach + radius
+        if k == guess or dx * dx + dy * dy >= far * far:
+            continue
+        base, count = scene.ranges[k, 0] * EDGE_WIDTH, scene.ranges[k, 1]
+        found = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, outward)
+        if found.square < best.square:
+            best, block, reach = found, k, math.sqrt(found.square)
+    return best.signed, best.x, best.y, block
