@@ -1,9 +1,10 @@
 """The scene: the dish and the named shapes in it, as every node knows them."""
 
-from magnetosuture_thread.scene.definitions import SHAPES, shape_from_mapping
+from magnetosuture_thread.scene.definitions import shape_from_mapping
 from magnetosuture_thread.scene.files import read_scene, scene_from_mapping, scene_to_mapping, write_scene
 from magnetosuture_thread.scene.places import WALL, occupant
 from magnetosuture_thread.scene.scene import KINDS, Dish, Scene, SceneShape
+from magnetosuture_thread.scene.shapes import SHAPES
 
 __all__ = [
     "KINDS",

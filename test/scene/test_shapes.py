@@ -13,7 +13,7 @@ from scipy.integrate import quad
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import shape_from_mapping
-from magnetosuture_thread.scene.definitions import ARC_TOLERANCE
+from magnetosuture_thread.scene.shapes import ARC_TOLERANCE
 
 HALF_PI = 0.5 * math.pi
 
