@@ -319,10 +319,19 @@ def nearest_clear(
             who[total, 0], who[total, 1] = where, ended
             total += 1
     touched[:] = False
+    if bx == vx and by == vy:
+        return vx, vy
     if what != NOTHING:
         touched[what] = True
+    worst, missing = -1, 0.0
     for k in range(total):
-        if rows[k, 0] * vx + rows[k, 1] * vy < least[k] or depth[k] > 0.0:
-            if rows[k, 0] * ux + rows[k, 1] * uy - least[k] <= ACTIVE * speed or depth[k] > 0.0:
-                touched[who[k, 1]] = True
+        least[k] = rows[k, 0] * vx + rows[k, 1] * vy - bounded[k]  # what the commanded velocity leaves
+        if least[k] < missing:
+            worst, missing = k, least[k]
+        left = rows[k, 0] * ux + rows[k, 1] * uy - bounded[k]
+        leans = depth[k] > 0.0 and least[k] < LEAN * speed * math.hypot(rows[k, 0], rows[k, 1])
+        if leans or (least[k] < 0.0 and left <= ACTIVE * speed):
+            touched[who[k, 1]] = True
+    if worst >= 0 and not touched.any():
+        touched[who[worst, 1]] = True
     return bx, by

@@ -222,7 +222,7 @@ class NeedleSafetyFilter:
             pose.outward,
             self._touched,
         )
-        if not self._touched.any():
+        if x == velocity[0] and y == velocity[1]:
             return velocity, []
         return np.array([x, y]), [self._names[k] for k in np.flatnonzero(self._touched)]
 

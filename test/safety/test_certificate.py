@@ -1,0 +1,148 @@
+"""For how long a motion keeps clear, against looking at it in small steps by other code."""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.keep_out import Needle, World, random_scene
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.safety import NeedleKinematics, NeedleSafetyFilter
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
+
+EAST = np.array([1.0, 0.0])
+HOLD = 0.3
+
+
+def safety(scene: Scene, length: float, curvature: float = 0.0, keep: float = 5e-4) -> NeedleSafetyFilter:
+    """Return a filter that holds for 0.3 s."""
+    return NeedleSafetyFilter(
+        scene, keep_out=keep, approach_rate=10.0, hold_time=HOLD, needle_length=length, needle_curvature=curvature
+    )
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_what_is_certified_keeps_clear_and_little_more_would_not(seed: int):
+    random = np.random.default_rng(seed)
+    tight = 0
+    for _ in range(8):
+        scene = random_scene(random)
+        length = float(random.uniform(0.001, 0.01))
+        curvature = float(random.choice([0.0, random.uniform(-2.5, 2.5) / length]))
+        world, filtered = World(scene), safety(scene, length, curvature, 3e-4)
+        for _ in range(25):
+            r, angle = world.radius * math.sqrt(random.uniform()), float(random.uniform(-math.pi, math.pi))
+            needle = Needle(length, curvature, cmath.rect(r, float(random.uniform(-3.0, 3.0))), angle)
+            if world.clearance([needle.points()]) < 3.6e-4:
+                continue
+            velocity = cmath.rect(float(random.uniform(0.0, 0.03)), float(random.uniform(-3.0, 3.0)))
+            share, _ = filtered.safe_share(np.array([velocity.real, velocity.imag]), *needle.pose())
+            axes = [needle.moved(velocity, HOLD * share * k / 300).points() for k in range(301)]
+            assert world.clearance(axes) > 3e-4 - 1e-9
+            if share < 0.9:
+                end = needle.moved(velocity, HOLD * min(1.0, share + 0.01)).points()
+                tight += world.clearance([end]) < 3e-4 + 6e-5
+    assert tight > 0
+
+
+@pytest.mark.parametrize("curvature", [0.0, 250.0, -250.0])
+def test_the_kinematics_are_those_of_a_body(curvature: float):
+    needle, kinematics = Needle(0.007, curvature, 0.001 + 0.002j, 0.4), NeedleKinematics(0.007, curvature)
+    tail, heading = needle.pose()
+    along, across = kinematics.body_velocity(heading, np.array([0.004, -0.011]))
+    moved = kinematics.moved(tail, heading, along, across, 0.7)
+    expected = needle.moved(0.004 - 0.011j, 0.7).pose()
+    np.testing.assert_allclose(moved[0], expected[0], atol=1e-14)
+    np.testing.assert_allclose(moved[1], expected[1], atol=1e-12)
+
+
+def test_a_point_goes_straight():
+    tail, heading = NeedleKinematics(0.0).moved(np.zeros(2), EAST, 0.003, 0.004, 2.0)
+    assert tail.tolist() == [0.006, 0.008]
+    assert heading.tolist() == EAST.tolist()
+
+
+def test_a_needle_may_turn_many_times_where_there_is_room():
+    filtered = safety(Scene(Dish(0.05)), 0.001)
+    assert filtered.safe_share(np.array([0.0, 0.03]), np.array([-0.0005, 0.0]), EAST) == (1.0, "")
+
+
+def test_a_turning_needle_is_stopped_by_what_its_tip_meets():
+    """A quarter of a turn away from the tip, and beyond half a turn from the tail."""
+    post = SceneShape("post", "instrument", Disc((0.0, 0.0051), 0.001))
+    filtered = safety(Scene(Dish(0.05), (post,)), 0.007)
+    lever = 0.0035
+    assert filtered.safe_share(np.array([0.0, 0.05]), np.array([-lever, 0.0]), EAST)[0] == 1.0
+    near = SceneShape("near", "instrument", Disc((0.0, 0.0045), 0.001))
+    share, name = safety(Scene(Dish(0.05), (near,)), 0.007).safe_share(
+        np.array([0.0, 0.05]), np.array([-lever, 0.0]), EAST
+    )
+    # The tip is at the distance of 1.5 mm from the centre at (0, 4.5 mm).
+    keep = math.hypot(5e-4, 0.5 * 0.007 / 28)
+    c = (lever**2 + 0.0045**2 - (0.001 + keep) ** 2) / (2.0 * lever * 0.0045)
+    assert name == "near"
+    assert share * HOLD * 0.05 / lever == pytest.approx(math.asin(c), rel=1e-6)
+
+
+def test_a_straight_edge_stops_a_point_where_it_is_met():
+    wall = SceneShape("block", "wall", Polygon(((-0.01, 0.001), (0.01, 0.001), (0.01, 0.003), (-0.01, 0.003))))
+    share, name = safety(Scene(Dish(0.05), (wall,)), 0.0).safe_share(np.array([0.001, 0.01]), np.zeros(2), EAST)
+    assert name == "block"
+    assert share * HOLD * 0.01 == pytest.approx(0.0005, rel=1e-6)
+
+
+def test_one_who_is_too_near_may_slide_and_leave_and_goes_no_deeper():
+    block = SceneShape("block", "wall", Polygon(((-0.01, 0.0), (0.01, 0.0), (0.01, 0.002), (-0.01, 0.002))))
+    filtered = safety(Scene(Dish(0.05), (block,)), 0.0)
+    for y in (-3e-4, -1e-6, 2e-4, 9e-4):  # before it, and inside
+        at = np.array([0.0, y])
+        assert filtered.safe_share(np.array([0.0, 0.001]), at, EAST)[0] < 1e-6 if y < 9e-4 else True
+        assert filtered.safe_share(np.array([0.0, -0.001]), at, EAST)[0] == 1.0
+        if y < 0.0:
+            assert filtered.safe_share(np.array([0.001, 0.0]), at, EAST)[0] == 1.0
+
+
+def test_around_a_dish_both_ends_slide_at_the_bound():
+    """The motion is a turn about the dish's centre: nothing gets nearer, whatever rounding says."""
+    filtered, radius = safety(Scene(Dish(0.035)), 0.007), 0.0175 - 5e-4
+    lever = 0.0035
+    middle = math.sqrt(radius**2 - lever**2)
+    velocity = np.array([-0.02 * lever / middle, 0.02])  # forwards, and turned to the left
+    assert filtered.safe_share(velocity, np.array([middle, -lever]), np.array([0.0, 1.0]))[0] == 1.0
+    assert filtered.safe_share(velocity * [0.9, 1.0], np.array([middle, -lever]), np.array([0.0, 1.0]))[0] < 0.01
+
+
+def test_between_two_points_of_the_needle_a_corner_keeps_out_too():
+    random, worst = np.random.default_rng(3), math.inf
+    for _ in range(40):
+        x = float(random.uniform(-0.003, 0.003))
+        spike = SceneShape("spike", "instrument", Polygon(((x, 0.002), (x + 2e-5, 0.006), (x - 2e-5, 0.006))))
+        scene = Scene(Dish(0.05), (spike,))
+        filtered, needle = safety(scene, 0.007), Needle(0.007, 0.0, 0j, 0.0)
+        # Sidewards, as a motion that is only turned about a far point: many small steps.
+        for _ in range(30):
+            pose = needle.pose()
+            velocity = np.array([0.0, 0.02 if x > 0.0 else -0.02])
+            share, _ = filtered.safe_share(velocity, *pose)
+            needle = needle.moved(complex(*velocity), HOLD * share)
+        worst = min(worst, World(scene).clearance([needle.points()]))
+    assert 5e-4 - 1e-9 < worst < 5.3e-4
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_refused(bad: float):
+    filtered, good = safety(Scene(), 0.007), np.array([0.001, 0.0])
+    for velocity, tail, heading in (
+        (np.array([bad, 0.0]), good, EAST),
+        (good, np.array([0.0, bad]), EAST),
+        (good, good, np.array([bad, 0.0])),
+        (good, good, np.zeros(2)),
+    ):
+        with pytest.raises(InvalidInputError, match="finite numbers"):
+            filtered.filter(velocity, tail, heading)
+        with pytest.raises(InvalidInputError, match="finite numbers"):
+            filtered.safe_share(velocity, tail, heading)

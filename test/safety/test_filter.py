@@ -1,0 +1,152 @@
+"""What the filter makes of a commanded velocity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.keep_out import Needle, World, random_scene
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.safety import NeedleSafetyFilter
+from magnetosuture_thread.safety.filter import BAND
+from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+
+EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
+POST = SceneShape("post", "instrument", Disc((0.006, 0.004), 0.002))
+BLOCK = SceneShape("block", "wall", Polygon(((-0.01, 0.0), (0.01, 0.0), (0.01, 0.002), (-0.01, 0.002))))
+
+
+def needle_filter(*shapes: SceneShape, length: float = LENGTH, **values: float) -> NeedleSafetyFilter:
+    """Return a filter in a dish of 35 mm."""
+    given = {"keep_out": KEEP, "approach_rate": 10.0, "hold_time": HOLD, "needle_length": length, **values}
+    return NeedleSafetyFilter(Scene(Dish(0.035), shapes), **given)
+
+
+@pytest.mark.parametrize("way", [0.0, 1.0, 2.5, -2.0])
+def test_far_from_everything_a_velocity_is_left_bit_for_bit(way: float):
+    velocity = 0.01 * np.array([math.cos(way), math.sin(way)])
+    found = needle_filter(POST).filter(velocity, np.array([-0.0035, -0.006]), EAST)
+    assert found.filtered.tolist() == velocity.tolist()
+    assert (found.active, found.reason) == ((), "")
+
+
+def test_friction_comes_first_then_speed_then_acceleration():
+    limited = needle_filter(max_speed=0.02, max_acceleration=0.5)
+    at = (np.array([-0.0035, 0.0]), EAST)
+    found = limited.filter(np.array([0.03, 0.0]), *at, slowdown=0.5)
+    assert (found.filtered.tolist(), found.active) == ([0.015, 0.0], ("friction",))
+    found = limited.filter(np.array([0.03, 0.04]), *at)
+    assert found.filtered.tolist() == pytest.approx([0.012, 0.016])
+    assert found.active == ("speed",)
+    found = limited.filter(np.array([0.03, 0.0]), *at, previous=np.zeros(2), elapsed=0.01)
+    assert (found.filtered.tolist(), found.active) == ([0.005, 0.0], ("speed", "acceleration"))
+    found = limited.filter(np.array([0.03, 0.0]), *at, max_speed=0.001)
+    assert (found.filtered.tolist(), found.active) == ([0.001, 0.0], ("speed",))
+    assert limited.filter(np.array([1e308, 1e308]), *at).filtered.tolist() == pytest.approx([0.02 / 2**0.5] * 2)
+    for slowdown in (-0.1, 1.1, math.nan):
+        with pytest.raises(InvalidInputError, match="slowdown"):
+            limited.filter(np.array([0.03, 0.0]), *at, slowdown=slowdown)
+
+
+def test_towards_the_wall_it_slows_down_and_says_by_what():
+    tail = np.array([0.0175 - 2.0 * KEEP - LENGTH, 0.0])
+    found = needle_filter().filter(np.array([0.02, 0.0]), tail, EAST)
+    assert found.filtered.tolist() == pytest.approx([RATE * KEEP, 0.0], rel=0.01)
+    assert (found.active, found.reason) == (("wall",), "")
+
+
+def test_a_slower_approach_may_be_asked_for():
+    tail = np.array([0.0175 - 2.0 * KEEP - LENGTH, 0.0])
+    found = needle_filter(approach_rate=1.0).filter(np.array([0.02, 0.0]), tail, EAST)
+    assert found.filtered.tolist() == pytest.approx([1.0 * KEEP, 0.0], rel=0.01)
+
+
+def test_head_on_it_rests_and_says_why():
+    found = needle_filter().filter(0.01 * EAST, np.array([0.0175 - KEEP - LENGTH, 0.0]), EAST)
+    assert found.filtered.tolist() == [0.0, 0.0]
+    assert (found.active, found.reason) == (("wall",), "stopped by wall")
+
+
+def test_rest_is_left_alone_wherever_the_needle_is():
+    for x in (0.0, 0.012, 0.05):
+        found = needle_filter(POST).filter(np.zeros(2), np.array([x, 0.0]), EAST)
+        assert (found.filtered.tolist(), found.active, found.reason) == ([0.0, 0.0], (), "")
+
+
+def test_a_point_slides_along_a_block_and_leaves_it():
+    point = needle_filter(BLOCK, length=0.0)
+    at = (np.array([0.0, -KEEP - BAND]), EAST)
+    np.testing.assert_allclose(point.filter(np.array([0.003, 0.004]), *at).filtered, [0.003, 0.0], atol=1e-5)
+    away = np.array([0.003, -0.004])
+    assert point.filter(away, *at).filtered.tolist() == away.tolist()
+
+
+def test_beyond_its_bound_a_needle_that_slides_leaves_a_little():
+    at = (np.array([0.0, -0.9 * KEEP]), EAST)
+    x, y = needle_filter(BLOCK, length=0.0).filter(np.array([0.003, 0.004]), *at).filtered
+    assert x > 0.002
+    assert y / x == pytest.approx(-math.tan(0.1), rel=1e-6)
+
+
+def test_between_two_walls_too_near_a_needle_can_still_leave_along_them():
+    walls = [
+        SceneShape(
+            f"wall_{k}", "wall", Polygon(((-0.01, s * 4e-4), (0.01, s * 4e-4), (0.01, s * 2e-3), (-0.01, s * 2e-3)))
+        )
+        for k, s in enumerate((1.0, -1.0))
+    ]
+    found = needle_filter(*walls).filter(np.array([0.004, 0.003]), np.array([-0.0035, 0.0]), EAST)
+    np.testing.assert_allclose(found.filtered, [0.004, 0.0], atol=1e-9)
+
+
+def test_a_curved_needle_is_kept_clear_with_its_belly():
+    """Its chord passes the post by more than the distance, its body does not."""
+    chord = 2.0 / 250.0 * math.sin(0.5 * 250.0 * LENGTH)
+    belly = (1.0 - math.cos(0.5 * 250.0 * LENGTH)) / 250.0
+    post = SceneShape("post", "instrument", Disc((0.0, -belly - KEEP - 0.00115), 0.001))
+    heading = np.array([math.cos(-0.5 * 250.0 * LENGTH), math.sin(-0.5 * 250.0 * LENGTH)])
+    # Forwards and down at once, as no needle moves sidewards.
+    velocity, tail = np.array([0.006, -0.01]), np.array([-0.5 * chord, 0.0])
+    assert "post" in needle_filter(post, needle_curvature=250.0).filter(velocity, tail, heading).active
+    assert "post" not in needle_filter(post).filter(velocity, tail, EAST).active
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_it_is_never_faster_than_commanded_and_near_nothing_the_best_there_is(seed: int):
+    random = np.random.default_rng(seed)
+    rested = 0
+    for _ in range(10):
+        scene = random_scene(random)
+        world = World(scene)
+        safety = NeedleSafetyFilter(scene, keep_out=3e-4, approach_rate=10.0, hold_time=HOLD, needle_length=0.004)
+        for _ in range(30):
+            point = 1.2 * world.radius * random.uniform(-1.0, 1.0, 2)
+            needle = Needle(0.004, 0.0, complex(*point), float(random.uniform(-3.0, 3.0)))
+            velocity = random.uniform(-0.02, 0.02, 2)
+            found = safety.filter(velocity, *needle.pose())
+            assert np.linalg.norm(found.filtered) <= np.linalg.norm(velocity) * (1.0 + 1e-9)
+            assert bool(found.reason) == (not found.filtered.any())
+            assert bool(found.active) == (found.filtered.tolist() != velocity.tolist())
+            share, _ = safety.safe_share(found.filtered, *needle.pose())
+            assert share > 1.0 - 1e-6
+            rested += bool(found.reason)
+    assert rested < 200
+
+
+def test_a_dish_without_room_is_refused():
+    with pytest.raises(ConfigurationError, match=r"scene\.dish\.diameter: got 0\.007, .* room for the needle"):
+        NeedleSafetyFilter(Scene(Dish(0.007)), keep_out=KEEP, approach_rate=10.0, hold_time=HOLD, needle_length=LENGTH)
+
+
+def test_through_the_channel_of_the_hernia_nothing_is_taken_off():
+    safety = NeedleSafetyFilter(
+        read_scene("hernia_ring"), keep_out=2.5e-4, approach_rate=10.0, hold_time=0.205, needle_length=0.0025
+    )
+    for y in np.linspace(-0.0105, -0.005, 40):
+        for speed in (0.002, 0.003):
+            found = safety.filter(speed * NORTH, np.array([0.0, y]), NORTH)
+            assert found.filtered.tolist() == (speed * NORTH).tolist()
