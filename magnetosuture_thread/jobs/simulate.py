@@ -163,16 +163,20 @@ def _run(
         ):
             running, interruption = False, Interruption()
             early: dict[str, bytes] = {}
+            begin: int | None = None
 
             def receive(topic: str, arrival: int, data: bytes) -> None:
+                nonlocal begin
                 # While nodes start, only what is said once and for all is worth keeping: for the bag's start.
                 if not running:
                     early.update({topic: data} if topic in ONCE else {})
                     return
-                for name, said_early in early.items():
-                    bag.write(name, arrival, said_early)
-                early.clear()
-                bag.write(topic, arrival, data)
+                if begin is None:
+                    begin = arrival
+                    for name, said_early in early.items():
+                        bag.write(name, begin, said_early)
+                # What waited elsewhere may have arrived before: the scene is the bag's first message all the same.
+                bag.write(topic, max(arrival, begin + 1), data)
 
             def check() -> None:
                 interruption.check()
@@ -250,12 +254,14 @@ def _follow(
     points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
     longest = PATIENCE * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE + (duration or 0.0)
     began = time.monotonic()
-    following = False
+    following, started = False, began
     while True:
         check()
         recorder.spin(LOOK)
         if not following and recorder.taken[TIP_SETPOINT.recorded]:
             following, began = True, time.monotonic()
+        if "path_follower" not in recorder.said and time.monotonic() - started < START_TIMEOUT:
+            began = time.monotonic()  # its process is still loading
         said, values = recorder.said.get("path_follower", ("", {}))
         elapsed = (time.monotonic() - began) * pace
         done = float(values.get("progress", 0.0))
