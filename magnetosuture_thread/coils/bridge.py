@@ -225,7 +225,7 @@ class Bridge:
         pose = self.needle.pose(now, arrival)
         unpredicted = self.prediction.missing(now, arrival)
         reasons = self._why_not(arrival, then, driver, followed, unpredicted)
-        active = (NO_PREDICTION,) if unpredicted else ()
+        active: tuple[str, ...] = (NO_PREDICTION,) if unpredicted else ()
         if reasons or pose is None or self._filter is None:
             return self._rest(now, arrival, followed, reasons, active)
         if not followed.velocity.any():

@@ -185,7 +185,7 @@ class _Output:
         if isinstance(outcome.problem, InvalidInputError):
             return  # as live: a pose that is refused gets no answer
         reason = WAITING if outcome.waiting else str(outcome.problem) if prediction is None else prediction.status
-        packed = packed_margins(time_of(stamp), step.margins, reason, scene_version=outcome.scene_version)
+        packed = packed_margins(time_of(stamp), step.margins, reason, outcome.scene_version)
         self._bag.write(MARGINS.recorded, max(stamp, 0), packed)
 
     def _frame(self, stamp: int, seen: Seen) -> None:

@@ -124,7 +124,7 @@ class ThreadModelNode(Node):
         else:
             problem = WAITING if outcome.problem is None else str(outcome.problem)
             (self._health.warn if outcome.problem is None else self._health.error)(problem)
-            packed = packed_margins(time_of(outcome.stamp), None, problem, scene_version=outcome.scene_version)
+            packed = packed_margins(time_of(outcome.stamp), None, problem, outcome.scene_version)
             self._margins.publish(packed)
 
     def _publish(self, outcome: Outcome, prediction: Prediction, step_time: float) -> None:
@@ -133,7 +133,7 @@ class ThreadModelNode(Node):
         self._predicted.publish(packed_prediction(when, prediction, settings.material, step_time=step_time))
         margins = outcome.margins
         reason = "" if margins else prediction.status
-        self._margins.publish(packed_margins(when, margins, reason, scene_version=version))
+        self._margins.publish(packed_margins(when, margins, reason, version))
         if self._markers.get_subscription_count():
             friction = margins.friction if margins else UNKNOWN
             self._markers.publish(packed_markers(when, prediction, friction, self._session.thread.diameter))

@@ -62,16 +62,16 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
     )
 
 
-def packed_margins(time: Time, margins: Margins | None, reason: str = "", *, scene_version: str = "") -> bytes:
+def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_version: str = "") -> bytes:
     """Return a SafetyMargins: every barrier, the least of each kind, and what touches; or why there are none.
 
     Args:
         time: of the pose, seconds and nanoseconds.
         margins: of its prediction; None where there are none.
         reason: why there are none.
-        scene_version: of the scene that they are of.
+        scene_version: of the scene in force where there are none.
     """
-    scene = text(scene_version)
+    scene = text(scene_version if margins is None else margins.scene_version)
     if margins is None:
         words = text(reason)
         return BEGIN + _no_margins_form(scene[0], words[0]).pack(

@@ -32,7 +32,7 @@ def prediction(y: float) -> Prediction:
     """Return a straight thread."""
     vertices = np.column_stack([-0.25 * np.arange(5), np.full(5, y)])
     stretch = np.array([0.0, -0.002, 0.001, 0.0])
-    return Prediction(1.0, "rod", vertices, stretch, 0.1, 1, "banded", "solved", 1e-9, True, list)
+    return Prediction(1.0, "rod", "", vertices, stretch, 0.1, 1, "banded", "solved", 1e-9, True, list)
 
 
 def margins(clearance: float) -> Margins:

@@ -20,8 +20,8 @@ from magnetosuture_thread.study.calibration.parameters import with_stiffness_ove
 from magnetosuture_thread.study.calibration.passage import Passage, passage_of
 from magnetosuture_thread.study.sight import Sight
 
-SETTINGS = ThreadModelSettings(length=0.019, segments=12, longest_step=0.07)  # one step a pose
-SILK = ThreadModelSettings(material="silk_6_0", length=0.15, segments=30, longest_step=0.07)
+SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, longest_step=0.07)  # one step a pose
+SILK = ThreadModelSettings(material="silk_6_0", thread_length=0.15, segments=30, longest_step=0.07)
 DRAG, LENGTH = 1.0, 0.019  # Pa s, m; of the rig's thread
 RATE = 15.0  # poses a second
 NEEDLE = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
@@ -76,7 +76,7 @@ def model_run(
     settings: ThreadModelSettings, duration: float = 6.0, scale: float = 6e-3, period: float = 8.0
 ) -> tuple[Sight, ...]:
     """Return what is seen of a thread that moves exactly as the model says."""
-    session = ThreadSession(replace(settings, initial_shape="straight"))
+    session = ThreadSession(replace(settings, initial_shape="straight"), None)
     found = []
     for index in range(round(duration * RATE)):
         stamp = round((1.0 + index / RATE) * 1e9)
