@@ -2,8 +2,8 @@
 
 Random accepted parameters of the coil bridge, random scenes with sharp corners and narrow channels, straight and curved
 needles, commands towards what is nearest, along it and at random, poses that come late by up to `pose_timeout`, and
-a bridge that stalls while the coils hold their last currents. How the needle moves and how near it comes is computed here
-anew, with complex numbers and shapely, by none of the code that is attacked.
+a bridge that stalls while the coils hold their last currents. How the needle moves and how near it comes is computed
+here anew, with complex numbers and shapely, by none of the code that is attacked.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import sys
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ import shapely
 from magnetosuture_thread.coils.bridge import Bridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.coils.settings import MAX_BLIND_WAY, CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, shape_from_mapping
@@ -32,6 +33,7 @@ from magnetosuture_thread.scene import Dish, Scene, SceneShape, shape_from_mappi
 TOLERANCE = 5e-6  # m; deeper is a violation
 READY = DriverState(True)
 SUBSTEP = 2e-5  # m of way between two looks at the clearance
+REPORT_EVERY = 500.0  # s of simulated time
 EPISODE = 4.0  # s of simulated time with the same parameters and scene
 
 
@@ -130,7 +132,7 @@ def random_settings(random: np.random.Generator) -> CoilBridgeSettings:
                 driver_timeout=driver_timeout,
                 command_timeout=min(1.0, max(4.0 / rate, float(random.uniform(0.05, 1.0)))),
                 pose_timeout=min(1.0, max(4.0 / rate, float(random.uniform(0.05, 1.0)))),
-                max_speed=float(min(0.5, random.choice([0.01 / hold, random.uniform(0.001, 0.01) / hold]))),
+                max_speed=float(min(0.5, random.choice([1.0, random.uniform(0.1, 1.0)]) * MAX_BLIND_WAY / hold)),
                 max_acceleration=float(10.0 ** random.uniform(-1.0, 2.0)),
                 max_current_slew=float(10.0 ** random.uniform(2.0, 5.0)),
                 max_current=float(random.uniform(2.0, 30.0)),
@@ -155,7 +157,7 @@ def random_scene(random: np.random.Generator) -> Scene:
         return share * radius * math.sqrt(random.uniform()) * np.array(_unit(random.uniform(-math.pi, math.pi)))
 
     def add(description: dict[str, object]) -> None:
-        with contextlib.suppress(ConfigurationError):
+        with contextlib.suppress(ConfigurationError):  # what bounds no area is left out
             shapes.append(shape_from_mapping(f"shape_{len(shapes)}", description))
 
     for _ in range(int(random.integers(0, 5))):
@@ -378,9 +380,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run it; 1 if the promise was broken."""
     total, began, seed = Tally(), time.process_time(), options.seed
+    shown = 0.0
     while total.seconds < options.seconds:
         total.add(attack(seed))
         seed += 1
+        if total.seconds >= shown + REPORT_EVERY:
+            shown = total.seconds
+            print(f"{shown:.0f} s, {total.violations} violations", file=sys.stderr, flush=True)
     figures = {**dataclasses.asdict(total), "worst": total.worst[:20], "cpu_seconds": time.process_time() - began}
     if options.json:
         print(json.dumps(figures, indent=2))

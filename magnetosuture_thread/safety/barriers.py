@@ -87,12 +87,12 @@ def find_rows(
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
         away = math.hypot(x, y)
-        if (not ends_only or i == 0 or i == count - 1) and scene.radius - away - keep_wall <= reach:
-            if rows < len(margin) and away > 1e-9:
-                margin[rows], bend[rows] = scene.radius - away - keep_wall, -1.0 / away
-                gradient[rows, 0], gradient[rows, 1] = -x / away, -y / away
-                who[rows, 0], who[rows, 1] = i, WALL
-                rows += 1
+        at_end = not ends_only or i == 0 or i == count - 1
+        if at_end and scene.radius - away - keep_wall <= reach and rows < len(margin) and away > 1e-9:
+            margin[rows], bend[rows] = scene.radius - away - keep_wall, -1.0 / away
+            gradient[rows, 0], gradient[rows, 1] = -x / away, -y / away
+            who[rows, 0], who[rows, 1] = i, WALL
+            rows += 1
         for s in range(distances.shape[1]):
             distance = distances[i, s]
             if distance - keep > reach:

@@ -40,7 +40,8 @@ class Bench:
         """Return settings for the boards."""
         ports = [str(line.path) for line in self.stage.lines for _ in line.boards]
         addresses = [board.address for board in self.boards]
-        return CoilBridgeSettings(**{"roboclaw_ports": ports, "roboclaw_addresses": addresses, **changes})
+        slow = {"max_speed": 0.005}  # with which the boards may have any timeout
+        return CoilBridgeSettings(**{"roboclaw_ports": ports, "roboclaw_addresses": addresses, **slow, **changes})
 
     def open(self, *, ready: bool = True, patience: float | None = None, **changes: Any) -> RoboClawDriver:
         """Return an open driver, once it is ready."""

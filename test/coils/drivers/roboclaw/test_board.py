@@ -123,7 +123,9 @@ def patient(port: ExchangePort) -> None:
 
 def board(port: ExchangePort, tenths: int = 2, hurries: bool = False) -> Board:
     """Return the board on a line."""
-    return Board(port, 0, 128, "board 0", CoilBridgeSettings(driver_timeout=0.1 * tenths), lambda: hurries)
+    return Board(
+        port, 0, 128, "board 0", CoilBridgeSettings(driver_timeout=0.1 * tenths, max_speed=0.005), lambda: hurries
+    )
 
 
 def give(made: Board, *currents: float) -> None:
