@@ -22,7 +22,7 @@ ALLOWED = {
     "compiled": set(),
     "geometry": {"errors", "compiled"},
     "model": {*BASE, "compiled", "geometry"},
-    "vision": {*BASE, "compiled", "geometry"},
+    "vision": {*BASE, "compiled", "geometry", "scene"},
     "coils": {*BASE, "geometry"},
     "guidance": {*BASE, "geometry"},
     "console": {*BASE, "geometry"},

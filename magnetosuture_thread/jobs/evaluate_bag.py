@@ -24,6 +24,7 @@ from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.predictions import predictions
 from magnetosuture_thread.offline.sights import NOT_FOUND, Sights, pixels
 from magnetosuture_thread.offline.unpacking import stamp_of
+from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.study.bag_table import Row, row_of
 from magnetosuture_thread.study.report.account import Account
 from magnetosuture_thread.study.report.figures import About
@@ -197,7 +198,7 @@ def _photos(given: Given, moments: list[Moment]) -> dict[int, Photo]:
             images[stamp] = pixels(record.decode(), record.type_name)
         except (BagError, InvalidInputError):
             continue
-        view = VisionTracker(given.setup.vision).look(images[stamp]).view
+        view = VisionTracker(given.setup.vision, Scene(Dish(given.setup.vision.dish_diameter))).look(images[stamp]).view
         if view is not None:
             views[stamp] = view
     spare = next(iter(views.values()), None)

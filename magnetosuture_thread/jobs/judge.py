@@ -20,6 +20,7 @@ from magnetosuture_thread.interface import NEEDLE_COMMAND, SEEN_THREAD, TRUE_THR
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.offline.predictions import chosen_source
 from magnetosuture_thread.offline.sights import pixels
+from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.picture import draw_summary
 from magnetosuture_thread.study.replayed import Instant, Summary
@@ -152,7 +153,7 @@ def write_results(
 def _frame_of(given: Given, stamp: int) -> tuple[NDArray[np.uint8], DishView] | None:
     """Return the camera frame of a stamp, and where the dish is, by the first frame in which it is found."""
     view, frame = None, None
-    tracker = VisionTracker(given.setup.vision)
+    tracker = VisionTracker(given.setup.vision, Scene(Dish(given.setup.vision.dish_diameter)))
     camera = given.recording.camera
     assert camera is not None
     for record in given.recording.records([camera], start=given.start, duration=given.duration):

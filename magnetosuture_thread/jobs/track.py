@@ -14,6 +14,7 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.jobs.frames import Frame, FrameSource, numbered
+from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -97,7 +98,7 @@ def track(
     source = FrameSource(paths, remap=remap)
     for doubt in source.doubts:
         say(f"{paths[0]} {doubt}")
-    tracker = VisionTracker(settings)
+    tracker = VisionTracker(settings, Scene(Dish(settings.dish_diameter)))
     warm_up()
     results = []
     # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.

@@ -18,6 +18,7 @@ from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.look import no_pose
 from magnetosuture_thread.vision.session import TrackerSession
@@ -35,7 +36,7 @@ class VisionTrackerNode(Node):
         settings = declare(self, VisionTrackerSettings)
         self.get_logger().info("loading the tracker's kernels; the first start on a machine compiles them")
         warm_up()
-        self._session = TrackerSession(settings)
+        self._session = TrackerSession(settings, Scene(Dish(settings.dish_diameter)))
         self._health = Health(self)
         self._words = "nothing seen"
         # Simulated time may stand still; that the camera is silent must be noticed all the same.

@@ -18,6 +18,7 @@ from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SEEN_T
 from magnetosuture_thread.model.session import EARLY
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
+from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.sight import Sight
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -70,7 +71,7 @@ class Sights(Iterator[Sight]):
         self._tracker: TrackerSession | None = None
         if source == "camera":
             warm_up()
-            self._tracker = TrackerSession(setup.vision)
+            self._tracker = TrackerSession(setup.vision, Scene(Dish(setup.vision.dish_diameter)))
         self._recording = recording
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)

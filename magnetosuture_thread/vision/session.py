@@ -8,6 +8,7 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -44,20 +45,25 @@ class TrackerSession:
 
     Args:
         settings: what to look for.
+        scene: the dish, and the shapes in which neither needle nor thread can be.
 
     Attributes:
         frames: that came.
         tracked: those with a pose.
     """
 
-    def __init__(self, settings: VisionTrackerSettings) -> None:
-        self._tracker = VisionTracker(settings)
+    def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
+        self._tracker = VisionTracker(settings, scene)
         self.frames = self.tracked = 0
 
     @property
     def missing(self) -> State:
         """What to say of a frame that shows nothing: lost, or searching if there never was a needle."""
         return State.LOST if self.tracked else State.SEARCHING
+
+    def set_scene(self, scene: Scene) -> None:
+        """Take another scene; see `VisionTracker.set_scene`."""
+        self._tracker.set_scene(scene)
 
     def on_image(self, time_s: float, image: np.ndarray) -> Seen:
         """Look at the next frame, taken at a time [s]; see `VisionTracker.track`."""

@@ -24,6 +24,13 @@ class VisionTrackerSettings(Configuration):
     needle_length: float = quantity(0.007, "length of the needle", unit="m", minimum=0.001, maximum=0.05)
     needle_width: float = quantity(0.0004, "width of the needle's body", unit="m", minimum=5e-5, maximum=0.005)
     thread_length: float = quantity(0.019, "length of the thread", unit="m", minimum=0.001, maximum=2.0)
+    outline_tolerance: float = quantity(
+        0.0003,
+        "what the outline of a shape of the scene and the visible one may differ by, for parallax and calibration",
+        unit="m",
+        minimum=0.0,
+        maximum=0.01,
+    )
     dish_centre_px: tuple[float, ...] = quantity(
         (), "the dish's centre in the image, u and v; not given: found", unit="px", minimum=0.0, maximum=1e5, multiple=2
     )

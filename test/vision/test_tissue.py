@@ -9,6 +9,7 @@ import pytest
 
 from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -41,7 +42,7 @@ def fine_camera(setup: Setup) -> DishCamera:
 
 def assert_measured(setup: Setup, camera: DishCamera, tail: np.ndarray, heading: float, thread: np.ndarray) -> float:
     """Assert that one frame gives the needle's pose to 2 pixels and 3 degrees; return how far it is turned [rad]."""
-    seen = VisionTracker(setup.vision).look(camera.render(tail, heading, thread))
+    seen = VisionTracker(setup.vision, read_scene(setup.name)).look(camera.render(tail, heading, thread))
     assert seen.state is State.TRACKED, seen.reason
     assert np.linalg.norm(seen.tail - tail) < 2.0 * camera.view.metres_per_pixel
     turned = (np.arctan2(seen.heading[1], seen.heading[0]) - heading + np.pi) % (2.0 * np.pi) - np.pi
