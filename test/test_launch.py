@@ -36,7 +36,7 @@ class Configuration:
 @pytest.fixture
 def description(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return what the launch file describes."""
-    modules = {
+    modules: dict[str, dict[str, Any]] = {
         "ament_index_python": {},
         "ament_index_python.packages": {"get_package_share_directory": lambda package: str(ROOT)},
         "launch": {"LaunchContext": dict, "LaunchDescription": lambda entries: entries},

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.vision.scene_mask import SceneMask
 
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
 FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
@@ -25,6 +26,7 @@ class Picture:
         small: the same, shrunk by area.
         floor: brightness of what is behind all slender things, in the pixels of `small`.
         origin: (u, v) of the first pixel in the whole frame.
+        mask: where the scene's shapes are; None if it has none.
     """
 
     gray: np.ndarray
@@ -32,21 +34,25 @@ class Picture:
     small: np.ndarray
     floor: np.ndarray
     origin: tuple[int, int] = (0, 0)
+    mask: SceneMask | None = None
 
 
-def prepare(gray: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0)) -> Picture:
+def prepare(gray: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), mask: SceneMask | None = None) -> Picture:
     """Shrink a grey image and estimate the floor behind what lies on it.
 
     The floor is the median over a window that all slender things fill by less than half, so that light
-    that changes over the dish doesn't matter.
+    that changes over the dish doesn't matter. What a shape of the scene covers shows no floor.
     """
     small = gray
     if factor > 1:
         small = cv2.resize(gray, None, fx=1.0 / factor, fy=1.0 / factor, interpolation=cv2.INTER_AREA)
     cells = (max(2, gray.shape[1] // FLOOR_FACTOR), max(2, gray.shape[0] // FLOOR_FACTOR))
-    rough = cv2.medianBlur(cv2.resize(small, cells, interpolation=cv2.INTER_AREA), FLOOR_CELLS)
+    rough = cv2.resize(small, cells, interpolation=cv2.INTER_AREA)
+    if mask is not None:
+        rough = mask.show_floor(rough)
+    rough = cv2.medianBlur(rough, FLOOR_CELLS)
     floor = cv2.resize(rough, small.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return Picture(gray, factor, small, floor, origin)
+    return Picture(gray, factor, small, floor, origin, mask)
 
 
 def glare_mask(picture: Picture) -> np.ndarray:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.scene import Dish
+from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.find import find_dish
-from magnetosuture_thread.vision.images import Picture, prepare
+from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, prepare
 from magnetosuture_thread.vision.needle.body import SeenNeedle
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
+from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 
@@ -65,12 +67,12 @@ def no_pose(state: State, reason: str, view: DishView | None) -> Track:
     return Track(state, reason, 0.0, nothing, nothing, nothing, 0.0, np.empty((0, 0)), np.empty((0, 2)), view)
 
 
-def find_view(gray: np.ndarray, settings: VisionTrackerSettings, dish: Dish) -> DishView | None:
+def find_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> DishView | None:
     """Return the view: what of it is given, and the rest by the dish; None if no dish is seen."""
     fixed = settings.fixed_view()
     if fixed is not None:
         return fixed
-    found = find_dish(gray, dish.diameter)
+    found = find_dish(gray, diameter)
     if found is None:
         return None
     scale = settings.metres_per_pixel or found.metres_per_pixel
@@ -81,22 +83,37 @@ def find_view(gray: np.ndarray, settings: VisionTrackerSettings, dish: Dish) -> 
 
 
 def picture_of(
-    gray: np.ndarray, view: DishView, settings: VisionTrackerSettings, box: tuple[int, int, int, int] | None = None
+    gray: np.ndarray,
+    view: DishView,
+    settings: VisionTrackerSettings,
+    mask: SceneMask | None,
+    box: tuple[int, int, int, int] | None = None,
 ) -> Picture:
     """Make a frame ready to measure on, or the part of it in a box (left, top, right, bottom) [px]."""
     factor = search_factor(settings.needle_width / view.metres_per_pixel)
     if box is None:
-        return prepare(gray, factor)
+        return prepare(gray, factor, mask=mask)
     left, top, right, bottom = box
+    part = mask.part(left, top, right, bottom) if mask is not None else None
     # Copied: compiled code is compiled once more for each other layout of memory.
-    return prepare(np.ascontiguousarray(gray[top:bottom, left:right]), factor, (left, top))
+    return prepare(np.ascontiguousarray(gray[top:bottom, left:right]), factor, (left, top), part)
+
+
+def mask_of(gray: np.ndarray, view: DishView, settings: VisionTrackerSettings, scene: Scene) -> SceneMask | None:
+    """Return where the shapes of a scene are in a frame; None if it has none."""
+    factor = search_factor(settings.needle_width / view.metres_per_pixel)
+    return scene_mask(scene, view, gray.shape, factor, settings.outline_tolerance, FLOOR_FACTOR)
 
 
 def needles_in(
-    picture: Picture, view: DishView, settings: VisionTrackerSettings, dish: Dish, toward: np.ndarray | None = None
+    picture: Picture,
+    view: DishView,
+    settings: VisionTrackerSettings,
+    diameter: float,
+    toward: np.ndarray | None = None,
 ) -> tuple[list[SeenNeedle], list[str]]:
     """Find the needles in a picture, in its own pixels; see `find_needles`."""
-    radius, length, width = dish.radius, settings.needle_length, settings.needle_width
+    radius, length, width = 0.5 * diameter, settings.needle_length, settings.needle_width
     return find_needles(picture, _local(view, picture), radius, length, width, toward)
 
 
@@ -105,10 +122,12 @@ def why_none(refused: list[str]) -> str:
     return "no needle in the dish" + (f"; dark things: {', '.join(refused)}" if refused else "")
 
 
-def tracked(picture: Picture, view: DishView, settings: VisionTrackerSettings, dish: Dish, needle: SeenNeedle) -> Track:
+def tracked(
+    picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needle: SeenNeedle
+) -> Track:
     """Return what a frame shows whose needle is known, in the picture's own pixels, with the thread's centreline."""
     local = _local(view, picture)
-    reach = dish.radius / view.metres_per_pixel - WALL_PX
+    reach = 0.5 * diameter / view.metres_per_pixel - WALL_PX
     longest = LONGEST * settings.thread_length / view.metres_per_pixel
     walk = find_centreline(picture, needle, longest, local.centre_px, reach)
     heading = view.directions_to_dish(needle.direction_px)
@@ -126,15 +145,22 @@ def tracked(picture: Picture, view: DishView, settings: VisionTrackerSettings, d
     )
 
 
-def look_once(gray: np.ndarray, settings: VisionTrackerSettings, dish: Dish) -> Track:
-    """Look at one frame alone."""
-    view = find_view(gray, settings, dish)
+def look_once(
+    gray: np.ndarray,
+    settings: VisionTrackerSettings,
+    scene: Scene,
+    masked: Callable[[DishView], SceneMask | None] | None = None,
+) -> Track:
+    """Look at one frame alone; `masked` gives the scene's mask for a view, if somebody keeps it."""
+    diameter = scene.dish.diameter
+    view = find_view(gray, settings, diameter)
     if view is None:
         return no_pose(State.LOST, "no dish in the image", None)
-    picture = picture_of(gray, view, settings)
-    needles, refused = needles_in(picture, view, settings, dish)
+    mask = masked(view) if masked is not None else mask_of(gray, view, settings, scene)
+    picture = picture_of(gray, view, settings, mask)
+    needles, refused = needles_in(picture, view, settings, diameter)
     if len(needles) == 1:
-        return tracked(picture, view, settings, dish, needles[0])
+        return tracked(picture, view, settings, diameter, needles[0])
     return no_pose(State.LOST, f"{len(needles)} needles in the dish" if needles else why_none(refused), view)
 
 

@@ -10,11 +10,15 @@ import numpy as np
 
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.arc import needle_axis
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.look import State, Track
+from magnetosuture_thread.vision.scene_mask import outlines
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
 SHIFT = 4  # binary places of a coordinate
 NEEDLE, TIP, THREAD, DISH = (40, 140, 255), (40, 200, 255), (70, 190, 60), (200, 170, 60)
+SHAPE = (190, 90, 170)
 PLATES = {State.TRACKED: (70, 150, 50), State.LOST: (50, 50, 200), State.SEARCHING: (160, 120, 40)}
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -49,6 +53,14 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
         _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, TIP, -1)
     _plate(drawn, track, title, unit)
     return drawn
+
+
+def draw_scene(image: np.ndarray, view: DishView, scene: Scene) -> None:
+    """Draw the dish's circle and the outlines of the shapes into a BGR image."""
+    _circle(image, np.asarray(view.centre_px), scene.dish.radius / view.metres_per_pixel, DISH, 1)
+    for geometry in scene.obstacles:
+        for ring in outlines(geometry):
+            _line(image, view.to_pixels(np.vstack([ring, ring[:1]])), SHAPE, 1)
 
 
 def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: float) -> None:

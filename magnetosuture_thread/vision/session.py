@@ -8,7 +8,7 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -45,7 +45,7 @@ class TrackerSession:
 
     Args:
         settings: what to look for.
-        scene: in which.
+        scene: the dish, and the shapes in which neither needle nor thread can be.
 
     Attributes:
         frames: that came.
@@ -62,7 +62,7 @@ class TrackerSession:
         return State.LOST if self.tracked else State.SEARCHING
 
     def set_scene(self, scene: Scene) -> None:
-        """Take another scene."""
+        """Take another scene; see `VisionTracker.set_scene`."""
         self._tracker.set_scene(scene)
 
     def on_image(self, time_s: float, image: np.ndarray) -> Seen:

@@ -23,6 +23,13 @@ class VisionTrackerSettings(Configuration):
     needle_length: float = shared("needle_length")
     needle_width: float = shared("needle_width")
     thread_length: float = shared("thread_length")
+    outline_tolerance: float = quantity(
+        0.0003,
+        "what the outline of a shape of the scene and the visible one may differ by, for parallax and calibration",
+        unit="m",
+        minimum=0.0,
+        maximum=0.01,
+    )
     dish_centre_px: tuple[float, ...] = quantity(
         (), "the dish's centre in the image, u and v; not given: found", unit="px", minimum=0.0, maximum=1e5, multiple=2
     )

@@ -9,13 +9,14 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.watch import DishWatch
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_image, measured_channel
 from magnetosuture_thread.vision.look import (
     State,
     Track,
     look_once,
+    mask_of,
     needles_in,
     no_pose,
     picture_of,
@@ -23,6 +24,7 @@ from magnetosuture_thread.vision.look import (
     why_none,
 )
 from magnetosuture_thread.vision.needle.body import SeenNeedle
+from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 JUMP_BACK = 1.0  # s; time that goes back by more begins anew, as a bag that was wound back
@@ -32,6 +34,8 @@ LONGEST_PREDICTION = 0.2  # s; a motion is not extrapolated farther
 MEMORY = 0.5  # weight of the newest velocity
 MARGIN_PX = 32.0  # around the needle and the thread, that is looked at
 BORDER_PX = 20.0  # a thread that ends so near to the region's border may go on
+VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
+MASKS = 8  # kept
 LEAST_SHARE = 0.9  # of the thread seen before; if less is seen in the region, the whole frame is looked at
 
 
@@ -56,12 +60,14 @@ class VisionTracker:
 
     Args:
         settings: what to look for.
-        scene: in which.
+        scene: the dish, and the shapes in which neither needle nor thread can be.
     """
 
     def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
-        self._settings, self._scene = settings, scene
-        self._dish = DishWatch(settings, scene.dish)
+        self._settings = settings
+        self._scene = scene
+        self._dish = DishWatch(settings, scene.dish.diameter)
+        self._masks: dict[tuple[DishView, tuple[int, ...]], SceneMask | None] = {}
         self._shape: tuple[int, ...] = ()
         self.reset()
 
@@ -69,14 +75,19 @@ class VisionTracker:
         """Take another scene. The needle is still tracked, unless the dish has another size."""
         other_dish = scene.dish.diameter != self._scene.dish.diameter
         self._scene = scene
+        self._masks.clear()
         if other_dish:
-            self._dish = DishWatch(self._settings, scene.dish)
-            self._last, self._anew = None, []
+            self._dish = DishWatch(self._settings, scene.dish.diameter)
+            self._forget()
 
     def reset(self) -> None:
         """Forget the needle and the dish."""
-        self._dish.forget()
         self._time: float | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget what was seen, not the time of the last frame."""
+        self._dish.forget()
         self._last: _Pose | None = None
         self._anew: list[_Pose] = []
         self._thread: np.ndarray = np.empty((0, 2))  # in pixels, with the needle's ends
@@ -91,7 +102,8 @@ class VisionTracker:
             InvalidInputError: the image is not of this kind.
         """
         check_image(image)
-        return look_once(measured_channel(image), self._settings, self._scene.dish)
+        gray = measured_channel(image)
+        return look_once(gray, self._settings, self._scene, lambda view: self._masked(gray, view))
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame.
@@ -123,16 +135,32 @@ class VisionTracker:
             return no_pose(self._missing(), reason, view)
         if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
             self._last, self._anew = None, []
-        chosen, picture, reason = self._choose(gray, view, time_s)
+        mask, diameter = self._masked(gray, view), self._scene.dish.diameter
+        chosen, picture, reason = self._choose(gray, view, mask, time_s)
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
-        found = tracked(picture, view, self._settings, self._scene.dish, chosen)
+        found = tracked(picture, view, self._settings, diameter, chosen)
         if picture.gray.shape != gray.shape and self._is_cut(found, picture):
-            picture, chosen = _in_whole(picture, chosen, picture_of(gray, view, self._settings))
-            found = tracked(picture, view, self._settings, self._scene.dish, chosen)
+            picture, chosen = _in_whole(picture, chosen, picture_of(gray, view, self._settings, mask))
+            found = tracked(picture, view, self._settings, diameter, chosen)
         ends = np.array([found.tail, found.tip])
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
+
+    def _masked(self, gray: np.ndarray, view: DishView) -> SceneMask | None:
+        """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
+
+        The view is rounded, so that the noise of a dish found in every frame anew makes no new mask.
+        """
+        u, v = (round(value / VIEW_STEP_PX) * VIEW_STEP_PX for value in view.centre_px)
+        radius = round(self._scene.dish.radius / view.metres_per_pixel / VIEW_STEP_PX) * VIEW_STEP_PX
+        rounded = DishView((u, v), self._scene.dish.radius / radius, view.rotation)
+        key = (rounded, gray.shape)
+        if key not in self._masks:
+            if len(self._masks) >= MASKS:
+                self._masks.clear()
+            self._masks[key] = mask_of(gray, rounded, self._settings, self._scene)
+        return self._masks[key]
 
     def _advance(self, time_s: float) -> None:
         """Take the time of the next frame."""
@@ -157,19 +185,22 @@ class VisionTracker:
     def _missing(self) -> State:
         return State.LOST if self._last is not None else State.SEARCHING
 
-    def _choose(self, gray: np.ndarray, view: DishView, time: float) -> tuple[SeenNeedle | None, Picture | None, str]:
+    def _choose(
+        self, gray: np.ndarray, view: DishView, mask: SceneMask | None, time: float
+    ) -> tuple[SeenNeedle | None, Picture | None, str]:
         """Return the needle of this frame and the picture it is in, or why there is none."""
+        diameter = self._scene.dish.diameter
         if self._last is not None:
             _, angle = self._last.at(time)
             toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
-            picture = picture_of(gray, view, self._settings, self._region(gray, view, time))
-            needles, _ = needles_in(picture, view, self._settings, self._scene.dish, toward)
+            picture = picture_of(gray, view, self._settings, mask, self._region(gray, view, time))
+            needles, _ = needles_in(picture, view, self._settings, diameter, toward)
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             if len(within) == 1:
                 self._take(_pose(within[0], picture, view, time), self._last)
                 return within[0], picture, ""
-        picture = picture_of(gray, view, self._settings)
-        needles, refused = needles_in(picture, view, self._settings, self._scene.dish)
+        picture = picture_of(gray, view, self._settings, mask)
+        needles, refused = needles_in(picture, view, self._settings, diameter)
         if self._last is not None and len(needles) > 1:
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             needles = within if len(within) == 1 else needles

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from magnetosuture_thread.scene import Dish
+from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.find import rim_shift
 from magnetosuture_thread.vision.look import look_once
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -28,4 +28,4 @@ def warm_up() -> bool:
     cv2.fillPoly(image, [np.round(np.array(outline) * 16).astype(np.int32)], 45, cv2.LINE_AA, 4)
     image = cv2.GaussianBlur(image, (0, 0), 0.9)
     rim_shift(image, (320.0, 240.0), 218.0)
-    return not look_once(image, VisionTrackerSettings(), Dish()).reason
+    return not look_once(image, VisionTrackerSettings(), Scene()).reason

@@ -9,21 +9,24 @@ import pytest
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.friction import Friction, FrictionState
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.scene import Scene
+from test.model.worlds import scene_with
 
 SECOND = 1_000_000_000
 PERIOD = SECOND // 30
 EAST = np.array([1.0, 0.0])
 # A gate of two discs, 0.8 mm from the thread on either side, 6 mm behind the needle.
-GATE = [-0.006, 0.0018, 0.001, -0.006, -0.0018, 0.001]
+GATE = scene_with(Disc((-0.006, 0.0018), 0.001), Disc((-0.006, -0.0018), 0.001))
 
 
-def session(**values: Any) -> ThreadSession:
+def session(scene: Scene | None = None, **values: Any) -> ThreadSession:
     """Return a session whose thread begins straight behind a needle that points east."""
-    return ThreadSession(from_mapping(ThreadModelSettings, {"initial_shape": "straight", **values}))
+    return ThreadSession(from_mapping(ThreadModelSettings, {"initial_shape": "straight", **values}), scene)
 
 
 def drive(session: ThreadSession, first: int, last: int, speed: float = 3e-3, x: float = 0.0) -> tuple[float, Friction]:
@@ -33,6 +36,7 @@ def drive(session: ThreadSession, first: int, last: int, speed: float = 3e-3, x:
         outcome = session.on_pose(SECOND + k * PERIOD, NeedlePose(1.0 + k * PERIOD * 1e-9, np.array([at, 0.0]), EAST))
         assert outcome.problem is None
         assert outcome.margins is not None
+    assert outcome.margins is not None
     return at, outcome.margins.friction
 
 
@@ -41,7 +45,7 @@ def test_a_free_thread_slows_nothing():
 
 
 def test_friction_slows_a_needle_that_pulls_and_no_other():
-    model = session(disc_obstacles=GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
+    model = session(GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
     x, pulled = drive(model, 0, 5)
     assert pulled.state is FrictionState.PULLED
     assert 0.5 < pulled.slowdown < 1.0
@@ -50,7 +54,7 @@ def test_friction_slows_a_needle_that_pulls_and_no_other():
 
 
 def test_the_margins_tell_friction():
-    model = session(disc_obstacles=GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
+    model = session(GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
     x, _ = drive(model, 0, 5)
     states = []
     for k, at in ((5, x + 1e-4), (6, x + 1e-4)):
@@ -64,11 +68,11 @@ def test_the_margins_tell_friction():
 
 
 def test_a_change_of_settings_does_not_bring_the_thread_to_rest():
-    values = {"disc_obstacles": GATE, "friction_threshold": 1.2e-3, "initial_shape": "straight"}
-    model = session(**values)
+    values = {"friction_threshold": 1.2e-3, "initial_shape": "straight"}
+    model = session(GATE, **values)
     x, before = drive(model, 0, 9)
     assert before.slowdown < 1.0
-    model.change(from_mapping(ThreadModelSettings, {**values, "contact_tolerance": 2e-5}))
+    model.change(from_mapping(ThreadModelSettings, {**values, "contact_tolerance": 2e-5}), GATE)
     _, after = drive(model, 9, 10, speed=0.0, x=x)  # averaged, it still moves
     assert after.slowdown == pytest.approx(before.slowdown, rel=0.2)
 

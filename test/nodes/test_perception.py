@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ def answers(graph: Graph, frames: list[np.ndarray]) -> tuple[list[PredictedThrea
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, stamp))
         # Confirmed in the third frame; each later one is answered before the next is shown.
         count = max(0, index - 1)
-        graph.wait(lambda count=count: len(predicted) >= count and len(seen) >= count, "an answer")
+        graph.wait(partial(lambda least: len(predicted) >= least and len(seen) >= least, count), "an answer")
     graph.wait(lambda: bool(margins) and margins[-1].header.stamp == predicted[-1].header.stamp, "its margins")
     return predicted, margins
 

@@ -13,8 +13,10 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.rig.camera.dish_camera import Cover, DishCamera
 from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.scene import Scene as TrackedScene
 from magnetosuture_thread.vision.look import Track
 
+SCENE = TrackedScene()  # a dish of 35 mm with nothing in it
 VIEW = DishView((322.0, 238.0), 8e-5)
 PIXEL = VIEW.metres_per_pixel
 NOWHERE = np.array([[0.5, 0.5], [0.51, 0.5]])

@@ -13,9 +13,9 @@ from magnetosuture_thread.vision.needle import body, covers
 from magnetosuture_thread.vision.needle import find as needle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
-from test.vision.scenes import PIXEL, Pose, blob, finger, random_pose, random_thread, render
+from test.vision.scenes import PIXEL, SCENE, Pose, blob, finger, random_pose, random_thread, render
 
-TRACKER = VisionTracker(VisionTrackerSettings())
+TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 WHITE = (255.0, 255.0, 255.0)
 COLOURS = {
     "dark": (30.0, 32.0, 34.0),

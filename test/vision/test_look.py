@@ -13,13 +13,26 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.scene import Dish
+from magnetosuture_thread.scene import Scene as DishScene
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
-from test.vision.scenes import CURVATURES, NOWHERE, PIXEL, VIEW, Pose, line_error, random_pose, random_thread, render
+from test.vision.scenes import (
+    CURVATURES,
+    NOWHERE,
+    PIXEL,
+    SCENE,
+    VIEW,
+    Pose,
+    line_error,
+    random_pose,
+    random_thread,
+    render,
+)
 
 SAMPLES = Path(__file__).parent / "samples"
-TRACKER = VisionTracker(VisionTrackerSettings())
+TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 LIGHTS = {
     "usual": Lighting(),
     "dark": Lighting(gain=0.5, slope=3.0, tint_bgr=(0.9, 0.95, 1.0)),
@@ -33,7 +46,7 @@ LIGHTS = {
 def test_the_sample_frames_are_measured_to_half_a_pixel_and_a_degree(given_view: bool):
     truth = json.loads((SAMPLES / "truth.json").read_text())
     known = VisionTrackerSettings(dish_centre_px=(322.0, 238.0), metres_per_pixel=8e-5)
-    tracker = VisionTracker(known if given_view else VisionTrackerSettings())
+    tracker = VisionTracker(known if given_view else VisionTrackerSettings(), SCENE)
     tails, angles, tips, lines = [], [], [], []
     for frame in truth["frames"]:
         image = cv2.imread(str(SAMPLES / frame["file"]))
@@ -125,7 +138,7 @@ def test_a_larger_dish_with_a_faint_thread_is_tracked():
     s = np.linspace(0.0, 0.15, 500)
     tail, angle = np.array([0.03, 0.01]), np.pi - 0.4 + 35.0 * s
     thread = np.vstack([tail, tail + np.cumsum(0.15 / 500 * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)])
-    seen = VisionTracker(VisionTrackerSettings(dish_diameter=0.15, thread_length=0.15)).look(
+    seen = VisionTracker(VisionTrackerSettings(thread_length=0.15), DishScene(Dish(0.15))).look(
         camera.render(tail, -0.4, thread)
     )
     assert seen.reason == ""
@@ -144,8 +157,10 @@ def test_without_a_dish_it_says_lost():
 
 def test_a_dish_of_another_size_than_the_scale_says_is_none():
     frame = render(Pose(np.zeros(2), 0.3))
-    assert VisionTracker(VisionTrackerSettings(metres_per_pixel=8e-5)).look(frame).reason == ""
-    assert VisionTracker(VisionTrackerSettings(metres_per_pixel=9e-5)).look(frame).reason == "no dish in the image"
+    assert VisionTracker(VisionTrackerSettings(metres_per_pixel=8e-5), SCENE).look(frame).reason == ""
+    assert (
+        VisionTracker(VisionTrackerSettings(metres_per_pixel=9e-5), SCENE).look(frame).reason == "no dish in the image"
+    )
 
 
 def test_without_a_needle_it_says_lost():
@@ -172,7 +187,7 @@ def test_a_turned_camera_gives_the_same_pose_in_the_dish(rotation: float):
     pose = Pose(np.array([0.003, -0.002]), 0.8, 120.0)
     cosine, sine = np.cos(rotation), np.sin(rotation)
     turned = Pose(np.array([[cosine, -sine], [sine, cosine]]) @ pose.tail, pose.heading + rotation, pose.curvature)
-    seen = VisionTracker(VisionTrackerSettings(camera_rotation=rotation)).look(render(turned))
+    seen = VisionTracker(VisionTrackerSettings(camera_rotation=rotation), SCENE).look(render(turned))
     apart, angle = pose.error(seen)
     assert apart < 1.0
     assert abs(angle) < np.radians(1.5)
@@ -194,4 +209,4 @@ def test_what_is_no_image_is_refused(image: np.ndarray):
     with pytest.raises(InvalidInputError, match="image"):
         TRACKER.look(image)
     with pytest.raises(InvalidInputError, match="image"):
-        VisionTracker(VisionTrackerSettings()).track(image, 0.0)
+        VisionTracker(VisionTrackerSettings(), SCENE).track(image, 0.0)

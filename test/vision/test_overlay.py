@@ -12,9 +12,9 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
-from test.vision.scenes import VIEW, Pose, render
+from test.vision.scenes import SCENE, VIEW, Pose, render
 
-TRACKER = VisionTracker(VisionTrackerSettings())
+TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 
 
 def test_needle_and_state_are_drawn_where_they_are():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -15,7 +16,7 @@ TAIL = np.array([0.002, 0.001])
 
 def test_frames_are_counted_and_the_centreline_is_equally_spaced(camera, thread_arc):
     image = camera.render(TAIL, 0.4, thread_arc(TAIL, 0.4 + np.pi, 40.0))
-    session = TrackerSession(VisionTrackerSettings(confirm_frames=1))
+    session = TrackerSession(VisionTrackerSettings(confirm_frames=1), Scene())
     assert session.missing is State.SEARCHING
     seen = session.on_image(1.0, image)
     assert seen.tracked

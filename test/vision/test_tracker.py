@@ -10,7 +10,7 @@ from magnetosuture_thread.rig.camera.dish_camera import Cover
 from magnetosuture_thread.vision.look import State, Track
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
-from test.vision.scenes import NOWHERE, PIXEL, VIEW, Pose, blob, line_error, random_thread, render
+from test.vision.scenes import NOWHERE, PIXEL, SCENE, VIEW, Pose, blob, line_error, random_thread, render
 
 RATE = 30.0
 WHITE = (255.0, 255.0, 255.0)
@@ -25,7 +25,7 @@ def moving(index: int, turn_rate: float = 0.6, speed: float = 0.004) -> Pose:
 
 def started(settings: VisionTrackerSettings | None = None, frames: int = 4) -> VisionTracker:
     """Return a tracker that follows the moving needle since some frames."""
-    tracker = VisionTracker(settings or VisionTrackerSettings())
+    tracker = VisionTracker(settings or VisionTrackerSettings(), SCENE)
     for index in range(frames):
         seen = tracker.track(render(moving(index)), index / RATE)
     assert seen.state is State.TRACKED
@@ -33,7 +33,7 @@ def started(settings: VisionTrackerSettings | None = None, frames: int = 4) -> V
 
 
 def test_a_needle_is_tracked_after_three_frames_that_agree_and_then_in_each():
-    tracker = VisionTracker(VisionTrackerSettings())
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
     thread = random_thread(np.random.default_rng(2), moving(0))
     states = []
     for index in range(12):
@@ -52,7 +52,7 @@ def test_a_needle_is_tracked_after_three_frames_that_agree_and_then_in_each():
 
 def test_in_its_region_it_sees_what_it_sees_in_the_whole_frame():
     frame = render(moving(4), random_thread(np.random.default_rng(3), moving(4)))
-    near, alone = started().track(frame, 4 / RATE), VisionTracker(VisionTrackerSettings()).look(frame)
+    near, alone = started().track(frame, 4 / RATE), VisionTracker(VisionTrackerSettings(), SCENE).look(frame)
     np.testing.assert_allclose(near.tail, alone.tail, atol=0.2 * PIXEL)
     np.testing.assert_allclose(near.heading, alone.heading, atol=2e-3)
     assert len(near.centreline) == pytest.approx(len(alone.centreline), abs=4)
@@ -93,7 +93,7 @@ def test_of_two_needles_the_one_that_was_followed_is_taken():
 
 
 def test_two_needles_from_the_beginning_are_not_chosen_between():
-    tracker = VisionTracker(VisionTrackerSettings())
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
     frame = np.minimum(render(moving(4)), render(Pose(np.array([-0.009, -0.006]), 2.0)))
     for index in range(5):
         seen = tracker.track(frame, index / RATE)
@@ -110,7 +110,7 @@ def test_after_a_long_time_the_needle_is_searched_anew():
 
 
 def test_one_frame_is_enough_where_the_settings_say_so():
-    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1))
+    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
     assert tracker.track(render(moving(0)), 0.0).state is State.TRACKED
 
 
@@ -126,7 +126,7 @@ def test_frames_out_of_order_are_refused_and_a_bag_wound_back_begins_anew():
 @pytest.mark.parametrize(("aside", "turned"), [(0.4 * PIXEL, 0.0), (0.0, 0.004)], ids=["moved", "turned"])
 def test_after_two_frames_a_moment_apart_the_needle_is_still_tracked(aside: float, turned: float):
     """What differs between them is noise, and no needle is as fast as that noise seems over a microsecond."""
-    tracker = VisionTracker(VisionTrackerSettings())
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
     pose = Pose(np.array([0.001, 0.002]), 0.8)
     for index in range(4):
         assert tracker.track(render(pose), index / RATE).reason or index > 1
@@ -158,7 +158,7 @@ def test_a_frame_of_another_size_begins_anew():
 
 def test_in_a_sequence_with_faults_no_pose_is_wrong():
     random = np.random.default_rng(11)
-    tracker = VisionTracker(VisionTrackerSettings())
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
     tracked = 0
     for index in range(40):
         pose = moving(index)

@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.vision.dish.find import RIM_RAYS, RIM_SHARE, STILL_PX, rim_shift
 from magnetosuture_thread.vision.look import find_view
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -24,11 +23,12 @@ class DishWatch:
 
     Args:
         settings: what to look for.
-        dish: whose rim it is, which gives the scale.
+        diameter: inner diameter of the dish [m].
     """
 
-    def __init__(self, settings: VisionTrackerSettings, dish: Dish) -> None:
-        self._settings, self._dish = settings, dish
+    def __init__(self, settings: VisionTrackerSettings, diameter: float) -> None:
+        self._settings = settings
+        self._diameter = diameter
         self._fixed = settings.fixed_view()
         self.view = self._fixed
         self._anew: list[DishView] = []
@@ -49,14 +49,14 @@ class DishWatch:
         if self._fixed is not None:
             return ""
         if self.view is None:
-            self.view = find_view(gray, self._settings, self._dish)
+            self.view = find_view(gray, self._settings, self._diameter)
             return "" if self.view is not None else "no dish in the image"
-        shift, rays = rim_shift(gray, self.view.centre_px, self._dish.radius / self.view.metres_per_pixel)
+        shift, rays = rim_shift(gray, self.view.centre_px, 0.5 * self._diameter / self.view.metres_per_pixel)
         seen = rays >= RIM_SHARE * RIM_RAYS
         if seen and shift < STILL_PX:
             self._anew = []
             return ""
-        found = find_view(gray, self._settings, self._dish)
+        found = find_view(gray, self._settings, self._diameter)
         if found is None:
             self._anew = []
             return "too little of the dish is seen"

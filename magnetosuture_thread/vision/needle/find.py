@@ -9,12 +9,16 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
 from magnetosuture_thread.vision.needle.body import SeenNeedle, measure_body
+from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
 INSIDE = 0.985  # part of the dish's radius that is looked at, to stay off the rim
 WIDE_PX = 4.0  # a needle at least this wide is searched at half the size
 LEAST_AREA = 0.33  # of the needle's own
 ON_AXIS = 0.85  # of a needle's dark pixels lie along one arc; more beside it belong to what touches it
+AROUND_PX = 24.0  # around a dark thing, that is measured on
+AXIS_POINTS = 15
 MOST_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
 
@@ -43,9 +47,28 @@ def find_needles(
         The needles, and in words why each of the other candidates is none.
     """
     expected, thickness = length / view.metres_per_pixel, width / view.metres_per_pixel
+    needles, refused = _measured(picture, view, dish_radius, expected, thickness, toward)
+    if picture.mask is not None and not needles and refused:
+        # What of a dark shape the tolerance leaves may have grown together with the needle.
+        needles, _ = _measured(picture, view, dish_radius, expected, thickness, toward, tight=True)
+    return needles, refused
+
+
+def _measured(
+    picture: Picture,
+    view: DishView,
+    dish_radius: float,
+    expected: float,
+    thickness: float,
+    toward: np.ndarray | None,
+    *,
+    tight: bool = False,
+) -> tuple[list[SeenNeedle], list[str]]:
+    """Find the needles of a length and a width [px], shapes cut out up to their very outlines if `tight`."""
     needles: list[SeenNeedle] = []
     refused: list[str] = []
-    candidates = _dark_components(picture, view, dish_radius, expected * thickness)
+    mask = picture.mask
+    candidates = _dark_components(picture, view, dish_radius, expected * thickness, tight)
     if len(candidates) > MOST_CANDIDATES:
         return [], [f"{len(candidates)} dark things"]
     for points in candidates:
@@ -60,7 +83,15 @@ def find_needles(
         if abs(arc.curvature) * expected > 1.25 * np.pi:
             refused.append("bent beyond a half circle")
             continue
-        found = measure_body(picture.gray, arc, first, last, expected, thickness, toward)
+        gray, near = picture.gray, False
+        if mask is not None:
+            low, high = points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX
+            near = mask.deepest(low, high) > 0.0
+            if near:  # A strip along the needle takes its ground from beside it, which a shape may be.
+                gray = mask.without_shapes(gray, picture.floor, low, high, 0.0 if tight else mask.tolerance_px)
+        found = measure_body(gray, arc, first, last, expected, thickness, toward)
+        if mask is not None and near and isinstance(found, SeenNeedle) and _is_inside(mask, found, thickness):
+            found = "inside of a shape of the scene"
         if isinstance(found, SeenNeedle):
             needles.append(found)
         else:
@@ -68,7 +99,9 @@ def find_needles(
     return needles, refused
 
 
-def _dark_components(picture: Picture, view: DishView, dish_radius: float, area: float) -> list[np.ndarray]:
+def _dark_components(
+    picture: Picture, view: DishView, dish_radius: float, area: float, tight: bool
+) -> list[np.ndarray]:
     """Return the pixels of each dark component of at least a part `LEAST_AREA` of an area [px^2], shape (m, 2)."""
     factor = picture.factor
     shift = 0.5 * (factor - 1)
@@ -81,6 +114,9 @@ def _dark_components(picture: Picture, view: DishView, dish_radius: float, area:
         return []
     mask = np.zeros(dark.shape, np.uint8)
     cv2.circle(mask, (round((u - left) * 16), round((v - top) * 16)), round(radius * 16), 255, -1, cv2.LINE_8, 4)
+    if picture.mask is not None:
+        cut = picture.mask.inside if tight else picture.mask.solid
+        cv2.subtract(mask, cut[window], mask)
     cv2.bitwise_and(dark, mask, dark)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     result = []
@@ -97,6 +133,12 @@ def _dark_components(picture: Picture, view: DishView, dish_radius: float, area:
         at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
         result.append(at * factor + shift)
     return result
+
+
+def _is_inside(mask: SceneMask, needle: SeenNeedle, width: float) -> bool:
+    """Say whether a needle's axis lies in shapes: that of a real one stays half its width off their outlines [px]."""
+    depths = mask.depths(needle.arc.at(np.linspace(0.0, needle.length_px, AXIS_POINTS)))
+    return middle(depths) > mask.tolerance_px - 0.5 * width
 
 
 def _rough_axis(points: np.ndarray, width: float) -> tuple[Arc, float, float] | None:

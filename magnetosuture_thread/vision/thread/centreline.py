@@ -11,6 +11,7 @@ from magnetosuture_thread.vision.images import Picture, glare_mask
 from magnetosuture_thread.vision.needle.body import SeenNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.forks import follow
+from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.walk import refine
 
 FAINTEST = 5.0  # grey levels; a ridge fainter than this is noise
@@ -79,6 +80,9 @@ def find_centreline(
         strong,
     )
     points = path[:count, :2].copy()
+    if picture.mask is not None:
+        count = count_off_outline(points, ridge, picture.mask, (left, top), usual_noise + faintest)
+        points = points[:count]
     refine(ridge, points, strong[:count])
     return points + np.array([left, top])
 

@@ -61,7 +61,7 @@ def test_the_quick_check_tells_how_far_the_rim_has_moved():
 
 def test_a_bumped_camera_is_believed_only_after_several_frames():
     before, after = gray_of((322.0, 238.0), 8e-5, 3), gray_of((330.0, 235.0), 8e-5, 3)
-    watch = DishWatch(VisionTrackerSettings())
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
     assert watch.look(before) == ""
     seen = watch.view
     assert [watch.look(after) != "" for _ in range(AGREEING)] == [True] * (AGREEING - 1) + [False]
@@ -74,7 +74,7 @@ def test_a_bumped_camera_is_believed_only_after_several_frames():
 
 def test_a_dark_frame_gives_no_view_and_changes_none():
     gray = gray_of((322.0, 238.0), 8e-5, 3)
-    watch = DishWatch(VisionTrackerSettings())
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
     watch.look(gray)
     view = watch.view
     assert watch.look(0 * gray) == "too little of the dish is seen"
@@ -84,6 +84,6 @@ def test_a_dark_frame_gives_no_view_and_changes_none():
 
 def test_a_given_view_needs_no_dish():
     settings = VisionTrackerSettings(dish_centre_px=(320.0, 240.0), metres_per_pixel=8e-5, camera_rotation=0.1)
-    watch = DishWatch(settings)
+    watch = DishWatch(settings, 0.035)
     assert watch.look(np.zeros((480, 640), np.uint8)) == ""
     assert watch.view == DishView((320.0, 240.0), 8e-5, 0.1)

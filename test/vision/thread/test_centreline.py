@@ -14,10 +14,10 @@ from magnetosuture_thread.vision.needle.body import SeenNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 from magnetosuture_thread.vision.tracker import VisionTracker
-from test.vision.scenes import PIXEL, VIEW, Pose, blob, line_error, render
+from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
 
 NEEDLE = SeenNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
-TRACKER = VisionTracker(VisionTrackerSettings())
+TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 
 
 def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 140) -> np.ndarray:

@@ -1,0 +1,196 @@
+"""Needle and thread beside the shapes of a scene: what the mask is for, each shown to fail without it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+import shapely
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.rig.camera import scene as drawn
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.rig.camera.scene import Look
+from magnetosuture_thread.scene import Scene, read_scene, scene_from_mapping
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.vision.look import Track, mask_of
+from magnetosuture_thread.vision.overlay import draw_scene
+from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import VisionTracker
+from test.vision.scenes import PIXEL, VIEW, Pose, line_error, random_thread
+
+STEEL = Look((70.0, 66.0, 62.0), (60.0, 56.0, 52.0), 0.2e-3, 10.0, 3.0)
+OUTLINED = Look((200.0, 205.0, 215.0), (95.0, 95.0, 95.0), 0.25e-3)
+SILICONE = drawn.SILICONE
+POSTS = [(0.008, 0.004, 0.0015), (-0.008, 0.003, 0.001), (0.002, -0.009, 0.0012), (-0.006, -0.008, 0.0009)]
+POSTS += [(0.0, 0.0095, 0.0009), (0.011, -0.005, 0.0009), (-0.0115, -0.003, 0.0011)]
+POST = Disc((0.0077, 0.0039), 0.0015)
+NEEDLE_LIKE = [[0.002, 0.0098], [0.0076, 0.0098], [0.009, 0.00999], [0.009, 0.01001], [0.0076, 0.0102], [0.002, 0.0102]]
+
+
+def described(**shapes: Mapping[str, object]) -> Scene:
+    """Return a scene of a 35 mm dish with instruments."""
+    made = {name: {**shape, "kind": "instrument"} for name, shape in shapes.items()}
+    return scene_from_mapping({"dish": {"diameter": 0.035, "depth": 0.003}, "shapes": made})
+
+
+def frame_of(scene: Scene, look: Look, pose: Pose, thread: np.ndarray) -> np.ndarray:
+    """Draw a frame in which all shapes of a scene look alike."""
+    what = drawn.Scene(obstacles=scene.obstacles, looks=[look] * len(scene.shapes))
+    return DishCamera(what, VIEW, seed=3).render(pose.tail, pose.heading, thread)
+
+
+def seen_with_and_without(scene: Scene, frame: np.ndarray) -> tuple[Track, Track]:
+    """Return what is seen of a frame with the scene, and with its dish alone."""
+    settings = VisionTrackerSettings()
+    return VisionTracker(settings, scene).look(frame), VisionTracker(settings, Scene(scene.dish)).look(frame)
+
+
+def test_a_needle_among_many_dark_posts_is_found():
+    scene = described(**{f"post_{i}": {"disc": {"center": [x, y], "radius": r}} for i, (x, y, r) in enumerate(POSTS)})
+    pose = Pose(np.array([-0.002, -0.002]), 0.7)
+    frame = frame_of(scene, STEEL, pose, random_thread(np.random.default_rng(0), pose))
+    masked, plain = seen_with_and_without(scene, frame)
+    assert pose.is_right(masked)
+    assert "dark things" in plain.reason
+
+
+def test_an_instrument_that_looks_like_a_needle_is_not_taken_for_one():
+    scene = described(pointer={"polygon": {"outline": NEEDLE_LIKE}})
+    pose = Pose(np.array([-0.002, -0.004]), 0.7)
+    frame = frame_of(scene, STEEL, pose, random_thread(np.random.default_rng(0), pose))
+    masked, plain = seen_with_and_without(scene, frame)
+    assert pose.is_right(masked)
+    assert plain.reason == "2 needles in the dish"
+
+
+def test_without_a_needle_an_instrument_that_looks_like_one_gives_no_pose():
+    scene = described(pointer={"polygon": {"outline": NEEDLE_LIKE}})
+    frame = frame_of(scene, STEEL, Pose(np.array([0.5, 0.5]), 0.0), np.array([[0.5, 0.5], [0.51, 0.5]]))
+    masked, plain = seen_with_and_without(scene, frame)
+    assert "inside of a shape of the scene" in masked.reason
+    assert plain.reason == ""
+
+
+@pytest.mark.parametrize("gap", [0.05e-3, 0.2e-3])
+def test_a_needle_beside_a_dark_post_is_found(gap: float):
+    scene = read_scene("dish_35mm_post")
+    pose = Pose(np.array([0.0042, 0.0039 - POST.radius - 0.0002 - gap]), 0.0)
+    frame = frame_of(scene, STEEL, pose, np.linspace(pose.tail, pose.tail - (0.012, 0.0), 30))
+    masked, plain = seen_with_and_without(scene, frame)
+    assert pose.is_right(masked)
+    assert "no arc" in plain.reason
+
+
+def wrapped(turn: float) -> tuple[Pose, np.ndarray]:
+    """Return a needle and a thread from its tail to the post, and around it by an angle."""
+    angle = -0.5 * np.pi + np.linspace(0.0, turn, 80)
+    around = np.asarray(POST.centre) + (POST.radius + 4e-5) * np.column_stack([np.cos(angle), np.sin(angle)])
+    tail = around[0] - (0.003, 0.0)
+    return Pose(tail, np.pi), np.vstack([np.linspace(tail, around[0], 20)[:-1], around])
+
+
+@pytest.mark.parametrize("turn", [0.7, 2.0, 3.5])
+def test_a_thread_around_a_plain_post_is_followed_to_its_end(turn: float):
+    pose, thread = wrapped(turn)
+    scene = read_scene("dish_35mm_post")
+    masked, plain = seen_with_and_without(scene, frame_of(scene, SILICONE, pose, thread))
+    for seen in (masked, plain):
+        assert line_error(seen.centreline / PIXEL, thread / PIXEL)[1] > 0.95
+
+
+def test_a_thread_that_ends_at_a_dark_outline_is_not_followed_around_it():
+    scene = described(tool={"capsule": {"start": [-0.008, -0.004], "end": [0.005, -0.004], "radius": 0.0008}})
+    thread = np.array([[0.0085, -0.0026], [0.005, -0.00316], [0.003, -0.00316]])
+    pose = Pose(thread[0], float(np.arctan2(0.00056, 0.0035)))
+    masked, plain = seen_with_and_without(scene, frame_of(scene, OUTLINED, pose, thread))
+    length = np.linalg.norm(np.diff(thread, axis=0), axis=1).sum()
+    excess = [np.linalg.norm(np.diff(s.centreline, axis=0), axis=1).sum() / length - 1.0 for s in (masked, plain)]
+    assert excess[0] < 0.1
+    assert excess[1] > 0.3
+    assert line_error(masked.centreline / PIXEL, thread / PIXEL)[1] > 0.95
+
+
+def test_the_mask_is_made_once_for_a_view_and_a_scene(monkeypatch: pytest.MonkeyPatch):
+    made: list[Scene] = []
+
+    def counted(gray: np.ndarray, view: DishView, settings: VisionTrackerSettings, scene: Scene) -> SceneMask | None:
+        made.append(scene)
+        return mask_of(gray, view, settings, scene)
+
+    monkeypatch.setattr("magnetosuture_thread.vision.tracker.mask_of", counted)
+    scene = read_scene("dish_35mm_post")
+    pose = Pose(np.array([0.0, -0.003]), 0.3)
+    frame = frame_of(scene, SILICONE, pose, random_thread(np.random.default_rng(0), pose))
+    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), scene)
+    states = [tracker.track(frame, 0.1 * index).reason for index in range(4)]
+    assert (states, made) == ([""] * 4, [scene])
+    other = scene.remove("post")
+    tracker.set_scene(other)
+    assert tracker.track(frame, 0.5).reason == ""  # tracked without a pause
+    assert made == [scene, other]
+    shifted = np.roll(frame, 9, axis=1)
+    for index in range(4):
+        tracker.track(shifted, 0.6 + 0.1 * index)
+    assert made == [scene, other, other]
+
+
+def test_a_scene_with_another_dish_gives_another_scale():
+    scene = Scene()
+    pose = Pose(np.array([0.0, -0.003]), 0.3)
+    frame = frame_of(scene, SILICONE, pose, random_thread(np.random.default_rng(0), pose))
+    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), scene)
+    assert tracker.track(frame, 0.0).reason == ""
+    tracker.set_scene(scene_from_mapping({"dish": {"diameter": 0.07, "depth": 0.003}}))
+    seen = tracker.track(frame, 0.1)
+    assert seen.view is not None
+    assert seen.view.metres_per_pixel == pytest.approx(2.0 * PIXEL, rel=0.01)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_solid_and_depth_agree_with_the_geometry(factor: int):
+    scene = read_scene("hernia_ring")
+    view = DishView((322.3, 238.4), 1.1e-4, rotation=0.3)
+    mask = scene_mask(scene, view, (481, 641), factor, 3e-4, 8)
+    assert mask is not None
+    random = np.random.default_rng(0)
+    pixels = np.column_stack([random.integers(160, 500, 400), random.integers(100, 400, 400)]).astype(float)
+    shapes = shapely.union_all([shape.solid for shape in scene.shapes])
+    points = [shapely.Point(point) for point in view.to_dish(pixels)]
+    exact = np.array([-shapes.distance(p) or shapes.boundary.distance(p) for p in points]) / view.metres_per_pixel
+    assert np.abs(mask.depths(pixels) - exact).max() < 1.5
+    part = mask.part(160, 96, 501, 401)
+    np.testing.assert_array_equal(part.depths(pixels - (160, 96)), mask.depths(pixels))
+    inside = mask.solid[tuple(pixels.astype(int).T[::-1] // factor)] > 0
+    assert (exact[inside] > 3e-4 / view.metres_per_pixel - 1.5).all()
+    assert inside.sum() > 20
+
+
+def test_an_empty_scene_has_no_mask():
+    assert scene_mask(Scene(), VIEW, (480, 640), 2, 3e-4, 8) is None
+
+
+def test_outlines_are_drawn_where_the_shapes_are():
+    image = np.zeros((480, 640, 3), np.uint8)
+    draw_scene(image, VIEW, read_scene("dish_35mm_post"))
+    u, v = np.round(VIEW.to_pixels(np.add(POST.centre, (POST.radius, 0.0)))).astype(int)
+    assert image[v - 1 : v + 2, u - 1 : u + 2].max() > 100
+
+
+def test_the_set_ups_camera_sees_the_needle_among_dark_tissue():
+    setup = read_setup("hernia_ring")
+    scene = read_scene("hernia_ring")
+    rig = setup.rig
+    what = drawn.Scene(
+        dish_diameter=0.05, needle_length=0.0025, needle_width=0.00035, obstacles=scene.obstacles, looks=[STEEL] * 3
+    )
+    tail, heading = np.array([0.004, -0.012]), 2.0
+    thread = np.linspace(tail, tail - 0.012 * np.array([np.cos(heading), np.sin(heading)]), 40)
+    image = DishCamera(what, rig.view(scene), (rig.camera_width, rig.camera_height)).render(tail, heading, thread)
+    seen = VisionTracker(setup.vision, scene).look(image)
+    assert seen.reason == ""
+    assert np.linalg.norm(seen.tail - tail) < 2.0 * rig.view(scene).metres_per_pixel
+    assert VisionTracker(setup.vision, Scene(scene.dish)).look(image).reason
