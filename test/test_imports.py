@@ -148,10 +148,11 @@ def test_no_room_is_missing_from_the_rules():
 
 
 def test_modules_stay_small():
+    """A file is one concept, and its functions are bounded in complexity by the linter; this only keeps heaps away."""
     sizes = {str(path.relative_to(HOUSE)): len(path.read_text().splitlines()) for path in MODULES}
-    assert not {name: size for name, size in sizes.items() if size > 300}
+    assert not {name: size for name, size in sizes.items() if size > 400}
     nodes = {
         name: size for name, size in sizes.items() if name in {f"nodes/{n}.py" for n in (*NODES, *RIG_NODES, "console")}
     }
     assert len(nodes) == 6
-    assert not {name: size for name, size in nodes.items() if size > 150}
+    assert not {name: size for name, size in nodes.items() if size > 200}
