@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +52,16 @@ def answers(graph: Graph, frames: list[np.ndarray]) -> tuple[list[PredictedThrea
     """Return what comes of frames, one after the other."""
     predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
     seen = graph.listen(topics.SEEN_THREAD)
+
+    def answered(count: int) -> bool:
+        return min(len(predicted), len(seen)) >= count
+
     for index, image in enumerate(frames):
         stamp = Time(sec=5, nanosec=index * 33_000_000)
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, stamp))
         # Confirmed in the third frame; each later one is answered before the next is shown.
         count = max(0, index - 1)
-        graph.wait(lambda count=count: len(predicted) >= count and len(seen) >= count, "an answer")
+        graph.wait(partial(answered, count), "an answer")
     graph.wait(lambda: bool(margins) and margins[-1].header.stamp == predicted[-1].header.stamp, "its margins")
     return predicted, margins
 
