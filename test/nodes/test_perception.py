@@ -44,25 +44,24 @@ def met(graph: Graph, tracker: VisionTrackerNode, model: ThreadModelNode) -> Non
     said = [entry for entry in tracker.publishers if entry.topic_name in names]
     heard = [entry for entry in model.subscriptions if entry.topic_name in names]
     assert len(said) == len(heard) == len(names)
-    graph.wait(
-        lambda: (
-            all(entry.get_subscription_count() for entry in said)
-            and all(entry.get_publisher_count() for entry in heard)
-        ),
-        "tracker and model to meet",
-    )
+    graph.wait(lambda: all(entry.get_subscription_count() for entry in said), "the model to be found")
+    graph.wait(lambda: all(entry.get_publisher_count() for entry in heard), "the tracker to be found")
 
 
 def answers(graph: Graph, frames: list[np.ndarray]) -> tuple[list[PredictedThread], list[SafetyMargins]]:
     """Return what comes of frames, one after the other."""
     predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
     seen = graph.listen(topics.SEEN_THREAD)
+
+    def answered(count: int) -> bool:
+        return min(len(predicted), len(seen)) >= count
+
     for index, image in enumerate(frames):
         stamp = Time(sec=5, nanosec=index * 33_000_000)
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, stamp))
         # Confirmed in the third frame; each later one is answered before the next is shown.
         count = max(0, index - 1)
-        graph.wait(partial(lambda least: len(predicted) >= least and len(seen) >= least, count), "an answer")
+        graph.wait(partial(answered, count), "an answer")
     graph.wait(lambda: bool(margins) and margins[-1].header.stamp == predicted[-1].header.stamp, "its margins")
     return predicted, margins
 
@@ -108,13 +107,16 @@ def test_the_thread_is_handed_over_and_no_message_is_taken_besides(graph, frames
 
 
 def test_markers_come_only_where_somebody_looks(graph, frames):
-    together(graph)
+    _, model = together(graph)
     predicted, _ = answers(graph, frames[:4])
+    (shown,) = [entry for entry in model.publishers if entry.topic_name == f"/{topics.THREAD_MARKERS.name}"]
+    assert not shown.get_subscription_count()
     markers = graph.listen(topics.THREAD_MARKERS)
+    graph.wait(lambda: shown.get_subscription_count() == 1, "the viewer to be found")
     for index, image in enumerate(frames[4:], start=4):
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=index * 33_000_000)))
         graph.wait(lambda index=index: len(predicted) >= index - 1, "an answer")
-    graph.wait(lambda: bool(markers), "markers")
+    graph.wait(lambda: len(markers) == len(frames) - 4, "markers of all frames from then on")
     assert len(markers[-1].markers[0].points) == len(predicted[-1].vertices)
 
 
