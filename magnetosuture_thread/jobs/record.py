@@ -21,6 +21,7 @@ from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
+    SCENE,
     SEEN_THREAD,
     TRUE_NEEDLE,
     TRUE_THREAD,
@@ -28,7 +29,7 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.thread import Attachment
-from magnetosuture_thread.offline.messages import header, make, path_message, placed, pose_message
+from magnetosuture_thread.offline.messages import header, make, path_message, placed, pose_message, scene_message
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.camera.scene import Scene
 from magnetosuture_thread.setups import Setup
@@ -92,6 +93,9 @@ def record(
     notes = {"setup": setup.name, "simulated": f"{what} from the reference trajectory {reference.name}"}
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
         topics = _PoseTopics(bag, setup, noise, seed) if poses else _FrameTopics(bag, setup, reference, quality, seed)
+        begin = round((start + EPOCH) * 1e9)
+        bag.add_topic(SCENE.recorded, SCENE.type_name)
+        bag.write_message(SCENE.recorded, begin, scene_message(begin, setup.scene))
         for index in range(frames):
             time = start + index / rate
             before, after = max(first, time - 0.5 / rate), min(last, time + 0.5 / rate)

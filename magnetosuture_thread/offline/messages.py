@@ -13,9 +13,12 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     DISH_FRAME,
     NEEDLE_POSE,
+    SCENE,
     SEEN_THREAD,
     TRACKER_STATE,
 )
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.messages import scene_fields
 from magnetosuture_thread.vision.look import State, Track
 
 _IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
@@ -54,6 +57,34 @@ def path_message(stamp: int, points: Points) -> Any:
     shared = header(stamp)
     poses = [make("geometry_msgs/msg/PoseStamped", header=shared, pose=_pose(point, 0.0)) for point in points]
     return make(SEEN_THREAD.type_name, header=shared, poses=poses)
+
+
+def scene_message(stamp: int, scene: Scene) -> Any:
+    """Return a scene as a message."""
+    fields = scene_fields(scene)
+    shapes = [
+        make(
+            "magnetosuture_msgs/msg/SceneShape",
+            name=shape["name"],
+            kind=shape["kind"],
+            disc=[make("magnetosuture_msgs/msg/Disc", **disc) for disc in shape["disc"]],
+            polygon=[
+                make(
+                    "magnetosuture_msgs/msg/Polygon",
+                    outline=_outline(found["outline"]),
+                    holes=[_outline(hole) for hole in found["holes"]],
+                )
+                for found in shape["polygon"]
+            ],
+        )
+        for shape in fields["shapes"]
+    ]
+    return make(SCENE.type_name, header=header(stamp), **{**fields, "shapes": shapes})
+
+
+def _outline(fields: dict[str, Any]) -> Any:
+    corners = [make("geometry_msgs/msg/Point", **corner) for corner in fields["corners"]]
+    return make("magnetosuture_msgs/msg/Outline", corners=corners)
 
 
 def tracker_state(stamp: int, track: Track) -> Any:

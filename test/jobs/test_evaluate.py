@@ -11,7 +11,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
@@ -20,12 +19,14 @@ from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
-from magnetosuture_thread.interface import CURRENTS, NEEDLE_POSE, OBSTACLE_SET, PREDICTED_THREAD, SEEN_THREAD, Channel
+from magnetosuture_thread.interface import CURRENTS, NEEDLE_POSE, PREDICTED_THREAD, SCENE, SEEN_THREAD, Channel
 from magnetosuture_thread.jobs import evaluate_bag as job
 from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
 from magnetosuture_thread.jobs.evaluate_bag import Options
 from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions
 from magnetosuture_thread.jobs.replay_offline import replay_offline
+from magnetosuture_thread.offline.messages import scene_message
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.study.bag_table import TIMES, Row
 from magnetosuture_thread.study.report.moments import Moment
 from magnetosuture_thread.study.report.pictures import Picture, draw_moment
@@ -201,17 +202,9 @@ def copied(source: Path, target: Path, more: Sequence[tuple[Channel, int, bytes]
 def test_a_picture_has_the_obstacles_that_were_in_force(
     tmp_path: Path, short_bag: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    store = typestore()
-    stamp = store.types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    disc = store.types["magnetosuture_msgs/msg/Disc"](x=0.0, y=0.012, radius=0.002)
-    message = store.types[OBSTACLE_SET.type_name](
-        header=store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="dish"),
-        discs=[disc],
-        polygons=[],
-        corner_radius=np.empty(0),
-    )
-    data = bytes(store.serialize_cdr(message, OBSTACLE_SET.type_name))
-    bag = copied(short_bag, tmp_path / "changed", [(OBSTACLE_SET, Bag(short_bag).start, data)])
+    post = Scene(Dish(0.035), (SceneShape("post", "instrument", ObstacleDisc((0.0, 0.012), 0.002)),))
+    data = bytes(typestore().serialize_cdr(scene_message(0, post), SCENE.type_name))
+    bag = copied(short_bag, tmp_path / "changed", [(SCENE, Bag(short_bag).start, data)])
     shown: list[Moment] = []
 
     def draw(moment: Moment, *arguments: Any, **named: Any) -> Picture:

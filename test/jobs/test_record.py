@@ -97,9 +97,9 @@ def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: Referenc
 @pytest.mark.parametrize(
     ("metadata", "discs", "words"),
     [
-        ({"material": {"L_m": 0.15}}, (), r"thread_model\.length: got 0\.019, expected 0\.15"),
+        ({"material": {"L_m": 0.15}}, (), r"thread_model\.thread_length: got 0\.019, expected 0\.15"),
         ({"boundary": "pinned"}, (), r"thread_model\.attachment: got 'glued', expected pinned"),
-        ({}, (Disc((0.0, 0.0), 0.002),), r"thread_model\.disc_obstacles: got \(\), expected .*radius=0\.002"),
+        ({}, (Disc((0.0, 0.0), 0.002),), r"thread_model\.scene: got \(\), expected .*radius=0\.002"),
     ],
 )
 def test_a_setup_for_another_thread_is_refused(

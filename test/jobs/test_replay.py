@@ -316,8 +316,8 @@ def test_an_output_that_exists_is_not_touched(short_bag: Path, tmp_path: Path):
 
 def test_a_bad_setup_is_refused_before_anything_starts(short_bag: Path, tmp_path: Path):
     path = tmp_path / "bad.yaml"
-    path.write_text("thread_model: {ros__parameters: {length: 19.0}}\n")
-    with pytest.raises(ConfigurationError, match=r"thread_model\.length: got 19\.0"):
+    path.write_text("thread_model: {ros__parameters: {thread_length: 19.0}}\n")
+    with pytest.raises(ConfigurationError, match=r"thread_model\.thread_length: got 19\.0"):
         replay(short_bag, tmp_path / "out", setup_name=str(path))
     assert not (tmp_path / "out").exists()
 

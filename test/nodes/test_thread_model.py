@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
-from nav_msgs.msg import Path
+from nav_msgs.msg import Path as PathMessage
 from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.model import choices
 from magnetosuture_thread.model.formulations import rod
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.nodes import messages, topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.scene import read_scene, write_scene
+from test.model.worlds import scene_with
 
 
 def stamp(seconds: float) -> Time:
@@ -30,7 +34,7 @@ def pose(seconds: float, x: float = 0.0, y: float = 0.0) -> PoseWithCovarianceSt
     return messages.pose_message(stamp(seconds), np.array([x, y]), np.array([1.0, 0.0]))
 
 
-def seen(seconds: float) -> Path:
+def seen(seconds: float) -> PathMessage:
     """Return a thread that lies straight behind a needle at the origin."""
     return messages.PathMaker().message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
 
@@ -79,28 +83,25 @@ def colour_of(message: MarkerArray) -> tuple[float, float, float]:
     return colour.r, colour.g, colour.b
 
 
-def test_friction_is_told_shown_and_slows_what_an_operator_asks(graph):
+def scene_file(folder: Path, *geometries: Disc | Polygon, diameter: float = 0.5) -> str:
+    """Write a scene and return its file."""
+    write_scene(scene_with(*geometries, diameter=diameter), folder / "scene.yaml")
+    return str(folder / "scene.yaml")
+
+
+def test_friction_is_told_and_shown(graph, tmp_path: Path):
     """A gate of two discs around the thread, 6 mm behind the needle, which is drawn on and then rests."""
-    gate = [-0.006, 0.0018, 0.001, -0.006, -0.0018, 0.001]
     graph.add(
         ThreadModelNode,
         initial_shape="straight",
-        disc_obstacles=gate,
+        scene=scene_file(tmp_path, Disc((-0.006, 0.0018), 0.001), Disc((-0.006, -0.0018), 0.001)),
         friction_threshold=1.2e-3,
         friction_averaging=0.0,
     )
     margins, markers = graph.listen(topics.MARGINS), graph.listen(topics.THREAD_MARKERS)
-    commands, states = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.STEERING_STATE)
     for k, x in enumerate((0.0, 1e-4, 2e-4, 2e-4)):
         graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, x))
         graph.wait(lambda k=k: len(margins) == k + 1 and len(markers) == k + 1, "margins and markers")
-        if k < 2:
-            continue
-        asked = messages.twist_message(stamp(1.0 + k / 30.0 + 0.01), np.array([3e-3, 1e-3]))
-        graph.publish(topics.OPERATOR_COMMAND, asked)
-        graph.wait(lambda k=k: len(commands) == k - 1 and len(states) == k - 1, "a filtered command")
-        assert commands[-1].header.stamp == states[-1].header.stamp == asked.header.stamp
-        assert commands[-1].header.frame_id == "dish"
     pulled, resting = margins[-2:]
     assert pulled.friction_state == SafetyMargins.FRICTION_PULLED
     assert list(pulled.friction_nodes) == list(resting.friction_nodes)
@@ -112,49 +113,6 @@ def test_friction_is_told_shown_and_slows_what_an_operator_asks(graph):
     assert red > green > blue
     assert colour_of(markers[-1])[2] == max(colour_of(markers[-1]))
     assert len(markers[-2].markers[1].points) == count
-    assert commands[0].twist.linear.x == pytest.approx(pulled.slowdown * 3e-3)
-    assert commands[1].twist.linear.x == pytest.approx(3e-3)
-    assert states[0].slowdown == pulled.slowdown
-    assert not states[0].held_off
-
-
-def test_an_operator_who_falls_silent_is_followed_by_silence(graph):
-    graph.add(ThreadModelNode, initial_shape="straight")
-    commands, states = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.STEERING_STATE)
-    graph.publish(topics.OPERATOR_COMMAND, messages.twist_message(stamp(1.0), np.array([1e-3, 0.0])))
-    graph.wait(lambda: bool(commands and states), "an answer")
-    assert commands[0].twist.linear.x == 0.0
-    assert states[0].reason == "no predicted thread yet"
-    assert states[0].asked.x == 1e-3
-    for k in range(20):
-        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, k * 1e-4))
-    health = graph.listen(topics.DIAGNOSTICS)
-    for wrong in ([np.nan, 0.0], [5.0, 0.0]):
-        graph.publish(topics.OPERATOR_COMMAND, messages.twist_message(stamp(1.6), np.array(wrong)))
-        told = f"needle velocity: got {wrong}"
-        graph.wait(lambda told=told: any(told in v.value for m in health for v in m.status[0].values), "the refusal")
-    assert len(commands) == len(states) == 1
-
-
-def test_of_two_operators_at_once_neither_is_answered(graph):
-    graph.add(ThreadModelNode, initial_shape="straight")
-    commands, health = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.DIAGNOSTICS)
-    asked = messages.twist_message(stamp(1.0), np.array([1e-3, 0.0]))
-    other = graph.probe.create_publisher(TwistStamped, topics.OPERATOR_COMMAND.name, topics.OPERATOR_COMMAND.qos)
-    graph.wait(lambda: other.get_subscription_count() > 0, "the other to be found")
-    for k in range(2):
-        graph.publish(topics.OPERATOR_COMMAND, asked)
-        graph.wait(lambda k=k: len(commands) == k + 1, "an answer")
-    for _ in range(3):
-        graph.publish(topics.OPERATOR_COMMAND, asked)
-        other.publish(asked)
-
-    def refused() -> int:
-        return int(next((v.value for v in health[-1].status[0].values if v.key == "refused"), 0)) if health else 0
-
-    graph.wait(lambda: len(commands) + refused() == 8, "all to be heard")
-    assert refused() >= 3
-    assert "publishers at once, expected one" in str(health[-1].status[0].values)
 
 
 def test_the_order_of_pose_and_centreline_does_not_matter(graph):
@@ -188,37 +146,41 @@ def test_it_can_start_straight_without_a_camera(graph):
     assert predicted[0].vertices[25].x == pytest.approx(0.003 - 0.019)
 
 
-def test_obstacles_give_margins_contact_and_a_latched_marker(graph):
-    # A disc that node 12 rests against.
-    graph.add(ThreadModelNode, disc_obstacles=[-12 * 0.00076, 0.002 + 30e-6 + 1e-6, 0.002], initial_shape="straight")
-    margins, obstacles = graph.listen(topics.MARGINS), graph.listen(topics.OBSTACLE_MARKERS)
+def least_of(margins: SafetyMargins, kind: int) -> BarrierMargin:
+    """Return the least margin of a kind."""
+    return next(entry for entry in margins.least if entry.kind == kind)
+
+
+def test_a_scene_gives_margins_and_contact(graph, tmp_path: Path):
+    # A disc that node 12 rests against, and a square with its edge 1 mm above the thread's end.
+    square = Polygon(((-0.018, 0.001), (-0.016, 0.001), (-0.016, 0.007), (-0.018, 0.007)))
+    name = scene_file(tmp_path, Disc((-12 * 0.00076, 0.002 + 30e-6 + 1e-6), 0.002), square)
+    graph.add(ThreadModelNode, scene=name, initial_shape="straight")
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
     graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.wait(lambda: bool(margins and obstacles), "margins and obstacles")
+    graph.wait(lambda: bool(margins and predicted), "margins")
+    assert margins[0].scene_version == predicted[0].scene_version == read_scene(name).version
     assert margins[0].contact_state == SafetyMargins.CONTACT_TOUCHING
     assert list(margins[0].contact_nodes) == [12]
-    least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_OBSTACLE)
-    assert least.obstacle == 0
-    assert least.node == 12
+    least = least_of(margins[0], BarrierMargin.KIND_OBSTACLE)
+    assert (least.obstacle, least.node) == (0, 12)
     assert least.clearance == pytest.approx(1e-6, abs=1e-9)
-    assert [marker.action for marker in obstacles[0].markers] == [Marker.DELETEALL, Marker.ADD]
-    assert obstacles[0].markers[1].scale.x == pytest.approx(0.004)
+    of_square = np.asarray(margins[0].clearance)[np.asarray(margins[0].obstacle) == 1]
+    assert of_square.min() == pytest.approx(1e-3 - 30e-6, abs=1e-9)
+    assert BarrierMargin.KIND_WALL not in margins[0].kind  # which is 23 cm away
 
 
-def test_polygons_give_margins_and_are_shown_as_triangles(graph):
-    """A square with its edge 1 mm above the thread, its corners rounded."""
-    corners = [-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007]
-    graph.add(ThreadModelNode, polygon_obstacles=corners, polygon_sizes=[4], initial_shape="straight")
-    margins, obstacles = graph.listen(topics.MARGINS), graph.listen(topics.OBSTACLE_MARKERS)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.wait(lambda: bool(margins and obstacles), "margins and obstacles")
-    least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_OBSTACLE)
-    assert least.clearance == pytest.approx(1e-3 - 30e-6, abs=1e-9)
-    marker = obstacles[0].markers[1]
-    assert marker.type == Marker.TRIANGLE_LIST
-    corner = np.array([[p.x, p.y] for p in marker.points]).reshape(-1, 3, 2)
-    sides = corner[:, 1:] - corner[:, :1]
-    area = 0.5 * np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum()
-    assert area == pytest.approx(36e-6, rel=1e-2)
+def test_the_wall_gives_margins_and_contact(graph, tmp_path: Path):
+    name = scene_file(tmp_path, diameter=0.035)
+    graph.add(ThreadModelNode, scene=name, initial_shape="straight")
+    margins = graph.listen(topics.MARGINS)
+    graph.publish(topics.NEEDLE_POSE, pose(1.0, x=0.0015 + 30e-6 + 1e-6))
+    graph.wait(lambda: bool(margins), "margins")
+    least = least_of(margins[0], BarrierMargin.KIND_WALL)
+    assert (least.obstacle, least.node) == (-1, 25)
+    assert least.clearance == pytest.approx(1e-6, abs=1e-9)
+    assert (margins[0].contact_state, list(margins[0].contact_nodes)) == (SafetyMargins.CONTACT_TOUCHING, [25])
+    assert margins[0].friction_state == SafetyMargins.FRICTION_FREE
 
 
 def test_the_papers_formulation_runs_in_the_graph(graph):

@@ -19,23 +19,25 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
     MARGINS,
     MATERIAL,
     NEEDLE_POSE,
-    OBSTACLE_SET,
     PREDICTED_THREAD,
+    SCENE,
     SEEN_THREAD,
     TRUE_THREAD,
 )
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState
-from magnetosuture_thread.offline.messages import header, make, path_message, pose_message
+from magnetosuture_thread.offline.messages import header, make, path_message, pose_message, scene_message
 from magnetosuture_thread.offline.packing import packed_margins, packed_prediction
 from magnetosuture_thread.offline.predictions import predictions, sights
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
+from magnetosuture_thread.scene import SceneShape
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
@@ -226,7 +228,9 @@ def test_nothing_predicted_is_said_with_the_reason(pose_bag: Path, tmp_path: Pat
     with pytest.raises(BagError, match="30 of 30 poses had a needle; waiting for the thread to be seen"):
         replay_offline(blind, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    steps = list(predictions(sights(Recording(Bag(blind)), SETUP), replace(SETUP.model, initial_shape="straight")))
+    steps = list(
+        predictions(sights(Recording(Bag(blind)), SETUP), replace(SETUP.model, initial_shape="straight"), SETUP.scene)
+    )
     assert len(steps) == 30
     assert all(step.outcome.prediction is not None for step in steps)
 
@@ -248,7 +252,7 @@ def test_poses_may_wait_for_their_thread(pose_bag: Path):
     recording = Recording(Bag(pose_bag))
     seen = list(sights(recording, SETUP))
     late = [replace(s, seen=np.empty((0, 2))) if k < 5 else s for k, s in enumerate(seen)]
-    steps = list(predictions(late, SETUP.model))
+    steps = list(predictions(late, SETUP.model, SETUP.scene))
     assert [step.outcome.waiting for step in steps] == [True] * 5 + [False] * 25
     assert steps[5].outcome.stamp == steps[5].sight.stamp == seen[5].stamp
 
@@ -286,7 +290,7 @@ def test_poses_are_read_as_a_node_gets_them():
 
 
 def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
-    steps = list(predictions(list(sights(Recording(Bag(pose_bag)), SETUP))[:3], SETUP.model))
+    steps = list(predictions(list(sights(Recording(Bag(pose_bag)), SETUP))[:3], SETUP.model, SETUP.scene))
     prediction, margins = steps[-1].outcome.prediction, steps[-1].margins
     assert prediction is not None
     assert margins is not None
@@ -296,14 +300,16 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
         message: Any = store.deserialize_cdr(data, PREDICTED_THREAD.type_name)
         assert bytes(store.serialize_cdr(message, PREDICTED_THREAD.type_name)) == data
         assert (message.material, message.header.stamp.nanosec, message.step_time) == (material, 34, 0.0)
+        assert message.scene_version == SETUP.scene.version
         assert np.array_equal([[p.x, p.y] for p in message.vertices], prediction.vertices)
         assert np.array_equal(message.stretch, prediction.stretch)
     squeezed = Friction(FrictionState.PULLED, (2, 5, 6), 0.729)
     for given in (margins, replace(margins, touching=(3, 4)), replace(margins, friction=squeezed), None):
-        data = packed_margins(7, given, "" if given else "for a reason")
+        data = packed_margins(7, given, "" if given else "for a reason", "" if given else "0123456789abcdef")
         message = store.deserialize_cdr(data, MARGINS.type_name)
         assert bytes(store.serialize_cdr(message, MARGINS.type_name)) == data
         assert message.valid == (given is not None)
+        assert message.scene_version == (SETUP.scene.version if given else "0123456789abcdef")
         assert message.contact_state == (0 if given is None else 2 if given.touching else 1)
         friction = given.friction if given else UNKNOWN
         assert (message.friction_state, tuple(message.friction_nodes)) == (friction.state, friction.nodes)
@@ -313,24 +319,23 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
             assert [entry.obstacle for entry in message.least] == [entry.obstacle for entry in given.least]
 
 
-def test_obstacles_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_path: Path):
-    source = Bag(pose_bag)
+def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_path: Path):
+    source, scene = Bag(pose_bag), SETUP.scene.add(SceneShape("post", "instrument", Disc((0.0, 0.006), 0.002)))
+    too_fine = SETUP.scene.add(SceneShape("pin", "instrument", Disc((0.0, 0.006), 1e-5)))
     with BagWriter(tmp_path / "told", source.notes) as writer:
         for topic, type_name in (
             *source.topics.items(),
-            (OBSTACLE_SET.recorded, OBSTACLE_SET.type_name),
+            (SCENE.recorded, SCENE.type_name),
             (MATERIAL.recorded, MATERIAL.type_name),
         ):
             writer.add_topic(topic, type_name)
         for record in source.records(set(source.topics)):
             writer.write(record.topic, record.time, record.data)
-        for time, radius in ((1.39, 0.002), (1.61, -1.0)):
+        for time, told, version in ((1.39, scene, scene.version), (1.5, scene, "f" * 16), (1.61, too_fine, "")):
             stamp = round(time * 1e9)
-            disc = make("magnetosuture_msgs/msg/Disc", x=0.0, y=0.006, radius=radius)
-            obstacles = make(
-                OBSTACLE_SET.type_name, header=header(stamp), discs=[disc], polygons=[], corner_radius=np.empty(0)
-            )
-            writer.write_message(OBSTACLE_SET.recorded, stamp, obstacles)
+            message = scene_message(stamp, told)
+            message.version = version or message.version
+            writer.write_message(SCENE.recorded, stamp, message)
         silk = make(
             MATERIAL.type_name,
             header=header(stamp),
@@ -346,9 +351,13 @@ def test_obstacles_and_material_count_from_when_they_were_said(pose_bag: Path, t
         writer.write_message(MATERIAL.recorded, stamp, silk)
     for start, first in ((0.0, 12), (0.5, 0)):
         seen = sights(Recording(Bag(tmp_path / "told")), SETUP, start=start)
-        steps = list(predictions(seen, SETUP.model))
-        assert [len(step.settings.obstacles()) for step in steps] == [0] * first + [1] * (len(steps) - first)
+        steps = list(predictions(seen, SETUP.model, SETUP.scene))
+        assert [step.scene for step in steps] == [SETUP.scene] * first + [scene] * (len(steps) - first)
+        assert [step.outcome.scene_version for step in steps] == [step.scene.version for step in steps if step.scene]
         assert {step.settings.material for step in steps} == {SETUP.model.material, "silk_6_0"}
         assert steps[-1].settings.material == "silk_6_0"
         assert all(step.outcome.prediction is not None for step in steps)
-        assert sum(seen.refused.values()) == 1
+        assert sum(seen.refused.values()) == 2
+    replay_offline(tmp_path / "told", tmp_path / "again")
+    said = [record.decode().version for record in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]
+    assert said[0] == scene.version  # so that what comes of it can be replayed in its turn

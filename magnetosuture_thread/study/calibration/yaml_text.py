@@ -12,11 +12,11 @@ from magnetosuture_thread.study.calibration.result import FIXED, IDENTIFIED, Cal
 
 WIDTH = 118
 # Of the thread and its liquid, what gives the fitted numbers their meaning; with 0 the material's diameter counts.
-GIVEN = ("material", "diameter", "length", "segments", "viscosity", "wetted_fraction")
+GIVEN = ("material", "diameter", "thread_length", "segments", "viscosity", "wetted_fraction")
 UNITS = {"elastic_modulus": "Pa", "rest_curvature": "1/m", OFFSET: "m, along and left"}
 STIFFNESS = (
     "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
-    "the one that has the fitted ratio at the viscosity, diameter, length and wetted_fraction below; it is the "
+    "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
     "thread's own as far as these are true."
 )
 

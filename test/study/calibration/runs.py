@@ -20,7 +20,7 @@ from magnetosuture_thread.study.calibration.parameters import with_stiffness_ove
 from magnetosuture_thread.study.calibration.passage import Passage, passage_of
 from magnetosuture_thread.study.sight import Sight
 
-SETTINGS = ThreadModelSettings(length=0.019, segments=12, longest_step=0.07)  # one step a pose
+SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, longest_step=0.07)  # one step a pose
 SILK = ThreadModelSettings(material="silk_6_0", length=0.15, segments=30, longest_step=0.07)
 DRAG, LENGTH = 1.0, 0.019  # Pa s, m; of the rig's thread
 RATE = 15.0  # poses a second

@@ -30,7 +30,7 @@ from magnetosuture_thread.study.calibration.result import (
 from magnetosuture_thread.study.calibration.table import bag_table, calibration_lines, parameter_table
 from magnetosuture_thread.study.calibration.yaml_text import to_yaml
 
-SETTINGS = ThreadModelSettings(length=0.019, segments=12)
+SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12)
 
 ALL = [(formulation, parameter) for formulation, many in OF_FORMULATION.items() for parameter in many]
 
