@@ -16,7 +16,7 @@ GIVEN = ("material", "diameter", "thread_length", "segments", "viscosity", "wett
 UNITS = {"elastic_modulus": "Pa", "rest_curvature": "1/m", OFFSET: "m, along and left"}
 STIFFNESS = (
     "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
-    "the one that has the fitted ratio at the viscosity, diameter, length and wetted_fraction below; it is the "
+    "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
     "thread's own as far as these are true."
 )
 
