@@ -50,7 +50,7 @@ def test_kernels_are_forgotten_when_any_file_with_compiled_functions_changes(tmp
 
 def test_a_second_start_compiles_nothing():
     """A kernel that numba cannot find again would be compiled, and kept once more, at every start."""
-    code = "from magnetosuture_thread.model.settings import ThreadModelSettings as S; S().predictor()"
+    code = "from magnetosuture_thread.model.settings import ThreadModelSettings as S; S().predictor(None)"
 
     def started() -> set[Path]:
         subprocess.run([sys.executable, "-c", code], check=True, timeout=300)

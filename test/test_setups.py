@@ -98,14 +98,14 @@ def test_two_values_of_what_nodes_share_are_refused(tmp_path: Path, section: str
 def test_what_nodes_share_is_written_once(tmp_path: Path):
     path = tmp_path / "shared.yaml"
     path.write_text(
-        "/**: {ros__parameters: {scene: dish_150mm, needle_length: 0.004, needle_curvature: 8.0, driver_timeout: 0.5}}"
+        "/**: {ros__parameters: {scene: dish_150mm, needle_length: 0.004, needle_curvature: 8.0, driver_timeout: 0.3}}"
     )
     setup = read_setup(str(path))
     for part in (setup.vision, setup.coils, setup.rig, setup.follower, setup.console):
         assert part.needle_length == 0.004
         assert part.scene == "dish_150mm"
     assert setup.console.needle_curvature == setup.coils.needle_curvature == setup.rig.needle_curvature == 8.0
-    assert setup.coils.driver_timeout == setup.rig.driver_timeout == 0.5
+    assert setup.coils.driver_timeout == setup.rig.driver_timeout == 0.3
     assert setup.scene.dish.diameter == 0.15
 
 

@@ -22,7 +22,7 @@ from magnetosuture_thread.shared_parameters import shared
 INSIDE = 0.9  # of the distance to the coils
 FEWEST = 4.0  # periods of the loop in a timeout; two of them are given away so that no current outlives it
 FEWEST_HELD = 2.0  # periods of the loop in the drivers' timeout, or they would switch off between two steps
-MAX_BLIND_WAY = 0.01  # m; that the needle could go while nobody looks, was there nothing in its way
+MAX_BLIND_WAY = 0.0125  # m; that the needle could go while nobody looks, was there nothing in its way
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, TRACKER_STATE
+from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SCENE, SEEN_THREAD, TRACKER_STATE
 from magnetosuture_thread.jobs.judge import Given, begin_with_scene, opened, write_results
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.session import WAITING
@@ -92,7 +92,10 @@ def replay_offline(
         tally, refused = Tally(given.setup.model.thread_length), Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
             begin_with_scene(bag, given)
-            steps, made = predictions(seen, given.setup.model, given.setup.scene), _Output(bag, seen)
+            steps, made = (
+                predictions(seen, given.setup.model, given.setup.scene),
+                _Output(bag, seen, given.setup.scene.version),
+            )
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)
@@ -167,13 +170,15 @@ class _Output:
     Args:
         bag: to write to.
         seen: whose frames and records it gets as they go by.
+        version: of the scene that the bag begins with.
     """
 
-    def __init__(self, bag: BagWriter, seen: Sights) -> None:
+    def __init__(self, bag: BagWriter, seen: Sights, version: str) -> None:
         self._bag = bag
         states = [TRACKER_STATE] if seen.source == "camera" else []
         for channel in (NEEDLE_POSE, *states, SEEN_THREAD, PREDICTED_THREAD, MARGINS):
             bag.add_topic(channel.recorded, channel.type_name)
+        self._version = version
         seen.on_frame, seen.on_record = self._frame, self._record
 
     def write(self, step: Step) -> None:
@@ -198,4 +203,9 @@ class _Output:
         self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), messages.tracker_state(stamp, track))
 
     def _record(self, stamp: int, record: Record) -> None:
+        if record.topic == SCENE.recorded:
+            version = record.decode().version
+            if version == self._version:
+                return  # written at the beginning
+            self._version = version
         self._bag.write(record.topic, max(stamp, 0), record.data)

@@ -79,7 +79,8 @@ class Sights(Iterator[Sight]):
         given = (TRUE_THREAD, *CHANGING, *sources)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
         records = recording.records(channels, start=start, duration=duration)
-        self._changes = list(recording.records(CHANGING, duration=start)) if start > 0.0 else []
+        earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
+        self._changes = [record for record in earlier if record.time < begin]
         awaited = {TRUE_THREAD, SEEN_THREAD} & set(channels)
         self._going = self._go(_telling(records, begin, whole, progress), awaited)
 

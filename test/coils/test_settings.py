@@ -34,7 +34,7 @@ def test_a_scene_without_room_for_the_needle_is_refused():
             r"coil_bridge\.keep_out: got 0\.00015, .* 0\.0002 m, half of coil_bridge\.needle_width",
         ),
         ({"max_speed": 0.5}, r"coil_bridge\.max_speed: got 0\.5, .* max_speed x \(driver_timeout \+ 1 / rate\)"),
-        ({"driver_timeout": 1.0}, r"coil_bridge\.max_speed: got 0\.02, expected at most 0\.00995 m/s"),
+        ({"driver_timeout": 1.0}, r"coil_bridge\.max_speed: got 0\.02, expected at most 0\.0124 m/s"),
         (
             {"rate": 15.0, "driver_timeout": 0.1, "command_timeout": 0.5, "pose_timeout": 0.5},
             r"coil_bridge\.driver_timeout: got 0\.1, expected at least 0\.133333 s, 2 periods",

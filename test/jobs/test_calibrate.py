@@ -26,7 +26,7 @@ TRUE = 1.6e-9  # m^4/s; the material's is 1.3e-9
 SETUP = """\
 /**:
   ros__parameters:
-    scene: dish_35mm
+    scene: dish_150mm
     thread_length: 0.019
 
 /**/thread_model:

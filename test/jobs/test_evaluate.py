@@ -205,7 +205,7 @@ def test_a_picture_has_the_obstacles_that_were_in_force(
 ):
     post = Scene(Dish(0.035), (SceneShape("post", "instrument", ObstacleDisc((0.0, 0.012), 0.002)),))
     data = bytes(typestore().serialize_cdr(scene_message(post, header(0), make), SCENE.type_name))
-    bag = copied(short_bag, tmp_path / "changed", [(SCENE, Bag(short_bag).start, data)])
+    bag = copied(short_bag, tmp_path / "changed", [(SCENE, Bag(short_bag).start, data)], leave=SCENE.recorded)
     shown: list[Moment] = []
 
     def draw(moment: Moment, *arguments: Any, **named: Any) -> Picture:

@@ -48,10 +48,15 @@ def test_a_pose_that_cannot_be_does_not_end_the_bridge(graph, tail):
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.NEEDLE_POSE, messages.pose_message(graph.now(), np.array(tail), EAST))
     graph.publish(topics.NEEDLE_COMMAND, command(graph))
-    graph.wait(lambda: any("of the dish's centre" in str(d.status[0].values) for d in diagnostics), "a refusal")
+    graph.wait(lambda: any("the dish's centre" in str(d.status[0].values) for d in diagnostics), "a refusal")
     assert not driven(node)
-    drive(graph)
-    graph.wait(lambda: driven(node), "a good pose")
+
+    def drives_again() -> bool:
+        """Command again and again: only several poses in a row that agree are believed after one that was not."""
+        drive(graph)
+        return driven(node)
+
+    graph.wait(drives_again, "good poses to be believed")
 
 
 def test_between_commands_the_currents_follow_the_needle(graph):
@@ -169,11 +174,11 @@ def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
 
 
 def test_currents_stay_within_their_limit_and_saturation_is_said(graph):
-    node = armed(graph, max_current=1.5, max_speed=0.5, **LONG)
+    node = armed(graph, max_current=0.5, max_speed=0.04, **LONG)
     states = graph.listen(topics.BRIDGE_STATE)
     drive(graph, x=9.0)
     graph.wait(lambda: any(m.saturated for m in states), "saturation")
-    assert max(np.abs(a).max() for a in applied(node)) <= 1.5
+    assert max(np.abs(a).max() for a in applied(node)) <= 0.5
     saturated = next(m for m in states if m.saturated)
     assert 0.0 < saturated.applied.x < saturated.filtered.x
 
@@ -185,7 +190,7 @@ def test_two_publishers_at_once_stop_the_needle(graph):
     graph.wait(lambda: driven(node), "a current")
     other = graph.probe.create_publisher(TwistStamped, topics.NEEDLE_COMMAND.name, 10)
     graph.wait(lambda: other.get_subscription_count() > 0, "the bridge")
-    own = next(s for s in node.subscriptions if s.topic_name.endswith("servo_cv"))
+    own = next(s for s in node.subscriptions if s.topic_name == "/needle/servo_cv")
     graph.wait(lambda: own.get_publisher_count() == 2, "the other to be found")
     other.publish(command(graph, -0.01))
     graph.wait(lambda: "several publishers" in reasons(states), "the stop")
@@ -210,7 +215,7 @@ def test_a_message_that_breaks_arithmetic_does_not_end_the_node(graph, monkeypat
     def broken(*_: Any) -> None:
         raise OverflowError("a check that was forgotten")
 
-    monkeypatch.setattr(node.station.bridge.gate, "accept", broken)
+    monkeypatch.setattr(node.station.bridge, "command", broken)
     monkeypatch.setattr(node.station.bridge.needle, "see", broken)
     drive(graph)
     graph.wait(lambda: bool(states) and states[-1].refused == 2, "both refused")

@@ -229,7 +229,7 @@ def test_with_bad_parameters_it_does_not_start(graph, bad):
 
 
 def test_without_a_rig_the_simulated_driver_is_not_armed(graph):
-    graph.add(CoilBridgeNode, driver="simulated", **LONG)
+    graph.add(CoilBridgeNode, driver="simulated", **LONG, **READY)
     refusal = arm(graph)
     assert not refusal.success
     assert "no rig_simulator listens" in refusal.message

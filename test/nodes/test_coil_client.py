@@ -21,7 +21,7 @@ def test_every_switch_works_and_shows_the_state(
     graph, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
-    node = graph.add(CoilBridgeNode, autostart="unconfigured")
+    node = graph.add(CoilBridgeNode, autostart="unconfigured", scene="dish_35mm")
     code, said = press(capsys, "arm")
     assert code == 1
     assert "an unconfigured bridge" in said

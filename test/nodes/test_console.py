@@ -89,7 +89,7 @@ def test_a_wish_is_published_at_once_with_a_stamp_of_now(graph, console):
 
 
 def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
-    graph.add(CoilBridgeNode, autostart="active")
+    graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
     graph.wait(lambda: bridge(console).get("state") == "active", "the bridge")
     assert not bridge(console)["armed"]
     assert act(console, "arm") == ""
@@ -115,7 +115,7 @@ def test_a_stop_waits_for_no_other_action_and_ends_one_that_waits(graph, console
         await asyncio.sleep(0.05)
         assert arming.done()
         assert not stopping.done()
-        graph.add(CoilBridgeNode, autostart="active")
+        graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
         return await arming, await stopping
 
     armed, stopped = asyncio.run(both())
@@ -131,7 +131,7 @@ def test_a_switch_that_nobody_offers_is_refused_in_words(console, monkeypatch):
 
 
 def test_a_held_graph_is_told_nothing_but_a_stop(graph, console):
-    graph.add(CoilBridgeNode, autostart="active")
+    graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
     wishes = graph.listen(topics.OPERATOR_COMMAND)
 
     def heard(speed: float) -> bool:

@@ -26,11 +26,12 @@ from test.nodes.test_run import heard as is_heard
 from test.nodes.test_vision_tracker import compressed
 
 FRAMES = 8
+SCENE = "dish_35mm"
 
 
 def together(graph: Graph, **parameters: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
     """Add both nodes, made by the composition."""
-    overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+    overrides = [Parameter(name, value=value) for name, value in {"scene": SCENE, **parameters}.items()]
     made = perception(context=graph.context, parameter_overrides=overrides)
     for node in made:
         graph.nodes.append(node)
@@ -84,7 +85,7 @@ def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
             graph = Graph(domain)
             try:
                 if alone:
-                    tracker, model = graph.add(VisionTrackerNode), graph.add(ThreadModelNode)
+                    tracker, model = graph.add(VisionTrackerNode, scene=SCENE), graph.add(ThreadModelNode, scene=SCENE)
                     met(graph, tracker, model)
                 else:
                     together(graph)
@@ -135,7 +136,8 @@ def test_both_say_how_they_are(graph, frames):
 
 def test_a_stamp_that_is_none_is_refused_by_the_model_alone(graph, frames):
     said, poses = graph.listen_later(topics.DIAGNOSTICS), graph.listen_later(topics.NEEDLE_POSE)
-    tracker = VisionTrackerNode(context=graph.context, parameter_overrides=[Parameter("confirm_frames", value=1)])
+    given = [Parameter("confirm_frames", value=1), Parameter("scene", value=SCENE)]
+    tracker = VisionTrackerNode(context=graph.context, parameter_overrides=given)
     model = ThreadModelNode(context=graph.context, listens=False)
     tracker.hand_to(model)
     for node in (tracker, model):
@@ -149,18 +151,21 @@ def test_a_stamp_that_is_none_is_refused_by_the_model_alone(graph, frames):
 
 def test_one_that_cannot_be_made_takes_the_other_along(graph):
     with pytest.raises(MagnetosutureError, match="thread_model"):
-        together(graph, needle_width=0.0004)  # the tracker's; no parameter of the model
+        together(graph, confirm_frames=3)  # the tracker's; no parameter of the model
     nodes = graph.probe.get_node_names()
     graph.wait(lambda: "vision_tracker" not in graph.probe.get_node_names(), f"none of {nodes}")
 
 
 SETUP = """
+/**:
+  ros__parameters:
+    scene: dish_35mm
 /**/vision_tracker:
   ros__parameters:
     thread_length: {tracker}
 /**/thread_model:
   ros__parameters:
-    length: {model}
+    thread_length: {model}
     segments: 12
 """
 
@@ -190,7 +195,7 @@ def test_the_program_runs_until_it_is_asked_to_end(tmp_path: Path, end: signal.S
 @pytest.mark.parametrize(
     ("tracker", "model", "arguments", "words"),
     [
-        (0.018, 18.0, (), "thread_model.length: got 18.0, expected a number from"),
+        (0.018, 18.0, (), "thread_model.thread_length: got 18.0, expected a number from"),
         (18.0, 0.018, (), "vision_tracker.thread_length: got 18.0, expected a number from"),
         (0.018, 0.018, ("-r", "__node:=both"), "two nodes cannot both be named both"),
     ],

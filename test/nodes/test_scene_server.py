@@ -130,7 +130,7 @@ HOSTILE: list[tuple[str, dict[str, str], str]] = [
     ("load", {"file": "/dev/zero"}, "scene: got '/dev/zero', expected a YAML or GeoJSON file"),
     ("load", {"file": "FIFO"}, "scene: got '"),
     ("load", {"file": "x" * 100_000}, "file: got '100000 characters', expected at most 4096"),
-    ("load", {"file": "../../etc/passwd"}, "scene: got '../../etc/passwd', expected a YAML or GeoJSON file"),
+    ("load", {"file": "../../etc/nowhere"}, "scene: got '../../etc/nowhere', expected a YAML or GeoJSON file"),
     ("add", {"name": "", "shape": DISC}, "shapes: got '', expected names of 1 to 64 printable characters"),
     ("add", {"name": "x" * 65, "shape": DISC}, "name: got '65 characters', expected at most 64"),
     ("add", {"name": "a\nb", "shape": DISC}, "shapes: got 'a\\nb', expected names of"),

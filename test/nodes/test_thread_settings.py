@@ -223,7 +223,7 @@ def test_a_refused_parameter_leaves_all_as_it_was_to_the_last_bit(graph, values,
 
 def damaged(message: SceneMessage) -> SceneMessage:
     """Return a scene whose content is not that of its version."""
-    message.dish_diameter += 1e-6
+    message.dish_diameter -= 1e-6
     return message
 
 

@@ -148,7 +148,8 @@ def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
     assert cv2.imread(str(one / "summary.png")) is not None
     counts = Bag(one / "bag").counts
     assert {topic: counts[topic] for topic in counts if counts[topic]} == {
-        channel.recorded: 30 for channel in (NEEDLE_POSE, SEEN_THREAD, PREDICTED_THREAD, MARGINS)
+        SCENE.recorded: 1,
+        **{channel.recorded: 30 for channel in (NEEDLE_POSE, SEEN_THREAD, PREDICTED_THREAD, MARGINS)},
     }
 
 
@@ -361,4 +362,5 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
         assert sum(seen.refused.values()) == 2
     replay_offline(tmp_path / "told", tmp_path / "again")
     said = [record.decode().version for record in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]
-    assert said[0] == scene.version  # so that what comes of it can be replayed in its turn
+    # So that what comes of it can be replayed in its turn.
+    assert said[:2] == [SETUP.scene.version, scene.version]

@@ -145,7 +145,8 @@ def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
     (tmp_path / "device.yaml").symlink_to("/dev/zero")
     for path in (fifo, tmp_path / "folder.yaml", tmp_path / "device.yaml", tmp_path / "none.yaml", Path("/dev/zero")):
         with pytest.raises(
-            ConfigurationError, match=rf"^scene: got '{path}', expected a YAML or GeoJSON file, or one of dish_150mm"
+            ConfigurationError,
+            match=r"^scene: got '.*(yaml|\.{3}.*|zero)', expected a YAML or GeoJSON file, or one of dish_150mm",
         ):
             read_scene(str(path))
     large = tmp_path / "large.yaml"

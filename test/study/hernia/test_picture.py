@@ -15,12 +15,10 @@ from magnetosuture_thread.study.hernia.animation import draw_animation
 from magnetosuture_thread.study.hernia.picture import draw_hernia
 from magnetosuture_thread.study.hernia.run import HerniaRun, Steering, point_filter, replay_steering
 
-GATE = [0.004, 0.0018, 0.001, 0.004, -0.0018, 0.001]
-
 
 def run() -> HerniaRun:
     """Draw a needle through a gate."""
-    settings = from_mapping(ThreadModelSettings, {"disc_obstacles": GATE, "friction_threshold": 1.2e-3})
+    settings = from_mapping(ThreadModelSettings, {"friction_threshold": 1.2e-3})
     line = np.column_stack([-np.linspace(0.0, 0.019, 50), np.zeros(50)])
     times = np.arange(60) / 20.0
     posts = tuple(SceneShape(f"post_{k}", "tissue", Disc((0.004, y), 0.001)) for k, y in enumerate((0.0018, -0.0018)))

@@ -18,7 +18,6 @@ from magnetosuture_thread.study.hernia.steered import SteeredThread
 SETTINGS = from_mapping(
     ThreadModelSettings,
     {
-        "disc_obstacles": [0.004, 0.0018, 0.001, 0.004, -0.0018, 0.001],
         "friction_threshold": 1.2e-3,
         "friction_averaging": 0.0,
     },
