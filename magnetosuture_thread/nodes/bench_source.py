@@ -89,8 +89,15 @@ class BenchSourceNode(Node):
             pose = PoseWithCovarianceStamped()
             pose.header.stamp, pose.header.frame_id = stamp, frame
             position, q = pose.pose.pose.position, pose.pose.pose.orientation
+            # Most that is not odd is a needle that stays where it is: of others none would be believed, nothing driven.
             position.x, position.y = values[:2]
             angle = self._random.uniform(-math.pi, math.pi)
+            if self._random.random() < 0.9:
+                position.x, position.y = (
+                    place + 5e-3 * value if abs(value) < 0.02 else value
+                    for place, value in zip(TAIL.tolist(), values[:2], strict=True)
+                )
+                angle = math.atan2(HEADING[1], HEADING[0]) + 1e-3 * angle
             q.z, q.w = (values[2], values[3]) if self._random.random() < 0.3 else (math.sin(angle), math.cos(angle))
             self._send(self._poses, pose)
 

@@ -330,7 +330,7 @@ def test_a_graph_that_runs_is_joined_and_recorded(tmp_path: Path):
 
     with reserved_domain() as domain:
         environment = graph_environment(domain)
-        arguments = ("-p", "coil_bridge:autostart:=active")
+        arguments = ("-p", "coil_bridge:autostart:=active", "-p", "scene:=dish_35mm")
         with (
             NodeProcesses(("coil_bridge",), arguments, environment, tmp_path / "logs") as nodes,
             running("--graph", "--record", str(tmp_path / "recordings"), ROS_DOMAIN_ID=str(domain)) as console,
