@@ -23,10 +23,8 @@ MAX_FILE_BYTES = 1_000_000
 MAX_DEPTH = 20
 MAX_WORD_CHARS = 1000
 
-_C_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # without libyaml it takes ten times as long
 
-
-class _Loader(_C_LOADER):  # type: ignore[misc]
+class _Loader(yaml.CSafeLoader):  # the loader without libyaml takes ten times as long
     """Reads YAML as the set-up files are read: 1e-5 is a number, nothing is a date, no key stands twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -93,7 +91,7 @@ def parse_yaml(text: str, source: str = "", what: str = "scene file") -> Any:
     """
     try:
         depth = 0
-        for event in yaml.parse(text, Loader=_C_LOADER):
+        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
             problem = ""
             if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
                 depth += 1
@@ -107,8 +105,8 @@ def parse_yaml(text: str, source: str = "", what: str = "scene file") -> Any:
             elif isinstance(event, yaml.NodeEvent) and getattr(event, "tag", None) not in (None, "!"):
                 problem = "a tag (!)"
             if problem:
-                line = event.start_mark.line + 1  # type: ignore[union-attr]
-                raise refusal(what, f"{problem} in line {line}", f"plain YAML, at most {MAX_DEPTH} deep", source)
+                where = f" in line {event.start_mark.line + 1}" if event.start_mark else ""
+                raise refusal(what, problem + where, f"plain YAML, at most {MAX_DEPTH} deep", source)
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         problem = " ".join(str(getattr(error, "problem", None) or error).split())
