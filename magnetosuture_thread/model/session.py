@@ -146,7 +146,7 @@ class ThreadSession:
             return False
         return not self._predictor.started or self._last is None or stamp < self._last - REPLAYED
 
-    def on_seen(self, stamp: int, centreline: Points) -> Iterator[Outcome]:
+    def on_measured_thread(self, stamp: int, centreline: Points) -> Iterator[Outcome]:
         """Take the thread as the camera sees it, to start from.
 
         Args:

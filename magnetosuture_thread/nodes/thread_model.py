@@ -62,7 +62,7 @@ class ThreadModelNode(Node):
 
     def listen(self) -> None:
         """Take poses and seen threads from their topics."""
-        topics.SEEN_THREAD.subscribe(self, self.on_seen_thread, raw=True)
+        topics.SEEN_THREAD.subscribe(self, self.on_measured_thread_message, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
 
     def on_scene(self, scene: Scene) -> None:
@@ -89,7 +89,7 @@ class ThreadModelNode(Node):
             return
         self._tell(outcome, time.perf_counter() - began)
 
-    def on_seen_thread(self, data: bytes) -> None:
+    def on_measured_thread_message(self, data: bytes) -> None:
         """Keep the thread that the camera sees, to start from.
 
         Most are not needed, and to read a path of a hundred poses takes as long as some predictions: so
@@ -105,13 +105,13 @@ class ThreadModelNode(Node):
             return
         self._start(stamp, centreline)
 
-    def on_seen(self, stamp: Time, centreline: np.ndarray) -> None:
+    def on_measured_thread(self, stamp: Time, centreline: np.ndarray) -> None:
         """Take a seen thread that a tracker hands over."""
         self._start(messages.nanoseconds(stamp), centreline)
 
     def _start(self, stamp: int, centreline: np.ndarray) -> None:
         began = time.perf_counter()
-        for outcome in self._session.on_seen(stamp, centreline):
+        for outcome in self._session.on_measured_thread(stamp, centreline):
             self._tell(outcome, time.perf_counter() - began)
             began = time.perf_counter()
 

@@ -39,7 +39,7 @@ class Follower(Protocol):
     def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
         """Take what is published on the topic of needle poses."""
 
-    def on_seen(self, stamp: Time, centreline: np.ndarray) -> None:
+    def on_measured_thread(self, stamp: Time, centreline: np.ndarray) -> None:
         """Take what is published on the topic of seen threads."""
 
 
@@ -131,7 +131,7 @@ class VisionTrackerNode(Node):
             if len(seen.centreline):
                 self._threads.publish(packed_path(when, seen.centreline))
                 for follower in self._followers:
-                    follower.on_seen(stamp, seen.centreline)
+                    follower.on_measured_thread(stamp, seen.centreline)
         self._states.publish(messages.tracker_state(stamp, track, 0.0 if seen.problem else taken))
         values = {"frames": self._session.frames, "tracked": self._session.tracked}
         if seen.problem is not None:

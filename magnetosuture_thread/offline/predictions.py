@@ -129,7 +129,7 @@ def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:
             continue
         if len(sight.seen):
             began = time.perf_counter()
-            for outcome in session.on_seen(sight.stamp, sight.seen):
+            for outcome in session.on_measured_thread(sight.stamp, sight.seen):
                 yield step(waiting.get(outcome.stamp, sight), outcome, began)
                 began = time.perf_counter()
         began = time.perf_counter()

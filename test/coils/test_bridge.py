@@ -454,7 +454,7 @@ def test_another_scene_holds_from_the_next_step_on():
     assert np.linalg.norm(after.applied) < 0.6 * np.linalg.norm(before.applied)
 
 
-def test_a_scene_without_room_leaves_the_one_before():
+def test_rejected_scene_leaves_the_previous_one_in_force():
     plant = Plant().ready()
     with pytest.raises(ConfigurationError, match="room for the needle"):
         plant.bridge.set_scene(Scene(Dish(0.006)))

@@ -21,7 +21,7 @@ def test_the_filter_has_dish_shapes_and_keep_out():
     np.testing.assert_allclose(found, [2.0 * 0.001, 0.0], atol=1e-5)
 
 
-def test_a_scene_without_room_for_the_needle_is_refused():
+def test_scene_too_narrow_for_the_needle_is_rejected():
     with pytest.raises(ConfigurationError, match=r"scene\.dish\.diameter: .* more than 0\.008 m, room for the needle"):
         CoilBridgeSettings().safety_filter(Scene(Dish(0.0079)))
 

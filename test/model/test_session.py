@@ -71,7 +71,7 @@ def test_a_pose_waits_for_the_thread_of_its_frame():
     session = ThreadSession(made(), None)
     assert [go(session, 1.0 + 0.1 * k, 1e-4 * k).waiting for k in range(4)] == [True] * 4
     # The first frame's thread was never seen.
-    found = list(session.on_seen(1_100_000_000, seen(1e-4)))
+    found = list(session.on_measured_thread(1_100_000_000, seen(1e-4)))
     assert [outcome.stamp for outcome in found] == [1_100_000_000, 1_200_000_000, 1_300_000_000]
     assert [predicted(outcome).status for outcome in found] == ["started", "solved", "solved"]
     assert predicted(go(session, 1.4, 4e-4)).interval == pytest.approx(0.1)
@@ -79,7 +79,7 @@ def test_a_pose_waits_for_the_thread_of_its_frame():
 
 def test_the_thread_may_be_seen_first():
     session = ThreadSession(made(), None)
-    session.on_seen(SECOND, seen())  # kept, whether or not anybody asks for what comes of it
+    session.on_measured_thread(SECOND, seen())  # kept, whether or not anybody asks for what comes of it
     assert go(session, 0.9).waiting
     assert predicted(go(session, 1.0)).status == "started"
 
@@ -88,7 +88,7 @@ def test_only_so_many_poses_wait():
     session = ThreadSession(made(), None)
     for k in range(3 * EARLY):
         assert go(session, 1.0 + 0.01 * k).waiting
-    kept = list(session.on_seen(SECOND, seen()))
+    kept = list(session.on_measured_thread(SECOND, seen()))
     assert [outcome.waiting for outcome in kept] == [True] * EARLY  # that of the frame is among them no more
     assert kept[0].stamp == SECOND + (2 * EARLY) * 10_000_000
 
@@ -98,7 +98,7 @@ def test_an_early_pose_that_fails_does_not_keep_the_next_from_being_followed():
     go(session, 1.0)
     go(session, 1.0)  # its stamp is not later
     go(session, 1.1)
-    found = list(session.on_seen(SECOND, seen()))
+    found = list(session.on_measured_thread(SECOND, seen()))
     assert isinstance(found[1].problem, InvalidInputError)
     assert [outcome.prediction is not None for outcome in found] == [True, False, True]
 
@@ -107,10 +107,10 @@ def test_a_thread_that_cannot_be_the_needles_is_refused_and_waited_for_anew():
     session = ThreadSession(made(), None)
     go(session, 1.0)
     go(session, 1.1)
-    found = list(session.on_seen(SECOND, seen(y=5e-3)))
+    found = list(session.on_measured_thread(SECOND, seen(y=5e-3)))
     assert "from the needle's tail" in str(found[0].problem)
     assert found[1].waiting
-    assert predicted(next(iter(session.on_seen(1_100_000_000, seen())))).status == "started"
+    assert predicted(next(iter(session.on_measured_thread(1_100_000_000, seen())))).status == "started"
 
 
 @pytest.mark.parametrize("offset", [[], [1e-3, 0.0]])
@@ -128,7 +128,7 @@ def test_a_thread_that_cannot_be_the_needles_is_refused_and_waited_for_anew():
 def test_a_centreline_that_is_none_is_refused(centreline: Points, offset: list[float]):
     session = ThreadSession(made(attachment_offset=offset), None)
     go(session, 1.0)
-    (outcome,) = session.on_seen(SECOND, centreline)
+    (outcome,) = session.on_measured_thread(SECOND, centreline)
     assert isinstance(outcome.problem, InvalidInputError)
 
 
@@ -163,7 +163,7 @@ def test_a_step_that_is_not_solved_is_told_and_the_next_goes_on_from_before():
 def test_only_threads_that_are_of_use_are_wanted():
     session = ThreadSession(made(), None)
     assert session.wants_seen(0)
-    session.on_seen(SECOND, seen())
+    session.on_measured_thread(SECOND, seen())
     go(session, 1.0)
     assert not session.wants_seen(2 * SECOND)
     assert not session.wants_seen(SECOND // 2)  # late
@@ -173,11 +173,11 @@ def test_only_threads_that_are_of_use_are_wanted():
 
 def test_time_set_back_starts_anew():
     session = ThreadSession(made(), None)
-    session.on_seen(100 * SECOND, seen())
+    session.on_measured_thread(100 * SECOND, seen())
     go(session, 100.0)
     go(session, 100.1)
     assert go(session, 1.0).waiting  # for a thread of that time
-    assert [predicted(outcome).status for outcome in session.on_seen(SECOND, seen())] == ["started"]
+    assert [predicted(outcome).status for outcome in session.on_measured_thread(SECOND, seen())] == ["started"]
     assert predicted(go(session, 1.1)).interval == pytest.approx(0.1)
 
 
@@ -241,7 +241,7 @@ def test_no_offset_is_an_offset_of_zero_to_the_last_bit():
 def test_a_seen_thread_begins_where_it_is_fixed(offset: list[float], begin: float, end: float):
     session = ThreadSession(made(attachment_offset=offset), None)
     go(session, 1.0)
-    prediction = predicted(next(iter(session.on_seen(SECOND, seen()))))
+    prediction = predicted(next(iter(session.on_measured_thread(SECOND, seen()))))
     np.testing.assert_allclose(prediction.vertices[0], [begin, 0.0], atol=1e-12)
     np.testing.assert_allclose(prediction.vertices[-1], [end, 0.0], atol=1e-9)
 
@@ -249,7 +249,7 @@ def test_a_seen_thread_begins_where_it_is_fixed(offset: list[float], begin: floa
 def test_a_seen_thread_must_begin_at_the_tail_wherever_it_is_fixed():
     session = ThreadSession(made(attachment_offset=[2e-3, 0.0]), None)
     go(session, 1.0)
-    (outcome,) = session.on_seen(SECOND, seen(x=2e-3))
+    (outcome,) = session.on_measured_thread(SECOND, seen(x=2e-3))
     assert "from the needle's tail" in str(outcome.problem)
 
 
@@ -319,7 +319,7 @@ def test_no_thread_starts_outside_of_the_dish(formulation: str, length: float):
     go(crooked, 1.0, x=0.0174)
     wavy = seen(0.0174) + np.array([0.0, 2e-4]) * np.sin(np.arange(60))[:, None]
     wavy[:20, 0] += np.linspace(0.0, 2e-3, 20)  # out through the wall
-    (outcome,) = crooked.on_seen(SECOND, wavy)
+    (outcome,) = crooked.on_measured_thread(SECOND, wavy)
     assert np.linalg.norm(predicted(outcome).vertices[1:], axis=1).max() < 0.0175 - 30e-6 + 1e-9
 
 
@@ -427,7 +427,9 @@ def test_a_change_while_the_thread_is_waited_for_loses_no_pose():
     for k in range(3):
         go(session, 1.0 + 0.1 * k)
     session.change(made(material="silk_6_0"), None)
-    assert [predicted(outcome).stamp for outcome in session.on_seen(SECOND, seen())] == pytest.approx([1.0, 1.1, 1.2])
+    assert [predicted(outcome).stamp for outcome in session.on_measured_thread(SECOND, seen())] == pytest.approx(
+        [1.0, 1.1, 1.2]
+    )
 
 
 def test_who_waits_for_the_camera_can_be_told_to_start_straight():

@@ -53,7 +53,7 @@ def test_friction_slows_a_needle_that_pulls_and_no_other():
     assert (resting.state, resting.slowdown) == (FrictionState.RESTING, 1.0)
 
 
-def test_the_margins_tell_friction():
+def test_margins_contain_the_friction_state():
     model = session(GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
     x, _ = drive(model, 0, 5)
     states = []

@@ -106,7 +106,7 @@ def test_every_kind_of_barrier_has_a_name():
     assert {f"KIND_{name.upper()}" for name in console_messages.KINDS.values()} == names
 
 
-def test_the_scene_has_discs_and_outlines_with_no_more_points_than_are_seen():
+def test_scene_outlines_are_simplified_to_the_resolution_of_the_screen():
     scene = every_shape()
     told = plain(console_messages.scene(scene_messages.scene_message(STAMP, scene)))
     assert (told["version"], told["dish_diameter"], told["dish_depth"]) == (scene.version, 0.05, 0.004)

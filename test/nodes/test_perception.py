@@ -171,7 +171,7 @@ SETUP = """
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_the_program_runs_until_it_is_asked_to_end(tmp_path: Path, end: signal.Signals):
+def test_perception_process_ends_on_a_signal(tmp_path: Path, end: signal.Signals):
     path = tmp_path / "setup.yaml"
     path.write_text(SETUP.format(tracker=0.018, model=0.018))
     with reserved_domain() as domain, (tmp_path / "log").open("wb") as log:

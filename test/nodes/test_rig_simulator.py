@@ -246,7 +246,7 @@ def test_a_paused_simulated_clock_stands_still(graph):
     assert nanoseconds(clocks[-1].clock) < still + 60e9
 
 
-def test_the_scene_that_is_told_is_drawn_and_one_that_cannot_be_is_refused(graph):
+def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):
     node = graph.add(RigSimulatorNode, **SMALL)
     frames, diagnostics = graph.listen(topics.CAMERA_INFO), graph.listen(topics.DIAGNOSTICS)
     graph.wait(lambda: bool(frames), "a frame")

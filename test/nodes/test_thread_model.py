@@ -325,5 +325,5 @@ def test_an_unproven_solution_gives_no_margin(graph):
 def test_a_seen_thread_that_is_cut_off_is_refused_and_ends_nothing(graph):
     node = graph.add(ThreadModelNode)
     whole = serialize_message(Path(header=messages.header(graph.now()), poses=[PoseStamped()] * 3))
-    node.on_seen_thread(whole[:-20])
+    node.on_measured_thread_message(whole[:-20])
     assert node._health._refused == 1

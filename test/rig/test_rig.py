@@ -190,7 +190,7 @@ def push(made: Rig, begin: float, end: float) -> np.ndarray:
     return np.asarray(frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)]))
 
 
-def test_another_scene_is_felt_seen_and_has_another_dish_from_then_on():
+def test_new_scene_changes_contact_camera_image_and_dish():
     made = rig()
     plain = made.look(0.0).image
     made.set_scene(scene(Disc((0.0135, 0.0), 0.001), diameter=0.04))

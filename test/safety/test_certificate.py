@@ -66,7 +66,7 @@ def test_a_point_goes_straight():
     assert heading.tolist() == EAST.tolist()
 
 
-def test_a_needle_may_turn_many_times_where_there_is_room():
+def test_certificate_accepts_full_turns_in_free_space():
     filtered = safety(Scene(Dish(0.05)), 0.001)
     assert filtered.safe_share(np.array([0.0, 0.03]), np.array([-0.0005, 0.0]), EAST) == (1.0, "")
 

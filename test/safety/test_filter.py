@@ -59,7 +59,7 @@ def test_towards_the_wall_it_slows_down_and_says_by_what():
     assert (found.active, found.reason) == (("wall",), "")
 
 
-def test_a_slower_approach_may_be_asked_for():
+def test_approach_rate_limits_the_filtered_speed():
     tail = np.array([0.0175 - 2.0 * KEEP - LENGTH, 0.0])
     found = needle_filter(approach_rate=1.0).filter(np.array([0.02, 0.0]), tail, EAST)
     assert found.filtered.tolist() == pytest.approx([1.0 * KEEP, 0.0], rel=0.01)

@@ -63,7 +63,7 @@ def test_gaps_of_discs_count_their_rims():
     assert warning.value == pytest.approx(0.0003, abs=1e-6)
 
 
-def test_a_shape_near_or_across_the_wall_is_told():
+def test_check_reports_a_shape_near_or_across_the_wall():
     (near,) = scene_warnings(scene(Disc((0.0, 0.0152), 0.002)), WIDTH)
     assert near.what == "gap"
     assert near.place == pytest.approx((0.0, 0.0172))
@@ -76,7 +76,7 @@ def test_a_shape_near_or_across_the_wall_is_told():
     assert scene_warnings(scene(Disc((0.0, 0.0150), 0.002)), WIDTH) == []
 
 
-def test_a_hole_that_no_needle_fits_into_is_told():
+def test_check_reports_a_hole_too_narrow_for_the_needle():
     wide = shape_from_mapping("wide", {"annulus": {"center": [0, 0], "inner_radius": 0.00021, "outer_radius": 0.002}})
     assert scene_warnings(Scene(Dish(), (wide,)), WIDTH) == []
     ring = shape_from_mapping("ring", {"annulus": {"center": [0, 0], "inner_radius": 0.00019, "outer_radius": 0.002}})

@@ -34,7 +34,7 @@ def replay(passage: Passage, settings: ThreadModelSettings) -> Points:
     stamps = passage.stamps.tolist()
     for leg, end, initial in zip(passage.legs, [*passage.legs[1:], len(stamps)], passage.initials, strict=True):
         session, last = ThreadSession(settings, passage.scene), nothing
-        for _ in session.on_seen(stamps[leg], initial):
+        for _ in session.on_measured_thread(stamps[leg], initial):
             pass
         for index in range(leg, end):
             pose = NeedlePose(stamps[index] * 1e-9, passage.tails[index], passage.headings[index])

@@ -64,7 +64,7 @@ class SteeredThread:
         self._needle = needle
         self._stamp = 0
         self._tail = np.asarray(centreline[0], dtype=np.float64)
-        for _ in self._session.on_seen(0, centreline):
+        for _ in self._session.on_measured_thread(0, centreline):
             pass
         self.now = self._take(None, 0.0)
 
