@@ -181,6 +181,7 @@ class SimulatedHost(RecordingHost):
             return f"scenario: got {scenario!r}, expected one of {', '.join(self._scenarios)}"
         try:
             setup = read_setup(scenario)
+            setup.scene  # noqa: B018 read while the old nodes still run, so that they stay if it cannot be
         except MagnetosutureError as error:
             return str(error)
         self._hold(f"starting {setup.name}")

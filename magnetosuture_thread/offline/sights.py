@@ -11,13 +11,14 @@ import numpy as np
 
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.errors import BagError, InvalidInputError, MagnetosutureError
 from magnetosuture_thread.geometry.orientation import as_told
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE, SEEN_THREAD, TRUE_THREAD, Channel
 from magnetosuture_thread.model.session import EARLY
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
+from magnetosuture_thread.scene.messages import scene_of
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.sight import Sight
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -65,7 +66,7 @@ class Sights(Iterator[Sight]):
         self.refused: Counter[str] = Counter()
         self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
         self.on_record: Callable[[int, Record], None] = lambda stamp, record: None
-        self._dish = setup.scene.dish.diameter
+        self._scene = setup.scene
         self._length = setup.model.thread_length
         self._threads = self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
@@ -81,6 +82,8 @@ class Sights(Iterator[Sight]):
         records = recording.records(channels, start=start, duration=duration)
         earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
         self._changes = [record for record in earlier if record.time < begin]
+        for record in self._changes:
+            self._follow(record)
         awaited = {TRUE_THREAD, SEEN_THREAD} & set(channels)
         self._going = self._go(_telling(records, begin, whole, progress), awaited)
 
@@ -117,6 +120,7 @@ class Sights(Iterator[Sight]):
             if record.topic in parts:
                 self._keep(parts[record.topic], record)
             elif record.topic in _CHANGING:
+                self._follow(record)
                 waiting.append(record)
             else:
                 waiting.append(self._pose(record) if self.source == "poses" else self._frame(record))
@@ -128,6 +132,18 @@ class Sights(Iterator[Sight]):
                 yield from self._next(waiting.popleft(), parts)
         while waiting:
             yield from self._next(waiting.popleft(), parts)
+
+    def _follow(self, record: Record) -> None:
+        """Look for the needle in a recorded scene from here on, as `vision_tracker` does."""
+        if record.topic != SCENE.recorded:
+            return
+        try:
+            scene = scene_of(record.decode())
+            if scene.version != self._scene.version and self._tracker is not None:
+                self._tracker.set_scene(scene)
+        except MagnetosutureError:
+            return  # counted and reported where the model takes it
+        self._scene = scene
 
     def _next(self, head: Sight | Record, parts: dict[str, dict[int, Points]]) -> Iterator[Sight]:
         if isinstance(head, Record):
@@ -204,9 +220,10 @@ class Sights(Iterator[Sight]):
 
     def _check_place(self, topic: str, points: Points) -> None:
         """Refuse what is farther away than the dish is wide."""
-        if np.maximum.reduce(np.abs(points), axis=None) > self._dish:  # what is not finite is refused by the model
+        width = self._scene.dish.diameter
+        if np.maximum.reduce(np.abs(points), axis=None) > width:  # what is not finite is refused by the model
             worst = points.reshape(-1, 2)[np.abs(points).reshape(-1, 2).max(axis=1).argmax()]
-            where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {self._dish:g} m wide"
+            where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {width:g} m wide"
             raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another set-up's?")
 
 

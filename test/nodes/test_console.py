@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from rclpy.node import Node
 
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.jobs.console_hosts import SimulatedHost
 from magnetosuture_thread.nodes import (
     camera_messages,
     console_graph,
@@ -253,6 +255,23 @@ def test_a_rig_is_paused_where_there_is_one(graph, console):
     assert not rig.time.paused
     assert "run by others" in asyncio.run(host.choose("petri_150mm_silk"))
     assert "--graph" in asyncio.run(host.record(True))
+
+
+def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: Path):
+    unusable = {
+        "no_scene": ("/**/thread_model: {ros__parameters: {segments: 25}}", "expected a scene file"),
+        "lost_scene": ("/**: {ros__parameters: {scene: nowhere.yaml}}", "nowhere.yaml"),
+        "wrong_key": ("/**/thread_model: {ros__parameters: {segmants: 25}}", "segmants"),
+    }
+    for name, (text, _) in unusable.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+    paths = {name: str(tmp_path / f"{name}.yaml") for name in unusable}
+    host = SimulatedHost(console, "hernia_ring", list(paths.values()), {}, tmp_path, tmp_path, lambda words: None)
+    host._hold("")  # as once all its nodes are there
+    for name, (_, words) in unusable.items():
+        assert words in asyncio.run(host.choose(paths[name]))
+        assert host.state()["scenario"] == "hernia_ring"
+        assert host.busy == ""
 
 
 def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_then_on(graph, node):

@@ -321,6 +321,23 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
             assert [entry.obstacle for entry in message.least] == [entry.obstacle for entry in given.least]
 
 
+def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
+    source = Bag(short_bag)
+    wider = replace(SETUP.scene, dish=replace(SETUP.scene.dish, diameter=0.07))
+    with BagWriter(tmp_path / "wider", source.notes) as writer:
+        for topic, type_name in (*source.topics.items(), (SCENE.recorded, SCENE.type_name)):
+            writer.add_topic(topic, type_name)
+        for record in source.records(set(source.topics)):
+            writer.write(record.topic, record.time, record.data)
+        stamp = round(1.39e9)
+        writer.write_message(SCENE.recorded, stamp, scene_message(wider, header(stamp), make))
+    for start, found in ((0.0, 12), (0.5, 0)):
+        seen = sights(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
+        # In a dish of twice the diameter, what was the needle is twice as long.
+        tracked = [sight.found for sight in seen]
+        assert sum(tracked) == sum(tracked[:found]) >= found - 2
+
+
 def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_path: Path):
     source, scene = Bag(pose_bag), SETUP.scene.add(SceneShape("post", "instrument", Disc((0.0, 0.006), 0.002)))
     too_fine = SETUP.scene.add(SceneShape("pin", "instrument", Disc((0.0, 0.006), 1e-5)))
