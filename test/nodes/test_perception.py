@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,11 +53,15 @@ def answers(graph: Graph, frames: list[np.ndarray]) -> tuple[list[PredictedThrea
     """Return what comes of frames, one after the other."""
     predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
     measured, states = graph.listen(topics.SEEN_THREAD), graph.listen(topics.TRACKER_STATE)
+
+    def answered(count: int) -> bool:
+        return len(states) >= count
+
     for index, image in enumerate(frames):
         stamp = Time(sec=5, nanosec=index * 33_000_000)
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, stamp))
         # Each is answered before the next is shown: of frames that wait, the tracker takes only the newest two.
-        graph.wait(lambda n=index: len(states) > n, "the state of a frame")
+        graph.wait(partial(answered, index + 1), "the state of a frame")
     confirmed = len(frames) - 2  # the needle is in the third frame
     graph.wait(lambda: min(len(predicted), len(measured)) >= confirmed, "an answer to each")
     graph.wait(lambda: bool(margins) and margins[-1].header.stamp == predicted[-1].header.stamp, "its margins")
