@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,9 @@ from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+# What a shell runs in the background ignores SIGINT, and hands that on to its children: no Ctrl-C would reach them.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 VIEW = DishView((322.0, 238.0), 8e-5)
 POST = Disc((0.006, -0.004), 0.0015)
