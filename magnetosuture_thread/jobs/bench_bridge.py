@@ -132,16 +132,19 @@ class BridgeBench:
 
     def _drive(self) -> None:
         """Wait until the coils have been driven for a while, and start all anew where they are not."""
-        try:
-            self._wait(self._driven_for_a_while, "the coils to be driven", HEARD)
-        except GraphError:
-            # Who is killed may leave Fast DDS's shared memory such that nobody who starts later is heard.
-            self.unheard += 1
-            for name in ("commander", "tracker", "coil_bridge"):
-                self._nodes.kill(name)
-            for name in ("coil_bridge", "tracker", "commander"):
-                self.start(name)
-            self._wait(self._driven_for_a_while, "the coils to be driven")
+        for _ in range(ATTEMPTS):
+            try:
+                self._wait(self._driven_for_a_while, "the coils to be driven", HEARD)
+                return
+            except GraphError:
+                # Who is killed may leave Fast DDS's shared memory such that nobody who starts later is heard; and where
+                # the machine stands still for longer than a board may take to answer, the bridge is in fault.
+                self.unheard += 1
+                for name in ("commander", "tracker", "coil_bridge"):
+                    self._nodes.kill(name)
+                for name in ("coil_bridge", "tracker", "commander"):
+                    self.start(name)
+        self._wait(self._driven_for_a_while, "the coils to be driven")
 
     def _arm(self) -> None:
         """Arm the bridge; start it anew where it is not heard."""
