@@ -1,6 +1,7 @@
 """Starts every node from colcon's install folder, as `ros2 run` would, and ends it.
 
-A node passes when it says on /diagnostics that it is there, and ends with exit code 0 when interrupted.
+Each gets a scene by its name, which the install folder holds. A node passes when it says on /diagnostics that it is
+there, and ends with exit code 0 when interrupted.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import time
 from pathlib import Path
 
 NODES = {  # by program, what it says it is
+    "scene_server": "scene_server",
     "vision_tracker": "vision_tracker",
     "thread_model": "thread_model",
     "perception": "thread_model",
@@ -48,7 +50,8 @@ def main(install: Path) -> int:
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
     }
     for name, node in NODES.items():
-        program = f'. "{setup}" && exec "{install.resolve()}/magnetosuture_thread/lib/magnetosuture_thread/{name}"'
+        path = f"{install.resolve()}/magnetosuture_thread/lib/magnetosuture_thread/{name}"
+        program = f'. "{setup}" && exec "{path}" --ros-args -p scene:=dish_35mm'
         process = subprocess.Popen(["sh", "-c", program], env=environment, cwd="/")
         try:
             heard = subprocess.run([sys.executable, "-c", LISTEN, node, str(TIMEOUT)], env=environment, check=False)
