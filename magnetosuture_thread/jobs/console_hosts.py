@@ -181,7 +181,7 @@ class SimulatedHost(RecordingHost):
             return f"scenario: got {scenario!r}, expected one of {', '.join(self._scenarios)}"
         try:
             setup = read_setup(scenario)
-            setup.scene  # noqa: B018 read while the old nodes still run, so that they stay if it cannot be
+            version = setup.scene.version  # read while the old nodes still run: they stay if it cannot be
         except MagnetosutureError as error:
             return str(error)
         self._hold(f"starting {setup.name}")
@@ -194,7 +194,7 @@ class SimulatedHost(RecordingHost):
         self.setup, self._scenario, self.paused = setup, scenario, False
         self.graph.begin(served_as(setup.console, self.graph.settings))
         self.start()
-        self.say(f"starting {setup.name}")
+        self.say(f"starting {setup.name}, scene {version}")
         return ""
 
     async def watch(self) -> None:

@@ -59,12 +59,11 @@ def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     _, summary, said, shares = run
     assert summary.setup == "short"
     assert summary.frames >= 20
-    # A machine that is busy drops frames and moves the needle late; how well it goes is for a quiet one to say.
-    assert summary.tracked >= 0.6 * summary.frames
+    assert summary.tracked >= 0.9 * summary.frames
     assert summary.wrong == 0
     assert summary.predicted >= 0.9 * summary.tracked
     assert summary.tail_error < 8e-5
-    assert summary.path_error < 4e-3
+    assert summary.path_error < 2e-3  # how well is for a quiet machine to say
     assert summary.error_truth is not None
     assert summary.error_truth["mean"] < 2.0
     assert summary.seen_share > 0.9
@@ -88,7 +87,7 @@ def test_a_run_whose_bridge_is_stopped_ends_and_says_so(scenario: Path, tmp_path
 
 def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: Path, tmp_path: Path):
     summary = simulate(str(scenario), tmp_path / "bag", boards=True)
-    assert summary.path_error < 4e-3  # on a busy machine; at rest it is 9 mm at the end
+    assert summary.path_error < 2e-3
     states = [r.decode() for r in Bag(tmp_path / "bag").records({"/coils/state"})]
     following = [state for state in states if not state.reasons]
     assert following

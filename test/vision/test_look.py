@@ -129,8 +129,7 @@ def test_over_many_poses_the_covariance_is_about_right():
         seen = TRACKER.look(render(pose, random_thread(random, pose)))
         error = np.array([*(seen.tail - pose.tail), pose.error(seen)[1]])
         scaled.append(error @ np.linalg.solve(seen.covariance, error) / 3.0)
-    # 1 for errors as large as the covariance says; it allows for a rim that is not as sharp as this one's.
-    assert 0.1 < np.mean(scaled) < 2.0
+    assert 0.3 < np.mean(scaled) < 2.0
 
 
 def test_a_larger_dish_with_a_faint_thread_is_tracked():

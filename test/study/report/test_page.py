@@ -197,7 +197,7 @@ def test_words_of_a_bag_are_shown_and_never_run():
 
 
 def test_a_long_bag_makes_no_large_page():
-    account = made_account(7_000)
+    account = made_account(20_000)
     data = page_data(account, [])
     assert all(len(line["values"]) <= 5010 for plot in data["plots"] for line in plot["series"])
     assert len(data["map"]["times"]) <= 1300
