@@ -199,9 +199,9 @@ def random_scene(random: np.random.Generator) -> Scene:
             corners += [(size, 2.0 * thick + gap), (0.0, 2.0 * thick + gap)]
             add({"polygon": {"outline": _turned(corners, angle, 0.5 * centre)}})
         else:  # rough
-            turns = np.sort(random.uniform(-math.pi, math.pi, 40))
-            radii = size * random.uniform(0.6, 1.0, 40)
-            corners = [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, turns, strict=True)]
+            angles = np.sort(random.uniform(-math.pi, math.pi, 40))
+            lengths = size * random.uniform(0.6, 1.0, 40)
+            corners = [(r * math.cos(a), r * math.sin(a)) for r, a in zip(lengths, angles, strict=True)]
             add({"polygon": {"outline": _turned(corners, angle, centre)}})
     dish = Dish(2.0 * radius, 0.003)
     while True:

@@ -69,7 +69,9 @@ ALLOWED = {
         *BASE,
         *("interface", "geometry", "model", "vision", "safety", "bags", "study", "setups", "jobs"),
     },
-    "cli": {"errors", "scene", "setups", "jobs", "study", "reproduce"},
+    "cli": {
+        *("errors", "geometry", "scene", "setups", "bags", "coils", "vision", "nodes", "study", "jobs", "reproduce"),
+    },
 }
 
 # Packages that only some rooms may know.
