@@ -2,7 +2,7 @@
 # make test   run all tests
 # make lint   check style and types
 # make colcon build both packages by colcon, into install/
-# make peers  add the solvers and simulators of `magnetosuture bench --peers`
+# make peers  add the solvers and simulators of `python -m benchmarks solver --peers`
 # make clean  remove all that make made
 #
 # Each sets up .venv the first time, over ROS 2 Jazzy as wheels from PyPI. Needs Python 3.10 to 3.13

@@ -3,21 +3,61 @@
 from __future__ import annotations
 
 import argparse
+import inspect
+import json
 import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
 
 from benchmarks import keep_out
+from benchmarks.bridge import command as bridge
+from benchmarks.page import command as page
+from benchmarks.solver import command as solver
+from magnetosuture_thread.cli.arguments import output_file
+from magnetosuture_thread.cli.command import EXIT_CODES
+from magnetosuture_thread.cli.main import exit_code
+from magnetosuture_thread.cli.terminal import make_console
 
-BENCHMARKS = {"keep-out": keep_out}
+# Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
+BENCHMARKS: dict[str, Any] = {"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out}
+STANDARD_OUTPUT = Path("-")
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark that is named; 1 if it did not pass."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = parser.add_subparsers(dest="name", required=True)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark that is named; 1 if it failed or did not pass, 2 for wrong use."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__, epilog=EXIT_CODES)
+    names = parser.add_subparsers(title="benchmarks", metavar="NAME", required=True)
     for name, module in BENCHMARKS.items():
-        module.add_options(names.add_parser(name, help=(module.__doc__ or "").splitlines()[0]))
+        description = inspect.getdoc(module) or ""
+        own = names.add_parser(
+            name,
+            help=description.splitlines()[0],
+            description=description,
+            epilog=EXIT_CODES,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        module.add_options(own)
+        own.add_argument(
+            "--json", type=output_file, metavar="FILE", help="write the figures to a file (-: to standard output)"
+        )
+        own.set_defaults(run=module.run)
     options = parser.parse_args(arguments)
-    return BENCHMARKS[options.name].run(options)
+    return exit_code(lambda: _run(options.run, options))
+
+
+def _run(run: Callable[[argparse.Namespace, Console], tuple[dict[str, Any], bool]], options: argparse.Namespace) -> int:
+    """Run a benchmark and write its figures; tables go to standard error where the JSON goes to standard output."""
+    to_standard_output = options.json == STANDARD_OUTPUT
+    figures, passed = run(options, Console(stderr=True, highlight=False) if to_standard_output else make_console())
+    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    if to_standard_output:
+        sys.stdout.write(text)
+    elif options.json:
+        options.json.write_text(text)
+    return 0 if passed else 1
 
 
 if __name__ == "__main__":

@@ -12,16 +12,18 @@ import argparse
 import cmath
 import contextlib
 import dataclasses
-import json
 import math
 import sys
 import time
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import shapely
+from rich.console import Console
 
+from magnetosuture_thread.cli.terminal import sayer
 from magnetosuture_thread.coils.bridge import Bridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
@@ -198,8 +200,8 @@ def random_scene(random: np.random.Generator) -> Scene:
             add({"polygon": {"outline": _turned(corners, angle, 0.5 * centre)}})
         else:  # rough
             angles = np.sort(random.uniform(-math.pi, math.pi, 40))
-            radii = size * random.uniform(0.6, 1.0, 40)
-            corners = [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]
+            lengths = size * random.uniform(0.6, 1.0, 40)
+            corners = [(r * math.cos(a), r * math.sin(a)) for r, a in zip(lengths, angles, strict=True)]
             add({"polygon": {"outline": _turned(corners, angle, centre)}})
     dish = Dish(2.0 * radius, 0.003)
     while True:
@@ -329,7 +331,7 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
 
 def _swing(needle: Needle) -> float:
     """Return how many times faster than the tip a point of the needle can be."""
-    return max(1.0, float(np.abs(needle.axis).max()) / (0.5 * needle.chord)) * math.sqrt(2.0)
+    return float(max(1.0, np.abs(needle.axis).max() / (0.5 * needle.chord)) * math.sqrt(2.0))
 
 
 def _start(random: np.random.Generator, settings: CoilBridgeSettings, world: World) -> Needle | None:
@@ -374,11 +376,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     parser.add_argument("--seconds", type=float, default=10_000.0, help="simulated time")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")
-    parser.add_argument("--json", action="store_true", help="print figures as JSON")
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run it; 1 if the promise was broken."""
+def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+    """Attack the promise; return the figures and whether it was kept."""
     total, began, seed = Tally(), time.process_time(), options.seed
     shown = 0.0
     while total.seconds < options.seconds:
@@ -387,12 +388,15 @@ def run(options: argparse.Namespace) -> int:
         if total.seconds >= shown + REPORT_EVERY:
             shown = total.seconds
             print(f"{shown:.0f} s, {total.violations} violations", file=sys.stderr, flush=True)
-    figures = {**dataclasses.asdict(total), "worst": total.worst[:20], "cpu_seconds": time.process_time() - began}
-    if options.json:
-        print(json.dumps(figures, indent=2))
-    else:
-        print(
-            f"{total.seconds:.0f} s in {total.episodes} episodes, {total.steps} steps, {total.stalls} stalls: "
-            f"{total.violations} violations beyond {1e6 * TOLERANCE:g} um, deepest {1e6 * total.deepest:.4f} um"
-        )
-    return 1 if total.violations else 0
+    figures: dict[str, Any] = {
+        **dataclasses.asdict(total),
+        "worst": total.worst[:20],
+        "cpu_seconds": time.process_time() - began,
+    }
+    if math.isinf(total.deepest):
+        figures["deepest"] = None  # the needle was never near; JSON has no infinity
+    sayer(console)(
+        f"{total.seconds:.0f} s in {total.episodes} episodes, {total.steps} steps, {total.stalls} stalls: "
+        f"{total.violations} violations beyond {1e6 * TOLERANCE:g} um, deepest {1e6 * total.deepest:.4f} um"
+    )
+    return figures, not total.violations

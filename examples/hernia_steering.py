@@ -14,11 +14,11 @@ import numpy as np
 
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.interface import DISH_FRAME, OPERATOR_COMMAND
-from magnetosuture_thread.jobs.hernia import start_of
 from magnetosuture_thread.offline.messages import header, make
+from magnetosuture_thread.reproduce.hernia.replay import start_centreline
+from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredThread
+from magnetosuture_thread.reproduce.hernia.steering import RATE, point_filter
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.hernia.run import RATE, point_filter
-from magnetosuture_thread.study.hernia.steered import SteeredThread
 
 BAG = Path(__file__).parent / "hernia_steering"
 SETUP = "hernia_ring"
@@ -70,7 +70,7 @@ def main() -> None:
     with BagWriter(BAG, notes) as bag:
         bag.add_topic(OPERATOR_COMMAND.recorded, OPERATOR_COMMAND.type_name)
         needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
-        for time, (x, y) in keys(SteeredThread(setup.model, start_of(setup), needle)):
+        for time, (x, y) in keys(SteeredThread(setup.model, start_centreline(setup), needle)):
             stamp = 1_000_000_000 + round(time * 1e9)
             linear = make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=0.0)
             still = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)

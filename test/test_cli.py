@@ -12,6 +12,7 @@ import pytest
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.cli import commands
+from magnetosuture_thread.cli.main import MOVED
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS
 from test.study.test_evaluation import write
 
@@ -29,14 +30,13 @@ def test_help_names_every_command_and_the_exit_codes():
         "replay",
         "record",
         "simulate",
-        "behaviour",
+        "reproduce",
         "track",
         "calibrate-camera",
         "calibrate-coils",
         "coils",
         "console",
         "evaluate",
-        "bench",
         "no medical device",
         "0 done, 1 the job failed, 2 wrong use",
     ):
@@ -64,19 +64,20 @@ def test_help_waits_for_no_package_of_a_command():
         ("replay", "--output"),
         ("record", "--output"),
         ("simulate", "--pace"),
-        ("behaviour", "--output"),
+        ("reproduce", "thread-behavior"),
+        ("reproduce hernia", "--animation"),
+        ("reproduce thread-behavior", "--output"),
         ("track", "--overlay"),
         ("calibrate-camera", "--markers"),
         ("calibrate-coils", "--model"),
         ("coils", "ACTION"),
         ("console", "--replay"),
         ("evaluate", "--rig"),
-        ("bench", "--json"),
     ],
 )
 def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
-        cli.main([name, "--help"])
+        cli.main([*name.split(), "--help"])
     assert ended.value.code == 0
     assert option in capsys.readouterr().out
 
@@ -96,7 +97,9 @@ def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFi
         ["simulate", "petri_35mm_polyamide"],
         ["simulate", "petri_35mm_polyamide", "--output", "out", "--pace", "0"],
         ["simulate", "petri_35mm_polyamide", "--output", "out", "--duration", "-1"],
-        ["behaviour"],
+        ["reproduce"],
+        ["reproduce", "hernia", "--output", "out"],
+        ["reproduce", "thread-behavior"],
         ["console", "--graph", "--replay", "bag"],
         ["console", "--port", "some"],
         ["track"],
@@ -107,8 +110,6 @@ def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFi
         ["evaluate", "dir", "--solver", "magic"],
         ["evaluate", "dir", "--segments", "2"],
         ["evaluate", "dir", "--json", "/no/such/folder/x.json"],
-        ["bench", "--json", "."],
-        ["bench", "--peers", "all"],
     ],
 )
 def test_wrong_use_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
@@ -135,6 +136,15 @@ def test_a_failed_job_is_one_line(tmp_path: Path, monkeypatch, capsys, arguments
     assert errors.startswith(words)
     assert errors.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("name", "instead"), MOVED.items())
+def test_a_command_of_before_is_refused_and_the_new_one_named(
+    name: str, instead: str, capsys: pytest.CaptureFixture[str]
+):
+    for arguments in ([name], [name, "--help"], [name, "x", "--output", "out"]):
+        assert cli.main(arguments) == 2
+        assert capsys.readouterr().err == f"error: the command '{name}' is now `{instead}`\n"
 
 
 def test_brackets_in_an_error_are_shown_as_they_are(monkeypatch, capsys, tmp_path: Path):

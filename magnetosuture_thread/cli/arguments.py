@@ -73,7 +73,7 @@ def add_source(parser: argparse._ActionsContainer) -> None:
 
 def remap(text: str) -> tuple[str, str]:
     """Return a topic's name and its new one: an argument type."""
-    from magnetosuture_thread.jobs.bag import remapping
+    from magnetosuture_thread.bags.remap import remapping
 
     try:
         return remapping(text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -14,15 +13,27 @@ from magnetosuture_thread.cli.parser import make_parser
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 
 FAILED, WRONG_USE = 1, 2
+MOVED = {  # commands of before, and what is written instead
+    "bench": "python -m benchmarks solver|bridge|page, in the source tree",
+    "hernia": "magnetosuture reproduce hernia",
+    "behaviour": "magnetosuture reproduce thread-behavior",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    options = make_parser().parse_args(arguments)
-    run: Callable[[argparse.Namespace], int] = options.run
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given and given[0] in MOVED:
+        return _fail(f"the command {given[0]!r} is now `{MOVED[given[0]]}`", WRONG_USE)
+    options = make_parser().parse_args(given)
+    return exit_code(lambda: int(options.run(options)))
+
+
+def exit_code(run: Callable[[], int]) -> int:
+    """Return the exit code of what runs; an error ends it with one line on standard error."""
     try:
         with _interrupted_by(signal.SIGTERM, signal.SIGHUP):
-            return run(options)
+            return run()
     except ConfigurationError as error:
         return _fail(str(error), WRONG_USE)
     except MagnetosutureError as error:

@@ -7,17 +7,15 @@ import argparse
 from magnetosuture_thread.cli.command import EXIT_CODES
 from magnetosuture_thread.cli.commands import (
     bag,
-    behaviour,
-    bench,
     calibrate,
     calibrate_camera,
     calibrate_coils,
     coils,
     console,
     evaluate,
-    hernia,
     record,
     replay,
+    reproduce,
     scene,
     simulate,
     track,
@@ -35,8 +33,7 @@ COMMANDS = (
     record.add,
     simulate.add,
     console.add,
-    behaviour.add,
-    hernia.add,
+    reproduce.add,
     evaluate.add,
     track.add,
     calibrate.add,
@@ -45,7 +42,6 @@ COMMANDS = (
     coils.add,
     scene.add,
     bag.add,
-    bench.add,
 )
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -34,7 +36,7 @@ def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: bar.update(task, completed=share)
 
 
-def write_json(path: Path | None, text: str) -> None:
-    """Write a JSON text to the file of --json, if one was asked for."""
+def write_json(path: Path | None, figures: Any) -> None:
+    """Write figures to the file of --json, if one was asked for."""
     if path:
-        path.write_text(text.rstrip() + "\n")
+        path.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

@@ -142,19 +142,18 @@ class NodeProcesses:
                 last = lines[-1] if lines else "it said nothing"
                 raise GraphError(f"{name} ended with exit code {process.returncode}: {last}")
 
-    def start(self, name: str, *, label: str = "", arguments: Sequence[str] = ()) -> None:
+    def start(self, name: str, *, module: str = "", arguments: Sequence[str] = ()) -> None:
         """Start one more node, or one again that has ended.
 
         Args:
-            name: of its module.
-            label: what it and its log are called here; as the module if empty.
+            name: what it and its log are called here.
+            module: that runs it; the one of that name in this subpackage if empty.
             arguments: besides those for all, after `--ros-args`.
         """
-        label = label or name
-        given = [*self._arguments, *arguments]
-        command = [sys.executable, "-m", f"magnetosuture_thread.nodes.{name}", "--ros-args", *given]
-        with (self._logs / f"{label}.log").open("wb") as log:
-            self._processes[label] = subprocess.Popen(
+        program = module or f"magnetosuture_thread.nodes.{name}"
+        command = [sys.executable, "-m", program, "--ros-args", *self._arguments, *arguments]
+        with (self._logs / f"{name}.log").open("wb") as log:
+            self._processes[name] = subprocess.Popen(
                 command,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
@@ -164,19 +163,19 @@ class NodeProcesses:
                 preexec_fn=_end_with_parent,
             )
 
-    def prefer(self, label: str, priority: int) -> str:
+    def prefer(self, name: str, priority: int) -> str:
         """Give a node a real-time priority, where the system allows any; return how it is scheduled then."""
-        return take_priority(priority, self._processes[label].pid)
+        return take_priority(priority, self._processes[name].pid)
 
-    def kill(self, label: str) -> None:
+    def kill(self, name: str) -> None:
         """End a node without a word to it, as a crash would."""
-        process = self._processes.pop(label)
+        process = self._processes.pop(name)
         process.kill()
         process.wait()
 
-    def ended(self, label: str) -> bool:
+    def ended(self, name: str) -> bool:
         """Return whether a node has ended."""
-        return self._processes[label].poll() is not None
+        return self._processes[name].poll() is not None
 
     def end(self) -> None:
         """End the nodes, politely first, and wait until they have ended."""

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path as Outline
 
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.scene import KINDS, Scene, SceneShape
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.scene import KINDS, Scene
 from magnetosuture_thread.scene.labels import label_places
 
 INK, FAINT = "#22303c", "#7d8790"
@@ -60,7 +60,9 @@ def _draw(axes: Axes, scene: Scene) -> None:
     axes.add_patch(Circle((0.0, 0.0), radius, facecolor=LIQUID, edgecolor=WALL, linewidth=2.5, zorder=0))
     axes.plot([0.0], [0.0], "+", color=FAINT, markersize=9.0, markeredgewidth=0.8, zorder=1)
     for shape in scene.shapes:
-        _draw_shape(axes, shape)
+        fill, edge = COLOURS[shape.kind]
+        style: dict[str, Any] = {"facecolor": fill, "edgecolor": edge, "linewidth": 1.0, "zorder": 2, "alpha": 0.9}
+        axes.add_patch(shape_patch(shape.geometry, **style))
     axes.set_aspect("equal")
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
@@ -73,16 +75,12 @@ def _draw(axes: Axes, scene: Scene) -> None:
         axes.legend(handles=patches, loc="lower left", fontsize=9, frameon=False, labelcolor=INK)
 
 
-def _draw_shape(axes: Axes, shape: SceneShape) -> None:
-    fill, edge = COLOURS[shape.kind]
-    style: dict[str, Any] = {"facecolor": fill, "edgecolor": edge, "linewidth": 1.0, "zorder": 2, "alpha": 0.9}
-    geometry = shape.geometry
+def shape_patch(geometry: Disc | Polygon, **style: Any) -> Circle | PathPatch:
+    """Return a shape as a patch in millimetres, its holes left open."""
     if isinstance(geometry, Disc):
-        x, y = 1e3 * geometry.centre[0], 1e3 * geometry.centre[1]
-        axes.add_patch(Circle((x, y), 1e3 * geometry.radius, **style))
-        return
+        return Circle((1e3 * geometry.centre[0], 1e3 * geometry.centre[1]), 1e3 * geometry.radius, **style)
     rings = [Outline(1e3 * np.vstack([ring, ring[:1]]), closed=True) for ring in geometry.rings]
-    axes.add_patch(PathPatch(Outline.make_compound_path(*rings), **style))
+    return PathPatch(Outline.make_compound_path(*rings), **style)
 
 
 def _draw_names(axes: Axes, scene: Scene) -> None:

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
+from benchmarks.page.measurements import BROWSERS
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.jobs.bench_console import BROWSERS
 from test.console.scene import RecordingGraph, RecordingHost
 from test.console.visitor import TOKEN
 

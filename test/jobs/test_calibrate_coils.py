@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.cli.commands.calibrate_coils import calibrate_coils
 from magnetosuture_thread.coils.calibration import read_calibration
 from magnetosuture_thread.coils.field import coils_around, make_coils
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.jobs.calibrate_coils import calibrate_coils
 
 ANGLES = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)
 

@@ -14,9 +14,9 @@ import pytest
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
-from magnetosuture_thread.jobs.behaviour import behaviour
 from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.simulate import simulate
+from magnetosuture_thread.reproduce.thread_behavior import thread_behavior
 from magnetosuture_thread.resources import setup_file
 from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.scene.messages import scene_of
@@ -231,8 +231,8 @@ def test_an_interrupted_run_leaves_nothing_behind(scenario: Path, tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_behaviour_job_draws_each_scenario(scenario: Path, tmp_path: Path):
-    runs = behaviour(tmp_path / "out", [str(scenario)])
+def test_thread_behavior_draws_each_scenario(scenario: Path, tmp_path: Path):
+    runs = thread_behavior(tmp_path / "out", [str(scenario)])
     assert len(runs) == 1
     assert runs[0].summary.error_truth is not None
     picture = cv2.imread(str(tmp_path / "out" / "behaviour.png"))

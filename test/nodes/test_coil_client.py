@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.cli import main
-from magnetosuture_thread.jobs.coils import ACTIONS
+from magnetosuture_thread.cli.commands.coils import ACTIONS
 from magnetosuture_thread.nodes import coil_client
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
+from collections import Counter
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -52,31 +52,53 @@ def add(subparsers: Subparsers) -> None:
 
 def run_check(options: argparse.Namespace) -> int:
     """Say what a bag holds, and whether it is whole."""
-    from magnetosuture_thread.jobs.bag import check_bag
+    from magnetosuture_thread.bags.reader import Bag
+    from magnetosuture_thread.bags.report import report
 
     console = make_console()
     with progress(console, "bag check") as advance:
-        report = check_bag(options.bag, remap=dict(options.remap), frame=options.frame, progress=advance)
-    found = report.to_json()
+        bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
+        found = report(bag, options.frame, lambda share: advance(0.5 + 0.5 * share)).to_json()
     console.print(_table(found))
     for line in _lines(found):
         sayer(console)(line)
-    write_json(options.json, json.dumps(found, indent=2, allow_nan=False))
+    write_json(options.json, found)
     return DAMAGED if found["damage"] or found["refused"] else DONE
 
 
 def run_repair(options: argparse.Namespace) -> int:
     """Write what is intact in a bag into a new one."""
-    from magnetosuture_thread.jobs.bag import repair_bag
+    from magnetosuture_thread.bags.damage import counted
+    from magnetosuture_thread.bags.reader import Bag
+    from magnetosuture_thread.bags.repair import repair
+    from magnetosuture_thread.jobs.output import whole_folder
 
     console = make_console()
-    lines: list[str] = []
+    say = sayer(console)
+    refused: Counter[str] = Counter()
     with progress(console, "bag repair") as advance:
-        count = repair_bag(options.bag, options.output, remap=dict(options.remap), say=lines.append, progress=advance)
-    for line in lines:
-        sayer(console)(line)
-    sayer(console)(f"{count} messages in {options.output}")
+        bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
+        with whole_folder(options.output) as folder:
+            count = repair(bag, folder, options.output.name, refused, lambda share: advance(0.5 + 0.5 * share))
+    if bag.damage is not None:
+        say(str(bag.damage))
+    elif not refused:
+        say(bag.unchecked or "is not damaged: the new bag holds the same")
+    for reason, lost in refused.items():
+        say(f"{reason}: {counted(lost, 'message')} lost")
+    for place in bag.damage.places if bag.damage is not None else ():
+        say(f"  {place}{_times(place.first, place.last, bag.start)}")
+    say(f"{count} messages in {options.output}")
     return DONE
+
+
+def _times(first: int | None, last: int | None, start: int) -> str:
+    """Return between which times messages are missing, if any are."""
+    if first is None and last is None:
+        return ""
+    begin = "the beginning" if first is None else f"{(first - start) * 1e-9:.3f} s"
+    end = "the end" if last is None else f"{(last - start) * 1e-9:.3f} s"
+    return f"; messages between {begin} and {end}"
 
 
 def _table(found: dict[str, Any]) -> Table:

@@ -6,7 +6,8 @@ import argparse
 
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
 from magnetosuture_thread.cli.terminal import make_console, sayer
-from magnetosuture_thread.jobs.coils import ACTIONS, coils
+
+ACTIONS = ("state", "arm", "disarm", "stop", "reset", "configure", "activate", "deactivate", "cleanup")
 
 DESCRIPTION = """\
 Press a switch of the coil bridge that runs on this ROS domain, and show its state.
@@ -32,8 +33,13 @@ def add(subparsers: Subparsers) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Press a switch of the running coil bridge."""
+    from magnetosuture_thread.nodes.coil_client import CoilClient
+
     say = sayer(make_console())
-    state = coils(options.action)
+    with CoilClient() as client:
+        if options.action != "state":
+            client.do(options.action)
+        state = client.state()
     width = max(len(name) for name in state)
     for name, value in state.items():
         say(f"{name:{width}}  {value}")

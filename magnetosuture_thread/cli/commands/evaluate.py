@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -166,5 +165,5 @@ def _score_references(options: argparse.Namespace) -> int:
                 keep=keep,
             )
     console.print(evaluation_table(evaluation))
-    write_json(options.json, json.dumps(evaluation.to_mapping(), indent=2, allow_nan=False))
+    write_json(options.json, evaluation.to_mapping())
     return DONE

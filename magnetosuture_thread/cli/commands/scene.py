@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import json
+from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
 
 from magnetosuture_thread.cli.arguments import number, output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
 from magnetosuture_thread.cli.terminal import make_console, sayer, write_json
+from magnetosuture_thread.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.scene import SceneShape
 
 NEEDLE_WIDTH = 0.0004  # m
+PICTURES = (".png", ".svg")
 
 DESCRIPTION = """\
 Check a scene file, or draw it. FILE is a YAML or GeoJSON file, or the name of a scene that ships with the
@@ -55,23 +65,88 @@ def add(subparsers: Subparsers) -> None:
 
 def run_check(options: argparse.Namespace) -> int:
     """Show what a scene holds, and what to look at."""
-    from magnetosuture_thread.jobs.scene import check_scene
-    from magnetosuture_thread.study.scene_table import scene_table
+    from magnetosuture_thread.scene import read_scene
+    from magnetosuture_thread.scene.checks import scene_warnings
 
     console = make_console()
-    report = check_scene(options.file, options.needle_width)
-    console.print(scene_table(report.to_json()))
-    for warning in report.warnings:
+    scene = read_scene(options.file)
+    warnings = scene_warnings(scene, options.needle_width)
+    report = {
+        "file": options.file,
+        "version": scene.version,
+        "dish": asdict(scene.dish),
+        "shapes": [_shape(shape) for shape in scene.shapes],
+        "warnings": [asdict(warning) for warning in warnings],
+    }
+    console.print(_table(report))
+    for warning in warnings:
         console.print("warning:", style="bold yellow", end=" ")
         sayer(console)(warning.text)
-    write_json(options.json, json.dumps(report.to_json(), indent=2, allow_nan=False))
+    write_json(options.json, report)
     return DONE
 
 
 def run_draw(options: argparse.Namespace) -> int:
     """Draw a scene."""
-    from magnetosuture_thread.jobs.scene import draw_scene
+    if options.output.suffix not in PICTURES:
+        raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
 
-    scene = draw_scene(options.file, Path(options.output))
+    from magnetosuture_thread.jobs.output import whole_file
+    from magnetosuture_thread.scene import read_scene
+    from magnetosuture_thread.study.scene_picture import draw_scene
+
+    scene = read_scene(options.file)
+    with whole_file(options.output) as partial:
+        draw_scene(partial, scene, Path(options.file).stem)
     sayer(make_console())(f"{options.output}: {len(scene.shapes)} shapes, version {scene.version}")
     return DONE
+
+
+def _table(report: dict[str, Any]) -> Table:
+    """Return a row for each shape."""
+    dish = report["dish"]
+    table = Table(
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        title=f"dish of {1e3 * dish['diameter']:g} mm, {1e3 * dish['depth']:g} mm deep",
+    )
+    table.caption = f"version {report['version']}; least and greatest x, y in mm, area in mm^2"
+    table.add_column("", justify="right")
+    table.add_column("name", overflow="fold", min_width=12)
+    for name in ("kind", "shape"):
+        table.add_column(name, no_wrap=True)
+    for name in ("from", "to", "area"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for index, shape in enumerate(report["shapes"]):
+        left, bottom, right, top = (1e3 * value for value in shape["bounds_m"])
+        table.add_row(
+            str(index),
+            Text(shape["name"]),
+            shape["kind"],
+            shape["type"],
+            f"{left:.2f}, {bottom:.2f}",
+            f"{right:.2f}, {top:.2f}",
+            f"{1e6 * shape['area_m2']:.2f}",
+        )
+    return table
+
+
+def _shape(shape: SceneShape) -> dict[str, Any]:
+    """Return what is reported of a shape."""
+    from magnetosuture_thread.geometry.obstacles import Disc
+
+    geometry, kind = shape.geometry, next(iter(name for name in shape.definition if name != "corner_radius"), None)
+    if isinstance(geometry, Disc):
+        (x, y), radius = geometry.centre, geometry.radius
+        bounds, vertices = [x - radius, y - radius, x + radius, y + radius], 0
+    else:
+        bounds, vertices = list(shape.solid.bounds), sum(map(len, geometry.rings))
+    return {
+        "name": shape.name,
+        "kind": shape.kind,
+        "type": kind or ("disc" if isinstance(geometry, Disc) else "polygon"),
+        "definition": dict(shape.definition),
+        "bounds_m": bounds,
+        "area_m2": shape.area,
+        "vertices": vertices,
+    }

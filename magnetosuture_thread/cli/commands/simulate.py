@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from magnetosuture_thread.cli.arguments import number, output_file
@@ -67,5 +66,5 @@ def run(options: argparse.Namespace) -> int:
         raise
     console.print(loop_table(summary))
     say(f"bag: {options.output}")
-    write_json(options.json, json.dumps(summary.to_json(), indent=2, allow_nan=False))
+    write_json(options.json, summary.to_json())
     return DONE

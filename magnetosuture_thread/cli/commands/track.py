@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
+import math
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+from rich.table import Table
 
 from magnetosuture_thread.cli.arguments import add_remap, number, output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
 from magnetosuture_thread.cli.terminal import make_console, progress, sayer, write_json
+
+MAX_ROWS = 20  # beyond, only the summary is shown
 
 DESCRIPTION = """\
 Find needle and thread in camera frames, without a graph. FRAMES are pictures, a folder of them, or a bag.
@@ -58,7 +65,6 @@ def run(options: argparse.Namespace) -> int:
     from magnetosuture_thread.jobs.track import settings_with, track
     from magnetosuture_thread.scene import read_scene
     from magnetosuture_thread.setups import read_setup
-    from magnetosuture_thread.study.track_table import track_lines, track_table
 
     console = make_console()
     say = sayer(console)
@@ -78,5 +84,51 @@ def run(options: argparse.Namespace) -> int:
     console.print(track_table(rows))
     for line in track_lines(rows):
         say(line)
-    write_json(options.json, json.dumps(rows, indent=1, allow_nan=False))
+    write_json(options.json, rows)
     return DONE
+
+
+def track_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return a row for each of the first frames, as `TrackedFrame.to_json` gives them."""
+    import numpy as np
+
+    table = Table(title=f"{len(rows)} frames")
+    table.caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
+    table.add_column("frame", overflow="fold", min_width=12)
+    table.add_column("status")
+    for name in ("tail", "heading", "thread", "sure", "ms"):
+        table.add_column(name, justify="right", no_wrap=True)
+    began = rows[0]["stamp_s"] if rows else None
+    for row in rows[:MAX_ROWS]:
+        name = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s"
+        time = f"{row['time_s'] * 1e3:.1f}"
+        if row["reason"]:
+            table.add_row(name, f"{row['status']}: {row['reason']}", "", "", "", "", time)
+            continue
+        steps = np.diff(np.array(row["thread_m"] or []).reshape(-1, 2), axis=0)
+        length = 1e3 * float(np.hypot(steps[:, 0], steps[:, 1]).sum())
+        heading, confidence = row["heading_rad"], row["confidence"]
+        table.add_row(
+            name,
+            row["status"],
+            ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
+            "" if heading is None else f"{math.degrees(heading):.1f}",
+            "" if row["thread_m"] is None else f"{length:.1f}",
+            "" if confidence is None else f"{confidence:.2f}",
+            time,
+        )
+    if len(rows) > MAX_ROWS:
+        table.add_row(f"and {len(rows) - MAX_ROWS} more", "", "", "", "", "", "")
+    return table
+
+
+def track_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a summary in words."""
+    import numpy as np
+
+    if not rows:
+        return ["no frames"]
+    counts = Counter(row["status"] for row in rows)
+    times = np.array([row["time_s"] for row in rows]) * 1e3
+    found = ", ".join(f"{count} {status}" for status, count in counts.most_common())
+    return [f"{found}; {np.median(times):.1f} ms a frame in the median, {np.percentile(times, 95):.1f} ms in the 95th"]

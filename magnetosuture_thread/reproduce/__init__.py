@@ -1,0 +1,1 @@
+"""What reproduces the results of the paper, all of it simulated."""

@@ -1,0 +1,221 @@
+"""A recorded steering, replayed in the model: every instant, and the figures of the whole run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredInstant, SteeredThread
+from magnetosuture_thread.safety import NeedleSafetyFilter
+from magnetosuture_thread.scene import Scene
+
+RATE = 33.0  # Hz, of the paper's simulation
+HELD = 0.1  # s; a command that no other follows ends, as at the coil bridge
+SHOWN = (0.0, 12.0, 17.0, 27.0, 35.0, 55.0)  # s; the six instants of the paper's figure
+FIRST_NODES = 5  # whose barriers the paper plots
+_FAR = 1.0  # m; farther than any obstacle of a dish
+
+
+@dataclass(frozen=True)
+class Steering:
+    """What an operator asked for.
+
+    Attributes:
+        times: of each command, rising, shape (m,) [s].
+        velocities: shape (m, 2) [m/s].
+    """
+
+    times: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+
+    @property
+    def duration(self) -> float:
+        """From the start to the last command [s]."""
+        return float(self.times[-1]) if len(self.times) else 0.0
+
+    def at(self, time: float) -> NDArray[np.float64]:
+        """Return what is asked for at a time [s], shape (2,) [m/s]; zero where no command holds."""
+        index = int(np.searchsorted(self.times, time + 1e-9, side="right")) - 1
+        if index < 0 or time - self.times[index] > HELD + 1e-9:
+            return np.zeros(2)
+        return np.asarray(self.velocities[index])
+
+
+@dataclass(frozen=True)
+class HerniaSummary:
+    """The figures of a run.
+
+    Attributes:
+        setup: name of the set-up.
+        formulation: of the thread model.
+        nodes: n.
+        duration: [s].
+        rate: of the steps [Hz].
+        deepest: of a node or the needle in an obstacle, 0 if none ever was in one [m].
+        chord_deepest: the same of the middle of a chord between two nodes [m].
+        stretch: greatest of a segment, either way [-].
+        most_friction: greatest number of nodes under friction at once.
+        slowest: least factor on the needle's speed.
+        median_step: wall-clock time of a whole step: filter, thread and margins [s].
+        high_step: its 99th percentile [s].
+        instants: what was so at the times that are shown.
+    """
+
+    setup: str
+    formulation: str
+    nodes: int
+    duration: float
+    rate: float
+    deepest: float
+    chord_deepest: float
+    stretch: float
+    most_friction: int
+    slowest: float
+    median_step: float
+    high_step: float
+    instants: tuple[dict[str, Any], ...]
+
+    @property
+    def room(self) -> float:
+        """How many times the median step fits into its period."""
+        return 1.0 / (self.rate * self.median_step)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures, as JSON has them."""
+        return {**asdict(self), "room": self.room, "simulated": "the thread model alone, the needle a point"}
+
+
+@dataclass(frozen=True)
+class HerniaRun:
+    """A whole run.
+
+    Attributes:
+        settings: of the thread.
+        scene: dish and shapes.
+        instants: one a step, by time; the first is the start.
+        barriers: h_obs of the first nodes, shape (steps + 1, nodes, obstacles) [m].
+        chord_depths: how deep the middles of chords are at each step, negative outside, shape (steps + 1,) [m].
+    """
+
+    settings: ThreadModelSettings
+    scene: Scene
+    instants: Sequence[SteeredInstant]
+    barriers: NDArray[np.float64]
+    chord_depths: NDArray[np.float64]
+
+    def nearest(self, time: float) -> SteeredInstant:
+        """Return the instant nearest to a time [s]."""
+        return min(self.instants, key=lambda instant: abs(instant.time - time))
+
+    @property
+    def shown(self) -> list[SteeredInstant]:
+        """The instants to show: those of the paper, or as many spread evenly over a run that ends before."""
+        end = self.instants[-1].time
+        times = SHOWN if end >= SHOWN[-1] else np.linspace(0.0, end, len(SHOWN)).tolist()
+        return [self.nearest(time) for time in times]
+
+    def summary(self, setup: str) -> HerniaSummary:
+        """Return the figures; `setup` is the set-up's name."""
+        steps = self.instants[1:]
+        took = np.array([step.took for step in steps])
+        radius = 0.5 * self.settings.thread().diameter
+        nearest = min(
+            (least.clearance for step in self.instants for least in step.margins.least if least.obstacle >= 0),
+            default=math.inf,
+        )
+        counts = [len(step.margins.friction.nodes) for step in steps]
+        return HerniaSummary(
+            setup=setup,
+            formulation=self.settings.formulation,
+            nodes=self.settings.segments,
+            duration=self.instants[-1].time,
+            rate=RATE,
+            deepest=max(0.0, -(nearest + radius)),
+            chord_deepest=max(0.0, float(self.chord_depths.max())),
+            stretch=max(float(np.abs(step.prediction.stretch).max()) for step in self.instants),
+            most_friction=max(counts),
+            slowest=min(step.margins.friction.slowdown for step in steps),
+            median_step=float(np.median(took)),
+            high_step=float(np.percentile(took, 99.0)),
+            instants=tuple(map(_instant_figures, self.shown)),
+        )
+
+
+def point_filter(scene: Scene, keep_out: float, approach_rate: float) -> NeedleSafetyFilter:
+    """Return the filter of a needle that is a point and gets a new command in every step.
+
+    Args:
+        scene: dish and shapes.
+        keep_out: least distance of the needle from wall and shapes [m].
+        approach_rate: share of that distance by which it may approach [1/s].
+    """
+    return NeedleSafetyFilter(scene, keep_out=keep_out, approach_rate=approach_rate, hold_time=1.0 / RATE)
+
+
+def replay_steering(
+    settings: ThreadModelSettings,
+    centreline: Points,
+    steering: Steering,
+    needle: NeedleSafetyFilter,
+    progress: Callable[[float], None] = lambda share: None,
+) -> HerniaRun:
+    """Steer a thread as recorded.
+
+    Args:
+        settings: of thread and obstacles.
+        centreline: where the thread lies at the start, from the needle on, shape (m, 2) [m].
+        steering: what was asked for.
+        needle: see `point_filter`.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigurationError: an obstacle cannot be used.
+        InvalidInputError: the thread cannot begin there, or a velocity cannot be used.
+        SolverError: a step had no solution.
+    """
+    around = Surroundings(needle.scene.obstacles, _FAR)
+    instants = list(_steps(SteeredThread(settings, centreline, needle), steering, progress))
+    radius, obstacles = 0.5 * settings.thread().diameter, len(around.shapes)
+    barriers = np.array(
+        [_distances(around, instant.prediction.vertices[1 : 1 + FIRST_NODES], obstacles) for instant in instants]
+    )
+    middles = [0.5 * (i.prediction.vertices[1:] + i.prediction.vertices[:-1]) for i in instants]
+    depths = np.array([-_distances(around, points, obstacles).min(initial=_FAR) for points in middles])
+    return HerniaRun(settings, needle.scene, instants, barriers - radius, depths)
+
+
+def _steps(thread: SteeredThread, steering: Steering, progress: Callable[[float], None]) -> Iterator[SteeredInstant]:
+    yield thread.now
+    count = math.ceil((steering.duration + HELD) * RATE)
+    for k in range(count):
+        yield thread.step(1.0 / RATE, steering.at(k / RATE))
+        progress((k + 1) / count)
+
+
+def _distances(around: Surroundings, points: Points, obstacles: int) -> NDArray[np.float64]:
+    """Return the signed distance of each point from each obstacle, shape (m, obstacles) [m]."""
+    near = around.near(points)
+    distances = np.full((len(points), obstacles), _FAR)
+    np.minimum.at(distances, (near.node, near.obstacle), near.distance)
+    return distances
+
+
+def _instant_figures(instant: SteeredInstant) -> dict[str, Any]:
+    friction, command = instant.margins.friction, instant.command
+    return {
+        "time": instant.time,
+        "state": friction.state.name.lower(),
+        "friction_nodes": list(friction.nodes),
+        "slowdown": friction.slowdown,
+        "asked": command.commanded.tolist() if command else [0.0, 0.0],
+        "passed": command.filtered.tolist() if command else [0.0, 0.0],
+        "needle": instant.prediction.vertices[0].tolist(),
+    }

@@ -1,0 +1,213 @@
+"""The paper's thread-behavior tests in closed loop, by material: runs, figures, a table and a picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.table import Table
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Obstacle
+from magnetosuture_thread.interface import COMPRESSED_IMAGE
+from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.simulate import judge, simulate
+from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.study.loop import LoopSummary
+from magnetosuture_thread.study.picture import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
+from magnetosuture_thread.study.replayed import Instant
+from magnetosuture_thread.vision.images import decode_image
+
+TESTS = ("petri_35mm_polyamide", "petri_150mm_silk")
+SHOWN = 4  # instants of each run
+BORDER = 0.06  # of the dish's diameter, around it in a picture
+ROW = 2.9  # height of a run [inch]
+
+Say = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class BehaviorRun:
+    """One thread-behavior test.
+
+    Attributes:
+        name: for a person.
+        summary: its figures.
+        instants: the predicted frames, by time.
+        frames: BGR pictures of the instants to show, by their stamps [ns].
+        view: where the dish is in them.
+        dish_diameter: [m]
+        obstacles: in the dish.
+    """
+
+    name: str
+    summary: LoopSummary
+    instants: Sequence[Instant]
+    frames: dict[int, NDArray[np.uint8]]
+    view: DishView
+    dish_diameter: float
+    obstacles: Sequence[Obstacle] = ()
+
+
+def thread_behavior(
+    output: Path,
+    scenarios: Sequence[str] = TESTS,
+    *,
+    say: Say = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> list[BehaviorRun]:
+    """Run each scenario in a closed loop and put prediction, what was seen, and truth side by side.
+
+    `output` is made at the end, whole or not at all: a bag for each scenario, `behaviour.json` and
+    `behaviour.png`.
+
+    Args:
+        output: folder to make.
+        scenarios: names or paths of set-ups with a path for the needle.
+        say: called with a line for a person at each stage.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: the output exists or cannot be written, or a run holds no prediction.
+        ConfigurationError: a scenario cannot be used.
+        GraphError: a node ended or did not come.
+    """
+    setups = [read_setup(scenario) for scenario in scenarios]
+    with whole_folder(output) as folder:
+        runs = []
+        for index, setup in enumerate(setups):
+            say(setup.name)
+            simulate(
+                str(setup.path),
+                folder / setup.name,
+                say=say,
+                progress=_part(progress, index, len(setups)),
+            )
+            runs.append(_judged(folder / setup.name, setup))
+        figures = [run.summary.to_json() for run in runs]
+        (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        draw_behavior(folder / "behaviour.png", runs)
+    return runs
+
+
+def _part(progress: Progress, index: int, count: int) -> Progress:
+    """Return what reports the progress of one of several parts."""
+    return lambda share: progress((index + share) / count)
+
+
+def _judged(path: Path, setup: Setup) -> BehaviorRun:
+    """Return a run's figures and the frames to show."""
+    bag = Bag(path)
+    collector = judge(bag, setup)
+    summary = collector.summary(setup.name)
+    if not collector.instants:
+        raise BagError(path, "holds no predicted thread")
+    wanted = {instant.stamp for instant in chosen_instants(collector.instants)}
+    frames = {}
+    for record in bag.records({COMPRESSED_IMAGE.recorded}):
+        message = record.decode()
+        stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+        if stamp in wanted:
+            frames[stamp] = decode_image(message.data)
+    model = setup.model
+    material = model.material.replace("_", " ", 1).replace("_", "-")
+    return BehaviorRun(
+        name=f"{material}, {1e3 * model.thread_length:g} mm, {model.segments} segments, "
+        f"{model.attachment} to the needle, dish of {1e3 * setup.scene.dish.diameter:g} mm",
+        summary=summary,
+        instants=collector.instants,
+        frames=frames,
+        view=setup.rig.view(setup.scene),
+        dish_diameter=setup.scene.dish.diameter,
+        obstacles=setup.scene.obstacles,
+    )
+
+
+def behavior_table(runs: Sequence[BehaviorRun]) -> Table:
+    """Return the figures of the thread-behaviour tests as a table."""
+    table = Table(title="thread behaviour, closed loop, simulated", title_justify="left", title_style="bold")
+    table.caption = "errors: mean (greatest) over time, % of the thread's length; needle: root of the mean square"
+    table.add_column("", no_wrap=True)
+    for name in ("against the truth", "against the seen", "frames", "needle off its path"):
+        table.add_column(name, justify="right")
+    for run in runs:
+        summary = run.summary
+        errors = [
+            f"{figures['mean']:.3f} ({figures['maximum']:.3f})" if figures else "none"
+            for figures in (summary.error_truth, summary.error_seen)
+        ]
+        table.add_row(
+            summary.setup, *errors, f"{summary.predicted} of {summary.frames}", f"{1e3 * summary.path_error:.2f} mm"
+        )
+    return table
+
+
+def chosen_instants(instants: Sequence[Instant]) -> list[Instant]:
+    """Return the instants to show: spread evenly over the run, the last among them."""
+    at = np.linspace(0, len(instants) - 1, SHOWN + 1).round().astype(int)[1:]
+    return [instants[index] for index in at]
+
+
+def draw_behavior(path: Path, runs: Sequence[BehaviorRun]) -> None:
+    """Draw the tests below one another and write the picture as PNG.
+
+    Args:
+        path: of the picture.
+        runs: the tests.
+    """
+    height = ROW * len(runs) + 0.72
+    figure = Figure(figsize=(15.0, height), dpi=100, facecolor="white")
+    figure.text(0.012, 1.0 - 0.32 / height, "Thread behaviour in closed loop, simulated", fontsize=13, color=INK)
+    figure.text(
+        0.012,
+        1.0 - 0.58 / height,
+        "wide and blue: what the camera sees; thin, with nodes: what the model predicts from the needle's pose alone",
+        fontsize=9.5,
+        color=FAINT,
+    )
+    for index, run in enumerate(runs):
+        bottom = (ROW * (len(runs) - 1 - index) + 0.12) / height
+        _draw_row(figure, run, bottom, (ROW - 0.42) / height)
+    figure.savefig(path)
+
+
+def _draw_row(figure: Figure, run: BehaviorRun, bottom: float, height: float) -> None:
+    figure.text(0.012, bottom + height + 0.012, run.name, fontsize=10.5, color=INK)
+    began = run.instants[0].stamp
+    for column, instant in enumerate(chosen_instants(run.instants)):
+        axes = figure.add_axes((0.012 + 0.168 * column, bottom, 0.163, height))
+        _draw_instant(axes, run, instant, (instant.stamp - began) * 1e-9)
+    plot = figure.add_axes((0.725, bottom + 0.055, 0.262, height - 0.06))
+    times = np.array([(instant.stamp - began) * 1e-9 for instant in run.instants])
+    for label, colour, errors in (
+        ("against the seen centreline", SEEN, [instant.error_seen for instant in run.instants]),
+        ("against the truth", TRUTH, [instant.error_truth for instant in run.instants]),
+    ):
+        mean = float(np.nanmean(errors))
+        plot.plot(times, errors, color=colour, linewidth=1.2, label=f"{label}, mean {mean:.2f}")
+    plot.set_ylim(0.0, 1.35 * plot.get_ylim()[1])  # room for the legend
+    plot.set_xlim(times[0], times[-1])
+    plot.set_title("prediction error [% of the length]", fontsize=9.5, color=INK, loc="left")
+    plot.set_xlabel("time [s]", fontsize=8.5, color=INK, labelpad=1)
+    plot.legend(loc="upper right", fontsize=8.0, frameon=False, ncols=1)
+    tidy(plot)
+
+
+def _draw_instant(axes: Axes, run: BehaviorRun, instant: Instant, time: float) -> None:
+    draw_threads(axes, run.frames[instant.stamp], run.view, instant, run.obstacles, magnified=0.8)
+    centre = run.view.to_pixels(np.zeros(2))
+    half = (0.5 + BORDER) * run.dish_diameter / run.view.metres_per_pixel
+    axes.set_xlim(centre[0] - half, centre[0] + half)
+    axes.set_ylim(centre[1] + half, centre[1] - half)
+    axes.text(0.03, 0.97, f"{time:.1f} s", transform=axes.transAxes, fontsize=9, color=INK, va="top")
+    for side in axes.spines.values():
+        side.set_visible(False)
