@@ -71,7 +71,7 @@ def draw_scene(file: str, output: Path) -> Scene:
     if output.suffix not in PICTURES:
         raise ConfigurationError("--output", str(output), f"a file that ends in {' or '.join(PICTURES)}")
     scene = read_scene(file)
-    from magnetosuture_thread.study.scene_picture import draw_scene as draw
+    from magnetosuture_thread.evaluation.scene_plot import draw_scene as draw
 
     with whole_file(output) as partial:
         draw(partial, scene, Path(file).stem)

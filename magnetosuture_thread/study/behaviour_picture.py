@@ -15,11 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from magnetosuture_thread.evaluation.closed_loop import LoopSummary
+from magnetosuture_thread.evaluation.frames import FrameResult as Instant
+from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Obstacle
-from magnetosuture_thread.study.loop import LoopSummary
-from magnetosuture_thread.study.picture import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
-from magnetosuture_thread.study.replayed import Instant
 
 SHOWN = 4  # instants of each run
 BORDER = 0.06  # of the dish's diameter, around it in a picture

@@ -16,7 +16,9 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.cli.tables import track_table
 from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.jobs import frames
 from magnetosuture_thread.jobs.calibrate_camera import calibrate_camera
 from magnetosuture_thread.jobs.frames import FrameSource
@@ -24,8 +26,6 @@ from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.track import settings_with, track
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.reference import ReferenceTrajectory
-from magnetosuture_thread.study.track_table import track_table
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 

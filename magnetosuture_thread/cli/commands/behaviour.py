@@ -27,7 +27,7 @@ def add(subparsers: Subparsers) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the thread-behaviour tests."""
     from magnetosuture_thread.jobs.behaviour import behaviour
-    from magnetosuture_thread.study.table import behaviour_table
+    from magnetosuture_thread.study.behaviour_table import behaviour_table
 
     console = make_console()
     say = sayer(console)

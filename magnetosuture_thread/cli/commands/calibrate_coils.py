@@ -36,8 +36,8 @@ def add(subparsers: Subparsers) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Find the coils' properties from probe measurements."""
+    from magnetosuture_thread.cli.tables import coil_lines, coil_table
     from magnetosuture_thread.jobs.calibrate_coils import calibrate_coils
-    from magnetosuture_thread.study.coil_table import coil_lines, coil_table
 
     console = make_console()
     say = sayer(console)

@@ -55,8 +55,8 @@ def add(subparsers: Subparsers) -> None:
 
 def run_check(options: argparse.Namespace) -> int:
     """Show what a scene holds, and what to look at."""
+    from magnetosuture_thread.cli.tables import scene_table
     from magnetosuture_thread.jobs.scene import check_scene
-    from magnetosuture_thread.study.scene_table import scene_table
 
     console = make_console()
     report = check_scene(options.file, options.needle_width)

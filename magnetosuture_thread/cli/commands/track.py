@@ -55,10 +55,10 @@ def add(subparsers: Subparsers) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Track the needle in camera frames."""
+    from magnetosuture_thread.cli.tables import track_lines, track_table
     from magnetosuture_thread.jobs.track import settings_with, track
     from magnetosuture_thread.scene import read_scene
     from magnetosuture_thread.setups import read_setup
-    from magnetosuture_thread.study.track_table import track_lines, track_table
 
     console = make_console()
     say = sayer(console)

@@ -8,9 +8,9 @@ from pathlib import Path
 from matplotlib.animation import PillowWriter
 from matplotlib.figure import Figure
 
+from magnetosuture_thread.evaluation.plots import FAINT
 from magnetosuture_thread.study.hernia.run import HerniaRun
 from magnetosuture_thread.study.hernia.scene import INK, caption, draw_dish, draw_thread
-from magnetosuture_thread.study.picture import FAINT
 
 FASTER = 6  # than it happened
 PICTURES = 8  # a second

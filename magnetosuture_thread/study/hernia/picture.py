@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from magnetosuture_thread.evaluation.plots import FAINT, tidy
 from magnetosuture_thread.model.friction import Friction, FrictionState, friction_colour
 from magnetosuture_thread.study.hernia.run import HerniaRun
 from magnetosuture_thread.study.hernia.scene import INK, caption, draw_dish, draw_thread
-from magnetosuture_thread.study.picture import FAINT, tidy
 
 NODE_COLOURS = ("#0b3c5d", "#1f77b4", "#2a9d8f", "#8ab17d", "#e9a03b")
 TOP = 6.0e-3  # m; barriers beyond are not drawn
