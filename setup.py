@@ -17,9 +17,9 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
-            "study/report/page.html",
-            "study/report/page.css",
-            "study/report/page.js",
+            "evaluation/report/page.html",
+            "evaluation/report/page.css",
+            "evaluation/report/page.js",
             "console/page/*",
         ]
     },

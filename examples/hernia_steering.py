@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from magnetosuture_thread.bags.types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.interface import DISH_FRAME, OPERATOR_COMMAND
-from magnetosuture_thread.offline.messages import header, make
+from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.reproduce.hernia.replay import start_centreline
 from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredThread
 from magnetosuture_thread.reproduce.hernia.steering import RATE, point_filter
@@ -72,10 +72,7 @@ def main() -> None:
         needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
         for time, (x, y) in keys(SteeredThread(setup.model, start_centreline(setup), needle)):
             stamp = 1_000_000_000 + round(time * 1e9)
-            linear = make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=0.0)
-            still = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-            twist = make("geometry_msgs/msg/Twist", linear=linear, angular=still)
-            message = make(OPERATOR_COMMAND.type_name, header=header(stamp, DISH_FRAME), twist=twist)
+            message = MESSAGES.twist_message(stamp, np.array([x, y]))
             bag.write_message(OPERATOR_COMMAND.recorded, stamp, message)
 
 

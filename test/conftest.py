@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import Scene
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.reference import ReferenceTrajectory
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 # What a shell runs in the background ignores SIGINT, and hands that on to its children: no Ctrl-C would reach them.

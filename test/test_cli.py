@@ -14,7 +14,7 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.cli import commands
 from magnetosuture_thread.cli.main import MOVED
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS
-from test.study.test_evaluation import write
+from test.evaluation.test_reference_scores import write
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

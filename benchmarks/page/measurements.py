@@ -205,7 +205,9 @@ def _heard(domain: int) -> Iterator[Times]:
     By the senders' stamps: when we hear of it is no concern of the coils. A wish that got lost on its way to us is
     known by the command that followed from it, which keeps its stamp.
     """
-    from magnetosuture_thread.nodes import messages, topics
+    from magnetosuture_thread.messages.cdr import header_stamp
+    from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.messages import serialised_velocity
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment
     from magnetosuture_thread.nodes.recorder import Recorder
 
@@ -231,8 +233,8 @@ def _heard(domain: int) -> Iterator[Times]:
         thread.join()
         recorder.close()
         for topic, data in came:
-            stamp = messages.header_stamp(data)
-            if stamp is not None and messages.serialised_velocity(data).any():
+            stamp = header_stamp(data)
+            if stamp is not None and serialised_velocity(data).any():
                 times[OPERATOR_COMMAND.recorded if topic == NEEDLE_COMMAND.recorded else topic].append(stamp * 1e-9)
         for found in times.values():
             found.sort()

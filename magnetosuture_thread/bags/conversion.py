@@ -7,14 +7,15 @@ message was decoded, and return messages of our own type store.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magnetosuture_thread.bags.transforms import Rigid, rigid_of, rotation_of
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.types import MESSAGES
+from magnetosuture_thread.messages.building import ADD, LINE_STRIP
 
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -22,7 +23,7 @@ PATH = "nav_msgs/msg/Path"
 TWIST = "geometry_msgs/msg/TwistStamped"
 UNSTAMPED_TWIST = "geometry_msgs/msg/Twist"
 
-_LINE_STRIP, _ADD = 4, 0  # of visualization_msgs/Marker
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 Convert = Callable[[Any, int], Any]
 
@@ -31,19 +32,9 @@ class UnfitError(Exception):
     """A message that says nothing that our graph could take; the text says why."""
 
 
-def _make(name: str, *fields: Any) -> Any:
-    return typestore().types[name](*fields)
-
-
-def header(stamp: Any, frame: str) -> Any:
-    """Return a header; `stamp` is a time message or nanoseconds."""
-    seconds, nanoseconds = divmod(stamp, 10**9) if isinstance(stamp, int) else (stamp.sec, stamp.nanosec)
-    return _make("std_msgs/msg/Header", _make("builtin_interfaces/msg/Time", seconds, nanoseconds), frame)
-
-
 def pose_stamped(message: Any, time: int) -> Any:
     """Return a PoseStamped of anything that holds one pose."""
-    return _make(POSE, _header_of(message), _pose_in(message))
+    return MESSAGES.pose_stamped(_header_of(message), _pose_in(message))
 
 
 def pose_with_covariance(message: Any, time: int) -> Any:
@@ -51,8 +42,7 @@ def pose_with_covariance(message: Any, time: int) -> Any:
     holder = getattr(message, "pose", None)
     covariance = getattr(holder, "covariance", None)
     values = np.zeros(36) if covariance is None else np.array(covariance, dtype=float)
-    held = _make("geometry_msgs/msg/PoseWithCovariance", _pose_in(message), values)
-    return _make(POSE_WITH_COVARIANCE, _header_of(message), held)
+    return MESSAGES.pose_with_covariance(_header_of(message), _pose_in(message), values)
 
 
 def path_of_path(message: Any, time: int) -> Any:
@@ -77,7 +67,7 @@ def path_of_vertices(message: Any, time: int) -> Any:
 
 def path_of_marker(message: Any, time: int) -> Any:
     """Return a Path of a Marker that is a line strip."""
-    if message.action != _ADD or message.type != _LINE_STRIP:
+    if message.action != ADD or message.type != LINE_STRIP:
         raise UnfitError("a marker that is no line strip being added")
     points = np.array([[point.x, point.y, point.z] for point in message.points]).reshape(-1, 3)
     turn, place = message.pose.orientation, message.pose.position
@@ -87,17 +77,17 @@ def path_of_marker(message: Any, time: int) -> Any:
     if rotation is None:
         raise UnfitError("an orientation that is none")
     moved = Rigid(rotation, np.array([place.x, place.y, place.z])).points(points)
-    return _path(message, [_pose(_point(xyz)) for xyz in moved])
+    return _path(message, [MESSAGES.pose(xyz, UPRIGHT) for xyz in moved])
 
 
 def twist_of_twist(message: Any, time: int) -> Any:
     """Return a TwistStamped of a TwistStamped."""
-    return _make(TWIST, _header_of(message), _twist(message.twist.linear, message.twist.angular))
+    return MESSAGES.twist_stamped(_header_of(message), _twist(message.twist))
 
 
 def twist_without_stamp(message: Any, time: int) -> Any:
     """Return a TwistStamped of a Twist: stamped when it was recorded, in no frame."""
-    return _make(TWIST, header(time, ""), _twist(message.linear, message.angular))
+    return MESSAGES.twist_stamped(MESSAGES.header(time, ""), _twist(message))
 
 
 _POSES = (
@@ -127,23 +117,17 @@ def moved(message: Any, rigid: Rigid, frame: str) -> Any:
     Of a twist only the directions change: it stays the velocity of the same point, seen from a frame at rest.
     A covariance C becomes M C M^T, where M turns position and rotation alike.
     """
-    turned = header(message.header.stamp, frame)
+    header = MESSAGES.header(message.header.stamp, frame)
     kind = message.__msgtype__
     if kind == POSE:
-        return _make(POSE, turned, _moved_pose(message.pose, rigid))
+        return MESSAGES.pose_stamped(header, _moved_pose(message.pose, rigid))
     if kind == POSE_WITH_COVARIANCE:
         both = np.kron(np.eye(2), rigid.rotation.as_matrix())
         covariance = both @ np.reshape(message.pose.covariance, (6, 6)) @ both.T
-        pose = _moved_pose(message.pose.pose, rigid)
-        return _make(kind, turned, _make("geometry_msgs/msg/PoseWithCovariance", pose, covariance.ravel()))
+        return MESSAGES.pose_with_covariance(header, _moved_pose(message.pose.pose, rigid), covariance.ravel())
     if kind == PATH:
-        poses = [_moved_pose(each.pose, rigid) for each in message.poses]
-        return _make(PATH, turned, [_make(POSE, turned, pose) for pose in poses])
-    linear, angular = (
-        _vector(rigid.rotation.apply([vector.x, vector.y, vector.z]))
-        for vector in (message.twist.linear, message.twist.angular)
-    )
-    return _make(TWIST, turned, _make(UNSTAMPED_TWIST, linear, angular))
+        return MESSAGES.path(header, [_moved_pose(each.pose, rigid) for each in message.poses])
+    return MESSAGES.twist_stamped(header, _twist(message.twist, rigid.rotation.apply))
 
 
 def _moved_pose(pose: Any, rigid: Rigid) -> Any:
@@ -153,7 +137,7 @@ def _moved_pose(pose: Any, rigid: Rigid) -> Any:
         raise UnfitError("an orientation that is none")
     # Composed by hand, so that its length stays what it was: whoever takes it judges that.
     turned = (rigid.rotation * rotation).as_quat() * math.hypot(turn.x, turn.y, turn.z, turn.w)
-    return _make("geometry_msgs/msg/Pose", _point(place), _quaternion(turned))
+    return MESSAGES.pose(place, turned)
 
 
 def _pose_in(message: Any) -> Any:
@@ -167,33 +151,20 @@ def _pose_in(message: Any) -> Any:
 
 
 def _header_of(message: Any) -> Any:
-    return header(message.header.stamp, message.header.frame_id)
+    return MESSAGES.header(message.header.stamp, message.header.frame_id)
 
 
 def _path(message: Any, poses: Sequence[Any]) -> Any:
-    own = _header_of(message)
-    return _make(PATH, own, [_make(POSE, own, pose) for pose in poses])
+    return MESSAGES.path(_header_of(message), poses)
 
 
 def _pose(position: Any, orientation: Any = None) -> Any:
-    turn = [0.0, 0.0, 0.0, 1.0]
+    turn = UPRIGHT
     if orientation is not None:
-        turn = [orientation.x, orientation.y, orientation.z, orientation.w]
-    return _make("geometry_msgs/msg/Pose", _point([position.x, position.y, position.z]), _quaternion(turn))
+        turn = (orientation.x, orientation.y, orientation.z, orientation.w)
+    return MESSAGES.pose((position.x, position.y, position.z), turn)
 
 
-def _twist(linear: Any, angular: Any) -> Any:
-    vectors = (_vector([vector.x, vector.y, vector.z]) for vector in (linear, angular))
-    return _make(UNSTAMPED_TWIST, *vectors)
-
-
-def _point(xyz: Iterable[float]) -> Any:
-    return _make("geometry_msgs/msg/Point", *map(float, xyz))
-
-
-def _vector(xyz: Iterable[float]) -> Any:
-    return _make("geometry_msgs/msg/Vector3", *map(float, xyz))
-
-
-def _quaternion(xyzw: Iterable[float]) -> Any:
-    return _make("geometry_msgs/msg/Quaternion", *map(float, xyzw))
+def _twist(twist: Any, turned: Callable[[Any], Any] = list) -> Any:
+    vectors = (MESSAGES.vector(*turned([each.x, each.y, each.z])) for each in (twist.linear, twist.angular))
+    return MESSAGES.twist(*vectors)

@@ -8,12 +8,12 @@ from typing import Any
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.conversion import CONVERSIONS, UNSTAMPED_TWIST, UnfitError, moved
-from magnetosuture_thread.bags.headers import is_in_dish, stamp_and_frame
 from magnetosuture_thread.bags.reader import Bag, Record
 from magnetosuture_thread.bags.transforms import TF_MESSAGE, TOPICS, Rigid, Transforms
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA, DISH_FRAME, Channel
+from magnetosuture_thread.messages.cdr import is_in_dish, stamp_and_frame
 
 CHANNELS = tuple(value for value in vars(interface).values() if isinstance(value, Channel))
 _CAMERA_NAMES = {channel.recorded for channel in CAMERA.values()}

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from magnetosuture_thread.bags.headers import stamp_and_frame
 from magnetosuture_thread.bags.reader import Bag, Record
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import CDR
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.messages.cdr import stamp_and_frame
 
 
 @dataclass

@@ -9,6 +9,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from magnetosuture_thread.calibration.parameters import chosen
+from magnetosuture_thread.calibration.passage import Passage, passage_of
+from magnetosuture_thread.calibration.picture import draw_calibration
+from magnetosuture_thread.calibration.pool import pool
+from magnetosuture_thread.calibration.replays import Best
+from magnetosuture_thread.calibration.result import BagFit, Calibration
+from magnetosuture_thread.calibration.search import calibrate as fit
+from magnetosuture_thread.calibration.search import unfinished
+from magnetosuture_thread.calibration.yaml_text import to_yaml
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.jobs.judge import Given, opened
 from magnetosuture_thread.jobs.output import whole_file
@@ -17,15 +26,6 @@ from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import MATERIALS
 from magnetosuture_thread.offline.predictions import sights
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.study.calibration.parameters import chosen
-from magnetosuture_thread.study.calibration.passage import Passage, passage_of
-from magnetosuture_thread.study.calibration.picture import draw_calibration
-from magnetosuture_thread.study.calibration.pool import pool
-from magnetosuture_thread.study.calibration.replays import Best
-from magnetosuture_thread.study.calibration.result import Calibration, Course
-from magnetosuture_thread.study.calibration.search import calibrate as fit
-from magnetosuture_thread.study.calibration.search import unfinished
-from magnetosuture_thread.study.calibration.yaml_text import to_yaml
 
 READING = 0.15  # share of the time for reading the bags, and tracking their frames
 
@@ -93,7 +93,7 @@ def calibrate(
     best = Best()
     try:
         with pool(passages, min(request.workers, os.cpu_count() or 1)) as run:
-            calibration, courses = fit(
+            calibration, fits = fit(
                 passages,
                 settings,
                 request.parameters,
@@ -106,13 +106,13 @@ def calibrate(
         if best.settings is None:
             raise
         say("interrupted; writing the best so far")
-        calibration, courses = unfinished(passages, settings, best)
-    _write(calibration, courses, output, picture or output.with_suffix(".png"), json_file)
+        calibration, fits = unfinished(passages, settings, best)
+    _write(calibration, fits, output, picture or output.with_suffix(".png"), json_file)
     return calibration
 
 
 def _write(
-    calibration: Calibration, courses: Sequence[Course], output: Path, picture: Path, json_file: Path | None
+    calibration: Calibration, fits: Sequence[BagFit], output: Path, picture: Path, json_file: Path | None
 ) -> None:
     with whole_file(output) as partial:
         partial.write_text(to_yaml(calibration), encoding="utf-8")
@@ -120,7 +120,7 @@ def _write(
         with whole_file(json_file) as partial:
             partial.write_text(json.dumps(calibration.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     with whole_file(picture) as partial:
-        draw_calibration(partial, calibration, courses)
+        draw_calibration(partial, calibration, fits)
 
 
 def _read(

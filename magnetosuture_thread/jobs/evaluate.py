@@ -9,12 +9,12 @@ from pathlib import Path
 
 from magnetosuture_thread.bags.folder import STORAGES, bag_files
 from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
+from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv, table_json
 from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable
 from magnetosuture_thread.jobs.frames import numbered
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.workers import WorkerDiedError, run_all
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.bag_table import Row, failed_row, table_csv, table_json
 
 DEPTH = 2  # folders below the one that is given, in which bags are looked for
 LONGEST_NAME = 200  # bytes

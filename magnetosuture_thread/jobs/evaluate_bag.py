@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from magnetosuture_thread.bags.recording import CHANNELS
 from magnetosuture_thread.configuration import Configuration, described
 from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.evaluation.bag_table import Row, row_of
+from magnetosuture_thread.evaluation.frames import FrameResult, Observation
+from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures
+from magnetosuture_thread.evaluation.report.page import write_page
+from magnetosuture_thread.evaluation.report.pictures import Photo, Picture, draw_worst_frame
+from magnetosuture_thread.evaluation.series import WorstFrame
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import DISH_FRAME, PREDICTED_THREAD, SEEN_THREAD, TRUE_THREAD
 from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions, live_figures
 from magnetosuture_thread.jobs.judge import Given, opened
+from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.predictions import predictions
 from magnetosuture_thread.offline.sights import NOT_FOUND, Sights, pixels
-from magnetosuture_thread.offline.unpacking import stamp_of
-from magnetosuture_thread.study.bag_table import Row, row_of
-from magnetosuture_thread.study.report.account import Account
-from magnetosuture_thread.study.report.figures import About
-from magnetosuture_thread.study.report.moments import Moment
-from magnetosuture_thread.study.report.page import write_page
-from magnetosuture_thread.study.report.pictures import Photo, Picture, draw_moment
-from magnetosuture_thread.study.sight import Sight
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 AGAINST = ("auto", "truth", "seen")
@@ -96,32 +96,33 @@ def evaluate_bag(path: Path, name: str, options: Options, page: Path, say: Say, 
         if options.formulation:
             model = replace(model, formulation=options.formulation)
         recorded = bool(given.recording.counts.get(PREDICTED_THREAD.recorded))
-        account = Account(model.thread_length, given.recording.start, _targets(given, options.against), recorded)
-        seen = _Looked(given, account, lambda share: progress(0.95 * share))
-        refused = _predict(given, model, account, seen)
-        figures = account.figures(live_figures(given.recording, given.start, given.duration))
+        targets = _targets(given, options.against)
+        metrics = RunMetrics(model.thread_length, given.recording.start, targets, recorded=recorded)
+        seen = _Looked(given, metrics, lambda share: progress(0.95 * share))
+        refused = _predict(given, model, metrics, seen)
+        figures = BagFigures.of(metrics, live_figures(given.recording, given.start, given.duration))
         about = _about(given, name, model, refused, seen.thread_problem())
         if not figures.predicted:
-            counts = Counter(account.reasons) + refused
+            counts = Counter(metrics.reasons) + refused
             why = "; ".join(f"{count} times {reason}" for reason, count in counts.most_common(3)) or WAITING
             raise BagError(path, f"gave no prediction: {figures.tracked} of {figures.frames} had a needle; {why}")
-        pictures = _pictures(given, model, account)
-    page.write_text(write_page(about, account, figures, pictures), encoding="utf-8")
+        pictures = _pictures(given, model, metrics)
+    page.write_text(write_page(about, metrics, figures, pictures), encoding="utf-8")
     progress(1.0)
     return row_of(about, figures)
 
 
 class _Looked(Sights):
-    """A bag's sights, each of which an account takes as it goes by; what else the bag says goes to the model."""
+    """A bag's sights, each of which the metrics take as it goes by; what else the bag says goes to the model."""
 
-    def __init__(self, given: Given, account: Account, progress: Progress) -> None:
+    def __init__(self, given: Given, metrics: RunMetrics, progress: Progress) -> None:
         super().__init__(given.recording, given.setup, given.source, given.start, given.duration, progress)
-        self._account = account
+        self._metrics = metrics
 
-    def __next__(self) -> Sight:
+    def __next__(self) -> Observation:
         """Return the next sight."""
         sight = super().__next__()
-        self._account.look(sight)
+        self._metrics.observe(sight)
         return sight
 
 
@@ -142,21 +143,21 @@ def _targets(given: Given, against: str) -> list[str]:
     return [target for target, is_there in there.items() if is_there and against in ("auto", target)]
 
 
-def _predict(given: Given, model: ThreadModelSettings, account: Account, seen: Sights) -> Counter[str]:
+def _predict(given: Given, model: ThreadModelSettings, metrics: RunMetrics, seen: Sights) -> Counter[str]:
     """Go through a bag once; return what was refused, by why."""
     recorded = RecordedPredictions(given.recording, given.start, given.duration)
     refused = Counter[str]()
     for step in predictions(seen, model, given.setup.scene):
         if step.outcome.prediction is not None:
-            beside = recorded.of(step.sight.stamp)
-            account.predict(
+            frame = FrameResult.of(
                 step.sight,
                 step.outcome.prediction,
                 step.margins,
                 step.step_time,
-                beside,
-                step.scene.obstacles if step.scene is not None else (),
+                recorded=recorded.of(step.sight.stamp),
+                obstacles=step.scene.obstacles if step.scene is not None else (),
             )
+            metrics.add(frame)
         elif step.outcome.problem is not None:
             refused[_kind(step.outcome.problem)] += 1
     refused += Counter({why: count for why, count in seen.refused.items() if why != NOT_FOUND})
@@ -169,25 +170,25 @@ def _kind(problem: Exception) -> str:
     return "the model: a program that was not solved"
 
 
-def _pictures(given: Given, model: ThreadModelSettings, account: Account) -> list[Picture]:
-    moments = account.moments()
-    photos = _photos(given, moments)
+def _pictures(given: Given, model: ThreadModelSettings, metrics: RunMetrics) -> list[Picture]:
+    worst = metrics.worst_frames()
+    photos = _photos(given, worst)
     return [
-        draw_moment(
-            moment,
-            photos.get(moment.instant.stamp),
-            target=account.target,
+        draw_worst_frame(
+            each,
+            photos.get(each.frame.stamp),
+            target=metrics.target,
             length=model.thread_length,
             dish_diameter=given.setup.scene.dish.diameter,
             simulated=bool(given.recording.notes.get("simulated")),
         )
-        for moment in moments
+        for each in worst
     ]
 
 
-def _photos(given: Given, moments: list[Moment]) -> dict[int, Photo]:
-    """Return the camera frames of moments, by stamp; of a frame without a dish the view is that of another."""
-    wanted = {moment.instant.stamp for moment in moments}
+def _photos(given: Given, worst: list[WorstFrame]) -> dict[int, Photo]:
+    """Return the camera images of the worst frames, by stamp; of a frame without a dish the view is that of another."""
+    wanted = {each.frame.stamp for each in worst}
     camera = given.recording.camera
     images, views = dict[int, NDArray[np.uint8]](), dict[int, DishView]()
     if camera is None:
@@ -211,9 +212,9 @@ def _photos(given: Given, moments: list[Moment]) -> dict[int, Photo]:
     return {stamp: Photo(image, views.get(stamp, spare)) for stamp, image in images.items()}
 
 
-def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter[str], problem: str) -> About:
+def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter[str], problem: str) -> BagDetails:
     recording, setup = given.recording, given.setup
-    return About(
+    return BagDetails(
         name=name,
         path=printable(str(recording.path)),
         setup=setup.name,

@@ -10,11 +10,11 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.metrics import Percentiles
+from magnetosuture_thread.evaluation.report.figures import STAGES, LiveFigures
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import CURRENTS, NEEDLE_POSE, PREDICTED_THREAD
-from magnetosuture_thread.offline.unpacking import stamp_of
-from magnetosuture_thread.study.replayed import Spread
-from magnetosuture_thread.study.report.figures import STAGES, LiveFigures
+from magnetosuture_thread.messages.reading import stamp_of
 
 LATENT = dict(zip((NEEDLE_POSE, PREDICTED_THREAD, CURRENTS), STAGES, strict=True))
 LONGEST = 10.0  # s; a median beyond is of two clocks
@@ -44,14 +44,11 @@ def live_figures(recording: Recording, start: float, duration: float | None) -> 
         if stamp > latest.get(record.topic, 0):  # the first about each
             latest[record.topic] = stamp
             latencies[record.topic].append((record.time - stamp) * 1e-9)
-    found = {
-        LATENT[channel]: Spread(float(np.median(values)), float(np.percentile(values, 99)), float(np.max(values)))
-        for channel in there
-        if len(values := latencies[channel.recorded])
-    }
-    if any(not 0.0 <= spread.median <= LONGEST for spread in found.values()):
+    percentiles = {LATENT[channel]: Percentiles.of(latencies[channel.recorded]) for channel in there}
+    found = {stage: each for stage, each in percentiles.items() if each is not None}
+    if any(not 0.0 <= each.median <= LONGEST for each in found.values()):
         return LiveFigures(remark="not measured: stamps and times of recording are of two clocks")
-    if all(spread.maximum == 0.0 for spread in found.values()):
+    if all(each.maximum == 0.0 for each in found.values()):
         return LiveFigures(remark="not measured: the bag was made offline")
     return LiveFigures(found)
 

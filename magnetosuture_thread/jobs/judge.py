@@ -8,25 +8,27 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
+from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
+from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import NEEDLE_COMMAND, SCENE, SEEN_THREAD, TRUE_THREAD
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
-from magnetosuture_thread.offline.messages import header, make
+from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.offline.predictions import chosen_source
 from magnetosuture_thread.offline.sights import pixels
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.messages import scene_message, scene_of
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.study.picture import draw_summary
-from magnetosuture_thread.study.replayed import Instant, Summary
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 DEFAULT_SETUP = "petri_35mm_polyamide"
@@ -134,7 +136,7 @@ def scene_at(recording: Recording, start: float) -> Scene | None:
 def begin_with_scene(bag: BagWriter, given: Given) -> None:
     """Write the scene at the beginning of a bag made from another."""
     bag.add_topic(SCENE.recorded, SCENE.type_name)
-    bag.write_message(SCENE.recorded, given.begin, scene_message(given.setup.scene, header(given.begin), make))
+    bag.write_message(SCENE.recorded, given.begin, MESSAGES.scene_message(given.begin, given.setup.scene))
 
 
 def _setup_of(
@@ -165,28 +167,56 @@ def _setup_of(
     return read_setup(named or DEFAULT_SETUP, scene)
 
 
-def write_results(
-    folder: Path, given: Given, instants: list[Instant], chosen: Instant, summary: Summary, say: Say
-) -> None:
+def replay_summary(given: Given, metrics: RunMetrics, **others: Any) -> ReplaySummary:
+    """Return the figures of a replay.
+
+    Args:
+        given: what was replayed.
+        metrics: of its predictions, of which there are some.
+        others: the fields of `ReplaySummary` that these do not give.
+    """
+    errors = metrics.errors()
+    return ReplaySummary(
+        bag=str(given.recording.path),
+        setup=given.setup.name,
+        simulated=given.recording.notes.get("simulated", ""),
+        predicted=len(metrics.series),
+        step_time=metrics.percentiles("step_time"),
+        least_margins=list(metrics.minimum_margins.values()),
+        contact_frames=metrics.contact_frames,
+        stretch=metrics.maximum("strain"),
+        residual=metrics.maximum("residual"),
+        seen_share=metrics.mean("seen_share"),
+        error_seen=errors["seen"],
+        error_truth=errors["truth"],
+        source=given.source,
+        damage=str(given.recording.damage or ""),
+        **others,
+    )
+
+
+def write_results(folder: Path, given: Given, metrics: RunMetrics, summary: ReplaySummary, say: Say) -> None:
     """Write summary.json and summary.png.
 
     Args:
         folder: that gets them.
         given: what was replayed.
-        instants: all predictions, by time.
-        chosen: the one to show, in full.
+        metrics: of its predictions.
         summary: the figures.
         say: called with a line for a person.
     """
     text = json.dumps(summary.to_json(), indent=2, allow_nan=False)
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+    chosen = metrics.worst_measured
+    assert chosen is not None
     found = _frame_of(given, chosen.stamp) if given.source == "camera" else _plain_dish(given)
     if found is None:
         say("no picture: the dish is not found in any frame")
         return
     frame, view = found
+    at = (chosen.stamp - given.recording.start) * 1e-9
     obstacles = given.setup.scene.obstacles
-    draw_summary(folder / "summary.png", frame, view, chosen, instants, obstacles, given.recording.start, summary)
+    draw_summary(folder / "summary.png", frame, view, chosen, at, metrics.series, obstacles, summary)
 
 
 def _frame_of(given: Given, stamp: int) -> tuple[NDArray[np.uint8], DishView] | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import yaml
 
 from magnetosuture_thread.bags.reader import Record
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.types import MESSAGES, typestore
 from magnetosuture_thread.interface import (
     CAMERA,
     CAMERA_INFO,
@@ -25,9 +25,7 @@ from magnetosuture_thread.interface import (
 from magnetosuture_thread.jobs.judge import Given
 from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
 from magnetosuture_thread.offline.changes import CHANGING
-from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.scene import write_scene
-from magnetosuture_thread.scene.messages import scene_message
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.topics import Topic
@@ -106,7 +104,7 @@ class Playing:
         """Give the messages to play, by time."""
         given = self.given
         # The scene comes first: the one that the bag tells to be in force, or else the set-up's.
-        message = scene_message(given.setup.scene, header(given.begin), make)
+        message = MESSAGES.scene_message(given.begin, given.setup.scene)
         data = bytes(typestore().serialize_cdr(message, SCENE.type_name))
         yield Record(SCENE.recorded, SCENE.type_name, given.begin, data)
         if given.start > 0.0:  # what was said before of the thread is in force

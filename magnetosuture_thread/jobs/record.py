@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.bags.types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.interface import (
-    CAMERA_FRAME,
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     NEEDLE_COMMAND,
@@ -29,12 +30,9 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.thread import Attachment
-from magnetosuture_thread.offline.messages import header, make, path_message, placed, pose_message
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.camera.scene import Scene as CameraScene
-from magnetosuture_thread.scene.messages import scene_message
 from magnetosuture_thread.setups import Setup
-from magnetosuture_thread.study.reference import ReferenceTrajectory
 
 SIZE = (640, 480)
 DISH_SHARE = 0.9115  # of the image's height
@@ -95,7 +93,7 @@ def record(
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
         bag.add_topic(SCENE.recorded, SCENE.type_name)
         begin = round((start + EPOCH) * 1e9)
-        bag.write_message(SCENE.recorded, begin, scene_message(setup.scene, header(begin), make))
+        bag.write_message(SCENE.recorded, begin, MESSAGES.scene_message(begin, setup.scene))
         topics = _PoseTopics(bag, setup, noise, seed) if poses else _FrameTopics(bag, setup, reference, quality, seed)
         for index in range(frames):
             time = start + index / rate
@@ -153,12 +151,9 @@ class _Topics(ABC):
     def write(self, stamp: int, tail: Points, heading: float, thread: Points, velocity: Points) -> None:
         """Write an instant."""
         self._write_seen(stamp, tail, heading, thread)
-        linear = make("geometry_msgs/msg/Vector3", x=float(velocity[0]), y=float(velocity[1]), z=0.0)
-        none = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-        twist = make("geometry_msgs/msg/Twist", linear=linear, angular=none)
-        self._put(NEEDLE_COMMAND, stamp, make(NEEDLE_COMMAND.type_name, header=header(stamp), twist=twist))
-        self._put(TRUE_NEEDLE, stamp, placed(stamp, tail, heading))
-        self._put(TRUE_THREAD, stamp, path_message(stamp, _along(thread, TRUTH_POINTS)))
+        self._put(NEEDLE_COMMAND, stamp, MESSAGES.twist_message(stamp, velocity))
+        self._put(TRUE_NEEDLE, stamp, MESSAGES.placed(stamp, tail, heading))
+        self._put(TRUE_THREAD, stamp, MESSAGES.path_message(stamp, _along(thread, TRUTH_POINTS)))
 
     @abstractmethod
     def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
@@ -186,25 +181,9 @@ class _FrameTopics(_Topics):
 
     def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
         data = encode_jpeg(self._camera.render(tail, heading, thread), self._quality)
-        optical = header(stamp, CAMERA_FRAME)
-        image = make(COMPRESSED_IMAGE.type_name, header=optical, format="bgr8; jpeg compressed bgr8", data=data)
-        self._put(COMPRESSED_IMAGE, stamp, image)
-        matrix = self._camera.view.intrinsics(CAMERA_HEIGHT)
-        whole = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        information = make(
-            CAMERA_INFO.type_name,
-            header=optical,
-            height=self._camera.size[1],
-            width=self._camera.size[0],
-            distortion_model="plumb_bob",
-            d=np.zeros(5),
-            k=matrix.ravel(),
-            r=np.eye(3).ravel(),
-            p=np.column_stack([matrix, np.zeros(3)]).ravel(),
-            binning_x=0,
-            binning_y=0,
-            roi=whole,
-        )
+        self._put(COMPRESSED_IMAGE, stamp, MESSAGES.compressed_image(stamp, data))
+        camera = self._camera
+        information = MESSAGES.camera_info(stamp, camera.size, camera.view, CAMERA_HEIGHT)
         self._put(CAMERA_INFO, stamp, information)
 
 
@@ -219,12 +198,14 @@ class _PoseTopics(_Topics):
     def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
         off = self._noise * self._random.standard_normal(3)
         angle = heading + off[2]
-        pose = pose_message(stamp, tail + off[:2], np.array([np.cos(angle), np.sin(angle)]), np.diag(self._noise**2))
+        pose = MESSAGES.pose_message(
+            stamp, tail + off[:2], np.array([np.cos(angle), np.sin(angle)]), np.diag(self._noise**2)
+        )
         self._put(NEEDLE_POSE, stamp, pose)
         seen = _along(thread, SEEN_POINTS)
         seen[1:] += self._noise[:2] * self._random.standard_normal(seen[1:].shape)
         seen[0] = tail + off[:2]  # a seen thread begins at the seen tail
-        self._put(SEEN_THREAD, stamp, path_message(stamp, seen))
+        self._put(SEEN_THREAD, stamp, MESSAGES.path_message(stamp, seen))
 
 
 def _along(thread: Points, count: int) -> Points:

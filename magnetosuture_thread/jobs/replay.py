@@ -8,11 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, GraphError
+from magnetosuture_thread.evaluation.graph_outputs import (
+    CurrentSeries,
+    GraphCollector,
+    ReplaySummary,
+    stage_latencies,
+)
 from magnetosuture_thread.interface import (
     CURRENTS,
     NEEDLE_COMMAND,
@@ -20,12 +24,10 @@ from magnetosuture_thread.interface import (
     PAUSE_REPLAY,
     TRUE_THREAD,
 )
-from magnetosuture_thread.jobs.judge import Given, opened, write_results
+from magnetosuture_thread.jobs.judge import Given, opened, replay_summary, write_results
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.playing import SHORTEST_LOOP, Playing
 from magnetosuture_thread.offline.predictions import sights
-from magnetosuture_thread.study.currents import CurrentSeries
-from magnetosuture_thread.study.replayed import Collector, Spread, Summary, error_figures, stage_latencies
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.interruption import Interruption
@@ -49,7 +51,7 @@ def replay(
     frame: str = "dish",
     say: Say = lambda text: None,
     progress: Progress = lambda share: None,
-) -> Summary:
+) -> ReplaySummary:
     """Play a bag through the nodes as processes of their own, and judge what they made of it.
 
     `output` is made at the end, whole or not at all: `bag/` with all outputs, `summary.json`,
@@ -130,7 +132,7 @@ class _Replay:
     say: Say
     progress: Progress
 
-    def run(self, loop: bool) -> tuple[Summary, str]:
+    def run(self, loop: bool) -> tuple[ReplaySummary, str]:
         """Play the bag into the graph, record and judge its outputs; return what went wrong later, as well."""
         # Only here, where it is needed: without ROS the other commands still work.
         from magnetosuture_thread.nodes import topics
@@ -204,10 +206,11 @@ class _Replay:
             return str(error)
         return ""
 
-    def _judge(self, live: LiveReplay) -> Summary:
+    def _judge(self, live: LiveReplay) -> ReplaySummary:
         """Put the outputs side by side; write summary.json and summary.png."""
         given = self.given
-        collector, recorded, replayed = Collector(given.setup.model.thread_length), CurrentSeries(), CurrentSeries()
+        collector = GraphCollector(given.setup.model.thread_length)
+        recorded, replayed = CurrentSeries(), CurrentSeries()
         truth = [c for c in (TRUE_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
         for record in given.recording.records(truth, start=given.start, duration=given.duration):
             message = record.decode()
@@ -218,39 +221,26 @@ class _Replay:
             collector.take(record.topic, message)
             if record.topic == CURRENTS.recorded:
                 replayed.take(message)
-        instants, losses = collector.instants(), live.losses
+        metrics, losses = collector.metrics(given.recording.start), live.losses
         source = NEEDLE_POSE.name if given.source == "poses" else ""
         frames = losses.played[source] if source else losses.frames_played
-        if not instants:
+        if not len(metrics.series):
             said = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
             things = "poses" if source else "frames"
             raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {said}")
         commands = live.published.get(NEEDLE_COMMAND.name, {})
-        summary = Summary(
-            bag=str(given.recording.path),
-            setup=given.setup.name,
-            simulated=given.recording.notes.get("simulated", ""),
+        summary = replay_summary(
+            given,
+            metrics,
             frames=frames,
             tracked=collector.poses,
-            predicted=len(instants),
             commands=len(commands),
             driven=len(collector.driven & set(commands)),
             latency=stage_latencies(live.published, live.arrived, collector.driven),
-            step_time=Spread.of([instant.step_time for instant in instants]),
-            least_margins=collector.least_margins(given.recording.start),
-            contact_frames=collector.contact_frames,
-            stretch=max(instant.stretch for instant in instants),
-            residual=max(instant.residual for instant in instants),
-            seen_share=float(np.mean([instant.seen_share for instant in instants])),
-            error_seen=error_figures([instant.error_seen for instant in instants]),
-            error_truth=error_figures([instant.error_truth for instant in instants]),
             currents=replayed.against(recorded),
-            source=given.source,
             refused=self.refused,
             dropped=losses.dropped(),
-            damage=str(given.recording.damage or ""),
             remark=self.remark,
         )
-        errors = [instant.error_seen if np.isfinite(instant.error_seen) else -1.0 for instant in instants]
-        write_results(self.folder, given, instants, instants[int(np.argmax(errors))], summary, self.say)
+        write_results(self.folder, given, metrics, summary, self.say)
         return summary

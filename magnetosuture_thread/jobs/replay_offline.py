@@ -7,23 +7,21 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import numpy as np
-
 from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
+from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SCENE, SEEN_THREAD, TRACKER_STATE
-from magnetosuture_thread.jobs.judge import Given, begin_with_scene, opened, write_results
+from magnetosuture_thread.jobs.judge import Given, begin_with_scene, opened, replay_summary, write_results
 from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.messages.cdr import time_of
+from magnetosuture_thread.messages.packing import packed_margins, packed_path, packed_pose, packed_prediction
 from magnetosuture_thread.model.session import WAITING
-from magnetosuture_thread.offline import messages
 from magnetosuture_thread.offline.predictions import Step, predictions, sights
 from magnetosuture_thread.offline.sights import NOT_NEWER, Sights
-from magnetosuture_thread.packing.layout import time_of
-from magnetosuture_thread.packing.needle import packed_path, packed_pose
-from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
-from magnetosuture_thread.study.replayed import Spread, Summary, error_figures
-from magnetosuture_thread.study.tally import Tally
 from magnetosuture_thread.vision.session import Seen
 
 Say = Callable[[str], None]
@@ -42,7 +40,7 @@ def replay_offline(
     frame: str = "dish",
     say: Say = lambda text: None,
     progress: Progress = lambda share: None,
-) -> Summary:
+) -> ReplaySummary:
     """Put a bag through tracker and model without a graph, and judge what they made of it.
 
     `output` is made at the end, whole or not at all: `bag/`, `summary.json` and `summary.png`. The bag holds pose
@@ -89,7 +87,8 @@ def replay_offline(
             duration=given.duration,
             progress=progress,
         )
-        tally, refused = Tally(given.setup.model.thread_length), Counter[str]()
+        metrics = RunMetrics(given.setup.model.thread_length, given.recording.start)
+        refused = Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
             begin_with_scene(bag, given)
             steps, made = (
@@ -100,16 +99,16 @@ def replay_offline(
             for step in steps:
                 made.write(step)
                 if step.outcome.prediction is not None:
-                    tally.take(step.sight, step.outcome.prediction, step.margins, step.step_time)
+                    predicted = step.outcome.prediction
+                    metrics.add(FrameResult.of(step.sight, predicted, step.margins, step.step_time))
                 elif step.outcome.problem is not None:
                     refused[_kind(step.outcome.problem)] += 1
             taken = time.perf_counter() - began
         say(f"{given.duration / taken:.3g} times as fast as it was recorded; judging what came out")
-        summary, remark = _summary(given, seen, tally, refused, given.duration / taken), seen.thread_problem()
+        summary, remark = _summary(given, seen, metrics, refused, given.duration / taken), seen.thread_problem()
         if remark:
             say(remark)
-        assert tally.worst is not None
-        write_results(folder, given, tally.instants, tally.worst, summary, say)
+        write_results(folder, given, metrics, summary, say)
         return summary
 
 
@@ -120,48 +119,31 @@ def _kind(problem: Exception) -> str:
     return NOT_NEWER if problem.field == "needle pose stamp" else f"a {problem.field} that cannot be used"
 
 
-def _summary(given: Given, seen: Sights, tally: Tally, refused: Counter[str], speed: float) -> Summary:
+def _summary(given: Given, seen: Sights, metrics: RunMetrics, refused: Counter[str], speed: float) -> ReplaySummary:
     """Return the figures.
 
     Raises:
         BagError: nothing was predicted.
     """
     refused = refused + seen.refused + given.recording.refused
-    instants = tally.instants
-    if not instants:
+    if not len(metrics.series):
         words = "; ".join(f"{count} times {why}" for why, count in refused.most_common()) or WAITING
+        things = "frames" if given.source == "camera" else "poses"
         raise BagError(
-            given.recording.path,
-            f"gave no prediction: {seen.found} of {seen.count} {_things(given.source)} had a needle; {words}",
+            given.recording.path, f"gave no prediction: {seen.found} of {seen.count} {things} had a needle; {words}"
         )
-    return Summary(
-        bag=str(given.recording.path),
-        setup=given.setup.name,
-        simulated=given.recording.notes.get("simulated", ""),
+    return replay_summary(
+        given,
+        metrics,
         frames=seen.count,
         tracked=seen.found,
-        predicted=len(instants),
         commands=0,
         driven=0,
         latency={},
-        step_time=Spread.of([instant.step_time for instant in instants]),
-        least_margins=tally.least_margins(given.recording.start),
-        contact_frames=tally.contact_frames,
-        stretch=max(instant.stretch for instant in instants),
-        residual=max(instant.residual for instant in instants),
-        seen_share=float(np.mean([instant.seen_share for instant in instants])),
-        error_seen=error_figures([instant.error_seen for instant in instants]),
-        error_truth=error_figures([instant.error_truth for instant in instants]),
-        source=given.source,
         speed=speed,
         refused=dict(refused.most_common()),
-        damage=str(given.recording.damage or ""),
         remark=seen.thread_problem(),
     )
-
-
-def _things(source: str) -> str:
-    return "frames" if source == "camera" else "poses"
 
 
 class _Output:
@@ -200,7 +182,7 @@ class _Output:
             self._bag.write(NEEDLE_POSE.recorded, max(stamp, 0), pose)
             if len(seen.centreline):
                 self._bag.write(SEEN_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
-        self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), messages.tracker_state(stamp, track))
+        self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), MESSAGES.tracker_state(stamp, track))
 
     def _record(self, stamp: int, record: Record) -> None:
         if record.topic == SCENE.recorded:

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory
+from magnetosuture_thread.evaluation.reference_scores import (
+    CaseResult,
+    Evaluation,
+    Progress,
+    StepFigures,
+    run_case,
+    score_each,
+)
 from magnetosuture_thread.rig.mechanics.dynamics import Attachment, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.study.evaluation import CaseScore, Course, Evaluation, Progress, resampled, score_each
-from magnetosuture_thread.study.reference import NOT_ONE, ReferenceTrajectory
 
 SEGMENTS = 100
 FORMULATION, SOLVER = "rig", "newton"
@@ -25,7 +31,7 @@ def score_rig(
     paths: Sequence[Path],
     segments: int | None = None,
     progress: Progress = lambda share: None,
-    keep: Callable[[Course], None] = lambda course: None,
+    keep: Callable[[CaseResult], None] = lambda result: None,
 ) -> Evaluation:
     """Drive the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
 
@@ -36,68 +42,35 @@ def score_rig(
         paths: the trajectories.
         segments: n, 100 unless given.
         progress: is told the share done.
-        keep: is given each case's course.
+        keep: is given each case's result.
 
     Raises:
         BagError: a file is no reference trajectory.
         SolverError: a step could not be solved.
     """
 
-    def one(reference: ReferenceTrajectory, path: Path, share: Progress) -> Course:
-        return score_rig_on(reference, path, segments or SEGMENTS, share)
+    def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
+        thread = rig_thread(reference, path, segments or SEGMENTS)
+        surface, heading = Surface(discs=reference.discs), float(reference.headings[0])
+        rig = RigDynamics(DRIVEN, thread, surface, None, reference.tails[0], heading, reference.threads[0])
+        speed = np.linalg.norm(np.diff(reference.tails, axis=0), axis=1) / np.diff(reference.times)
+        force = thread.drag_across * thread.length * max(float(speed.max()), 1e-6)
 
-    return Evaluation(FORMULATION, SOLVER, score_each(paths, one, progress, keep))
+        def step(index: int) -> RigDynamics:
+            interval = reference.times[index] - reference.times[index - 1]
+            rig.drive(reference.tails[index], float(reference.headings[index]), interval)
+            return rig
 
+        def figures(rig: RigDynamics) -> StepFigures:
+            strain = max(0.0, float(rig.tension.max()) / thread.stretching_stiffness)
+            return StepFigures(rig.thread, strain, rig.residual / force, rig.halvings)
 
-def score_rig_on(reference: ReferenceTrajectory, path: Path, segments: int, progress: Progress) -> Course:
-    """Score the rig's thread on one trajectory; see `score_rig`.
+        return run_case(reference, rig.thread, thread.length, thread.diameter, step, figures, share)
 
-    Source: reference set, "How a prediction is scored". Deviation: none.
-    """
-    properties = thread_of(reference, path, segments)
-    truth = np.stack([resampled(curve, segments) for curve in reference.threads])
-    rig = RigDynamics(
-        DRIVEN,
-        properties,
-        Surface(discs=reference.discs),
-        None,
-        reference.tails[0],
-        float(reference.headings[0]),
-        reference.threads[0],
-    )
-    count = len(reference.times)
-    vertices, took = np.empty_like(truth), np.zeros(count)
-    vertices[0] = rig.thread
-    stretch, depth, residual, halvings = 0.0, 0.0, 0.0, 0
-    speed = np.linalg.norm(np.diff(reference.tails, axis=0), axis=1) / np.diff(reference.times)
-    for k in range(1, count):
-        began = time.perf_counter()
-        rig.drive(reference.tails[k], float(reference.headings[k]), reference.times[k] - reference.times[k - 1])
-        took[k] = time.perf_counter() - began
-        vertices[k] = rig.thread
-        stretch = max(stretch, float(rig.tension.max()) / properties.stretching_stiffness)
-        residual, halvings = max(residual, rig.residual), halvings + rig.halvings
-        for disc in reference.discs:
-            outside = disc.signed_distance(vertices[k, 1:])[0] - 0.5 * properties.diameter
-            depth = max(depth, -float(outside.min()))
-        if k % 50 == 0:
-            progress(k / count)
-    error = 100.0 * np.linalg.norm(vertices[:, 1:] - truth[:, 1:], axis=2).mean(axis=1) / properties.length
-    figures = CaseScore(
-        name=reference.name,
-        mean_error_percent=float(error.mean()),
-        max_error_percent=float(error.max()),
-        max_stretch=stretch,
-        max_penetration_m=depth,
-        step_median_s=float(np.median(took[1:])),
-        step_p99_s=float(np.percentile(took[1:], 99)),
-        max_residual=residual / (properties.drag_across * properties.length * max(float(speed.max()), 1e-6)),
-        fallbacks=halvings,
-    )
-    return Course(reference, vertices, error, figures)
+    return Evaluation(FORMULATION, SOLVER, score_each(paths, score_case, progress, keep))
 
 
-def thread_of(reference: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
+def rig_thread(reference: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
     """Return the thread that a trajectory's metadata describes.
 
     Raises:

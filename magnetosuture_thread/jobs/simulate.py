@@ -14,11 +14,11 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.evaluation.closed_loop import LoopCollector, LoopSummary
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.interface import CAMERA, NODES, PROCESSES, SCENE, SCENE_MARKERS, SCENE_SERVER, TIP_SETPOINT
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.study.loop import LoopCollector, LoopSummary
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.coil_client import CoilClient

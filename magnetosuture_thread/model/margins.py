@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,3 +114,17 @@ def _touching(barriers: Sequence[BarrierRows], tolerance: float) -> tuple[int, .
     """Return the nodes that are this close to an obstacle or the wall, rising."""
     near = [rows for rows in barriers if rows.kind in TOUCHABLE and len(rows.value)]
     return tuple(sorted({node for rows in near for node in rows.nodes[rows.clearance <= tolerance, -1].tolist()}))
+
+
+def node_clearance(margins: Any, count: int) -> NDArray[np.float64]:
+    """Return the minimum clearance of an obstacle or the wall for each of `count` nodes [m]; inf where none is near.
+
+    Args:
+        margins: `Margins`, or a message SafetyMargins.
+        count: of nodes, more than the greatest index in the margins.
+    """
+    clearance = np.full(count, np.inf)
+    near = np.isin(np.asarray(margins.kind, dtype=np.uint8), TOUCHABLE)
+    nodes = np.asarray(margins.node, dtype=np.intp)
+    np.minimum.at(clearance, nodes[near], np.asarray(margins.clearance)[near])
+    return clearance

@@ -16,7 +16,8 @@ from magnetosuture_thread.coils.drivers import make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.station import CoilStation
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_report import CoilReport
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import run
@@ -103,8 +104,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if self.station.bridge is None:
             return
         try:
-            pose = messages.needle_pose(message)
-            covariance = messages.pose_covariance(message)
+            pose = reading.needle_pose(message)
+            covariance = reading.pose_covariance(message)
             self.station.bridge.needle.see(pose.tail, pose.heading, pose.stamp, number, *self._times(), covariance)
         except UNUSABLE as error:
             self._report.refuse(error)
@@ -114,7 +115,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if self.station.bridge is None:
             return
         try:
-            stamp, arrival = messages.seconds(message.header.stamp), self._times()[1]
+            stamp, arrival = reading.seconds(message.header.stamp), self._times()[1]
             self.station.bridge.on_margins(stamp, message.valid, message.slowdown, message.scene_version, arrival)
         except UNUSABLE as error:
             self._report.refuse(error)
@@ -132,8 +133,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if self.station.bridge is None:
             return
         try:
-            velocity = messages.plane_velocity(message, INPUTS[source])
-            stamp = messages.checked_nanoseconds(message.header.stamp, INPUTS[source]) * 1e-9
+            velocity = reading.plane_velocity(message, INPUTS[source])
+            stamp = reading.checked_nanoseconds(message.header.stamp, INPUTS[source]) * 1e-9
             self.station.bridge.command(source, velocity, stamp, number, *self._times())
         except UNUSABLE as error:
             self._report.refuse(error)

@@ -11,8 +11,9 @@ from rclpy.node import Node
 from magnetosuture_thread.coils.bridge import Outcome
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.station import CoilStation
-from magnetosuture_thread.nodes import coil_messages, messages, topics
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.messages import MESSAGES
 
 FAULT = "fault: "
 SCHEDULING = "scheduling"
@@ -50,7 +51,7 @@ class CoilReport:
 
     def to_rig(self, currents: np.ndarray) -> None:
         """Send currents to the simulated rig."""
-        header = messages.header(self._node.get_clock().now().to_msg())
+        header = MESSAGES.header(self._node.get_clock().now().to_msg())
         self._rig.publish(CoilCurrents(header=header, current=currents.tolist()))
 
     def rigs(self) -> int:
@@ -70,9 +71,9 @@ class CoilReport:
     def applied(self, command: Time | None, outcome: Outcome) -> None:
         """Say what the coils were told; `command` is the stamp of the command that they follow, if they do."""
         stamp = self._node.get_clock().now().to_msg()
-        self._currents.publish(coil_messages.currents_message(stamp, command, outcome))
-        self._setpoints.publish(messages.twist_message(stamp, outcome.applied))
-        self._filter.publish(coil_messages.filter_message(command or stamp, outcome))
+        self._currents.publish(MESSAGES.currents_message(stamp, command, outcome))
+        self._setpoints.publish(MESSAGES.twist_message(stamp, outcome.applied))
+        self._filter.publish(MESSAGES.filter_message(command or stamp, outcome))
 
     def state(self, *, anyway: bool) -> None:
         """Publish the state if it has changed, or anyway."""
@@ -94,9 +95,9 @@ class CoilReport:
         if not changed and not anyway:
             return
         stamp = self._node.get_clock().now().to_msg()
-        self._states.publish(coil_messages.state_message(stamp, station, driver, self._refused))
+        self._states.publish(MESSAGES.state_message(stamp, station, driver, self._refused))
         if outcome is not None and not outcome.publish:
-            self._filter.publish(coil_messages.filter_message(stamp, outcome))
+            self._filter.publish(MESSAGES.filter_message(stamp, outcome))
         self._health.note(
             **{key: round(value, 3) for key, value in zip(LOOP, station.rhythm.milliseconds, strict=True)}
         )

@@ -12,9 +12,10 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.nodes import console_messages, messages, topics
+from magnetosuture_thread.nodes import console_messages, topics
 from magnetosuture_thread.nodes.console_inbox import Inbox, Latest
 from magnetosuture_thread.nodes.console_switches import ACTIONS, ConsoleSwitches
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.vision.images import unpack_image
@@ -89,7 +90,7 @@ class ConsoleGraph:
     def steer(self, velocity: tuple[float, float]) -> None:
         """Publish the operator's wish now; while the graph is held, nothing."""
         if not self.held:
-            self._commands.publish(messages.twist_message(self.now().to_msg(), np.asarray(velocity, dtype=float)))
+            self._commands.publish(MESSAGES.twist_message(self.now().to_msg(), np.asarray(velocity, dtype=float)))
 
     async def act(self, action: str) -> str:
         """Arm, disarm, stop or reset; return an empty text, or the refusal.

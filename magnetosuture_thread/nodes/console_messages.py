@@ -8,7 +8,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3
 from magnetosuture_msgs.msg import (
-    BarrierMargin,
     CoilBridgeState,
     FilterState,
     PredictedThread,
@@ -20,9 +19,11 @@ from nav_msgs.msg import Path
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.orientation import angle_of
-from magnetosuture_thread.nodes.messages import needle_pose
+from magnetosuture_thread.messages.reading import needle_pose
+from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.model.barriers import BarrierKind
+from magnetosuture_thread.model.margins import node_clearance
 from magnetosuture_thread.scene import Scene, SceneShape
-from magnetosuture_thread.scene.messages import scene_of
 
 DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
 
@@ -43,14 +44,7 @@ FRICTION = {
     SafetyMargins.FRICTION_PULLED: "pulled",
     SafetyMargins.FRICTION_RESTING: "resting",
 }
-KINDS = {
-    BarrierMargin.KIND_CONNECTIVITY: "connectivity",
-    BarrierMargin.KIND_COMPRESSION: "compression",
-    BarrierMargin.KIND_OBSTACLE: "obstacle",
-    BarrierMargin.KIND_ENHANCED_CONNECTIVITY: "enhanced_connectivity",
-    BarrierMargin.KIND_STIFFNESS: "stiffness",
-    BarrierMargin.KIND_WALL: "wall",
-}
+KINDS = {int(kind): kind.name.lower() for kind in BarrierKind}
 LEVELS = {
     DiagnosticStatus.OK: "ok",
     DiagnosticStatus.WARN: "warn",
@@ -116,12 +110,7 @@ def margins(message: SafetyMargins) -> dict[str, Any]:
 
 def clearances(message: SafetyMargins) -> list[float | None]:
     """Return each node's least clearance of the wall and any shape [m]; None where none is near."""
-    nodes = np.asarray(message.node, dtype=np.intp)
-    if not nodes.size:
-        return []
-    least = np.full(int(nodes.max()) + 1, np.inf)
-    near = np.isin(np.asarray(message.kind, dtype=np.uint8), (BarrierMargin.KIND_OBSTACLE, BarrierMargin.KIND_WALL))
-    np.minimum.at(least, nodes[near], np.asarray(message.clearance)[near])
+    least = node_clearance(message, max(message.node, default=-1) + 1)
     return [value if value < np.inf else None for value in least.tolist()]
 
 

@@ -10,8 +10,10 @@ from rclpy.node import Node
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
-from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
@@ -57,14 +59,14 @@ class PathFollowerNode(Node):
             self._health.warn(some if audience else "nobody takes velocity commands")
             return
         try:
-            pose = messages.needle_pose(message)
+            pose = reading.needle_pose(message)
             wish = self._follower.follow(pose.stamp, pose.tail, pose.heading)
         except InvalidInputError as error:
             self._health.refuse(error)
             return
-        self._commands.publish(messages.twist_message(self.get_clock().now().to_msg(), wish.velocity))
+        self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), wish.velocity))
         if 0.0 < wish.progress < 1.0:
-            self._setpoints.publish(messages.placed(message.header.stamp, wish.tip, 0.0))
+            self._setpoints.publish(MESSAGES.placed(message.header.stamp, wish.tip, 0.0))
         text = "done" if wish.progress >= 1.0 else "following" if wish.progress else "settling"
         self._health.ok(text, progress=round(wish.progress, 4))
 

@@ -17,8 +17,9 @@ from std_srvs.srv import SetBool
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, PAUSE_REPLAY, SCENE
-from magnetosuture_thread.nodes import messages, topics
-from magnetosuture_thread.nodes.coil_messages import command_stamp
+from magnetosuture_thread.messages.cdr import header_stamp
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import command_stamp
 from magnetosuture_thread.nodes.replay_losses import Losses
 from magnetosuture_thread.nodes.replay_time import Timeline
 
@@ -180,7 +181,7 @@ class LiveReplay:
             self.play(records(), lambda time: None)
 
     def _publish(self, publisher: Any, record: Recorded) -> None:
-        name, stamp = record.topic.lstrip("/"), messages.header_stamp(record.data)
+        name, stamp = record.topic.lstrip("/"), header_stamp(record.data)
         now = time.time()
         publisher.publish(record.data)
         self.losses.played[name] += 1
@@ -237,7 +238,7 @@ class LiveReplay:
 
         def take(data: bytes, info: dict[str, Any]) -> None:
             self._taken += 1
-            stamp = command_stamp(data) if topic.channel is CURRENTS else messages.header_stamp(data)
+            stamp = command_stamp(data) if topic.channel is CURRENTS else header_stamp(data)
             if stamp is not None:
                 # When it reached this process: how long it waited here for its turn is not the graph's delay.
                 self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from rclpy.node import Node
 from rclpy.time import Time
 
-from magnetosuture_thread.nodes import camera_messages, messages, topics
+from magnetosuture_thread.messages.cdr import time_of
+from magnetosuture_thread.messages.packing import packed_path
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.rig import Frame
 from magnetosuture_thread.rig.settings import RigSettings
@@ -27,22 +30,21 @@ class FramePublisher:
         self._info = topics.CAMERA_INFO.publisher(node)
         self._needle = topics.TRUE_NEEDLE.publisher(node)
         self._thread = topics.TRUE_THREAD.publisher(node)
-        self._path = messages.PathMaker()
         self.take(camera)
 
     def take(self, camera: DishCamera) -> None:
         """Publish frames of another camera from now on."""
-        self._camera = camera_messages.camera_info(Time().to_msg(), camera.size, camera.view, self._distance)
+        self._camera = MESSAGES.camera_info(Time().to_msg(), camera.size, camera.view, self._distance)
 
     def publish(self, nanoseconds: int, frame: Frame) -> None:
         """Publish a frame with its stamp [ns]; one that got lost has its truth all the same."""
         stamp = Time(nanoseconds=nanoseconds).to_msg()
         if frame.image is not None:
             data = encode_jpeg(frame.image, self._quality)
-            self._compressed.publish(camera_messages.compressed_image(stamp, data))
+            self._compressed.publish(MESSAGES.compressed_image(stamp, data))
             if self._raw.get_subscription_count():
-                self._raw.publish(camera_messages.image(stamp, frame.image))
+                self._raw.publish(MESSAGES.image(stamp, frame.image))
             self._camera.header.stamp = stamp
             self._info.publish(self._camera)
-        self._needle.publish(messages.placed(stamp, frame.tail, frame.heading))
-        self._thread.publish(self._path.message(stamp, frame.thread))
+        self._needle.publish(MESSAGES.placed(stamp, frame.tail, frame.heading))
+        self._thread.publish(packed_path(time_of(nanoseconds), frame.thread))

@@ -13,9 +13,9 @@ from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
-from magnetosuture_thread.nodes.scene_messages import scene_markers, scene_message
 from magnetosuture_thread.scene import Scene, read_scene
 from magnetosuture_thread.scene.editing import SceneEditor
 from magnetosuture_thread.scene.settings import SceneServerSettings
@@ -62,8 +62,8 @@ class SceneServerNode(Node):
 
     def _publish(self, scene: Scene) -> None:
         stamp = self.get_clock().now().to_msg()
-        self._scenes.publish(scene_message(stamp, scene))
-        self._markers.publish(scene_markers(stamp, scene))
+        self._scenes.publish(MESSAGES.scene_message(stamp, scene))
+        self._markers.publish(MESSAGES.scene_markers(stamp, scene))
         count = len(scene.shapes)
         text = f"scene {scene.version}: dish of {1e3 * scene.dish.diameter:g} mm, {count} shape{'s' * (count != 1)}"
         self._health.ok(text, version=scene.version, shapes=", ".join(scene.names) or "none")

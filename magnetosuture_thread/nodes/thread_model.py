@@ -13,21 +13,22 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.cdr import header_stamp, time_of
+from magnetosuture_thread.messages.packing import packed_margins, packed_markers, packed_prediction
 from magnetosuture_thread.model.friction import UNKNOWN
 from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, Outcome, ThreadSession
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
-from magnetosuture_thread.nodes import messages, thread_messages, topics
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.messages import decoded
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
-from magnetosuture_thread.packing.layout import time_of
-from magnetosuture_thread.packing.markers import packed_markers
-from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
 from magnetosuture_thread.scene import Scene
 
 
@@ -74,16 +75,16 @@ class ThreadModelNode(Node):
 
         No margin is published that is not proven.
         """
-        self._step(message.header.stamp, lambda: messages.needle_pose(message))
+        self._step(message.header.stamp, lambda: reading.needle_pose(message))
 
     def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
         """Take a pose that a tracker hands over, with the same result as that of its message."""
-        self._step(stamp, lambda: messages.tracked_pose(stamp, tail, heading))
+        self._step(stamp, lambda: reading.tracked_pose(stamp, tail, heading))
 
     def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
         began = time.perf_counter()
         try:
-            outcome = self._session.on_pose(messages.nanoseconds(stamp), pose())
+            outcome = self._session.on_pose(reading.nanoseconds(stamp), pose())
         except InvalidInputError as error:
             self._health.refuse(error)
             return
@@ -95,11 +96,11 @@ class ThreadModelNode(Node):
         Most are not needed, and to read a path of a hundred poses takes as long as some predictions: so
         only the stamp is read of those.
         """
-        stamp = messages.header_stamp(data) or 0
+        stamp = header_stamp(data) or 0
         if not self._session.wants_seen(stamp):
             return
         try:
-            centreline = messages.path_points(thread_messages.decoded(topics.SEEN_THREAD, data))
+            centreline = reading.path_points(decoded(topics.SEEN_THREAD, data))
         except InvalidInputError as error:
             self._health.refuse(error)
             return
@@ -107,7 +108,7 @@ class ThreadModelNode(Node):
 
     def on_measured_thread(self, stamp: Time, centreline: np.ndarray) -> None:
         """Take a seen thread that a tracker hands over."""
-        self._start(messages.nanoseconds(stamp), centreline)
+        self._start(reading.nanoseconds(stamp), centreline)
 
     def _start(self, stamp: int, centreline: np.ndarray) -> None:
         began = time.perf_counter()

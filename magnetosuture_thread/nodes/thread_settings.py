@@ -8,10 +8,12 @@ from rclpy.node import Node
 
 from magnetosuture_thread.configuration import described
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.nodes import thread_messages, topics
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.messages import decoded
 from magnetosuture_thread.nodes.parameters import Changeable
 
 LARGEST = 1 << 18  # bytes of a message; what is larger is not even read
@@ -39,7 +41,7 @@ class ThreadSettings:
         try:
             if len(data) > LARGEST:
                 raise InvalidInputError(topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {LARGEST}")
-            self._parameters.set(thread_messages.material_values(thread_messages.decoded(topics.MATERIAL, data)))
+            self._parameters.set(changes.told_material(decoded(topics.MATERIAL, data)))
         except MagnetosutureError as error:
             self._health.refuse(error)
 

@@ -15,13 +15,15 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import CAMERA
-from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.packing import packed_path, packed_pose
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
-from magnetosuture_thread.packing.needle import packed_path, packed_pose
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.look import State, no_pose
@@ -100,7 +102,7 @@ class VisionTrackerNode(Node):
         if self._session is not None and self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
-            self._states.publish(messages.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
+            self._states.publish(MESSAGES.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
             self._health.warn(f"{reason}; before that {self._words}")
 
     def _arrival(self) -> float:
@@ -110,7 +112,7 @@ class VisionTrackerNode(Node):
         self._last_frame = self._arrival()
         stamp, taken = message.header.stamp, 0.0
         if self._session is None:
-            self._states.publish(messages.tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
+            self._states.publish(MESSAGES.tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
             self._health.warn(NO_SCENE)
             return
         try:
@@ -119,7 +121,7 @@ class VisionTrackerNode(Node):
             seen = self._session.on_broken(error)
         else:
             began = time.perf_counter()
-            seen = self._session.on_image(messages.seconds(stamp), image)
+            seen = self._session.on_image(reading.seconds(stamp), image)
             taken = time.perf_counter() - began
         track = seen.track
         if seen.tracked:
@@ -132,7 +134,7 @@ class VisionTrackerNode(Node):
                 self._threads.publish(packed_path(when, seen.centreline))
                 for follower in self._followers:
                     follower.on_measured_thread(stamp, seen.centreline)
-        self._states.publish(messages.tracker_state(stamp, track, 0.0 if seen.problem else taken))
+        self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))
         values = {"frames": self._session.frames, "tracked": self._session.tracked}
         if seen.problem is not None:
             self._health.refuse(seen.problem, **values)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.interface import MATERIAL, SCENE
+from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.messages import scene_of
 
 CHANGING = (SCENE, MATERIAL)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, MagnetosutureError
+from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.interface import CAMERA, COMPRESSED_IMAGE, NEEDLE_POSE
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose
@@ -21,7 +22,6 @@ from magnetosuture_thread.offline.changes import changed
 from magnetosuture_thread.offline.sights import Sights
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
-from magnetosuture_thread.study.sight import Sight
 
 SOURCES = ("auto", "camera", "poses")
 Progress = Callable[[float], None]
@@ -85,7 +85,7 @@ class Step:
         scene: in force.
     """
 
-    sight: Sight
+    sight: Observation
     outcome: Outcome
     margins: Margins | None
     step_time: float
@@ -93,7 +93,7 @@ class Step:
     scene: Scene | None
 
 
-def predictions(given: Iterable[Sight], settings: ThreadModelSettings, scene: Scene | None) -> Iterator[Step]:
+def predictions(given: Iterable[Observation], settings: ThreadModelSettings, scene: Scene | None) -> Iterator[Step]:
     """Predict the thread over one run, as `thread_model` does.
 
     What the bag of `sights` says of scene and thread is taken as it comes. A pose before the thread is first seen
@@ -111,10 +111,10 @@ def predictions(given: Iterable[Sight], settings: ThreadModelSettings, scene: Sc
     return _steps(given, ThreadSession(settings, scene))
 
 
-def _steps(given: Iterable[Sight], session: ThreadSession) -> Iterator[Step]:
-    waiting: dict[int, Sight] = {}
+def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Step]:
+    waiting: dict[int, Observation] = {}
 
-    def step(sight: Sight, outcome: Outcome, began: float) -> Step:
+    def step(sight: Observation, outcome: Outcome, began: float) -> Step:
         taken = time.perf_counter() - began
         if outcome.waiting:
             waiting[outcome.stamp] = sight

@@ -12,15 +12,15 @@ import numpy as np
 from magnetosuture_thread.bags.reader import Record
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError, MagnetosutureError
+from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.orientation import as_told
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE, SEEN_THREAD, TRUE_THREAD, Channel
+from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
+from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.model.session import EARLY
 from magnetosuture_thread.offline.changes import CHANGING
-from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
-from magnetosuture_thread.scene.messages import scene_of
 from magnetosuture_thread.setups import Setup
-from magnetosuture_thread.study.sight import Sight
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.session import Seen, TrackerSession
 from magnetosuture_thread.vision.warm_up import warm_up
@@ -39,7 +39,7 @@ _TRUE, _SEEN = TRUE_THREAD.recorded, SEEN_THREAD.recorded
 _NOTHING = np.empty((0, 2))
 
 
-class Sights(Iterator[Sight]):
+class Sights(Iterator[Observation]):
     """Goes through a bag; see `sights`. A few sights are held at a time, however long the bag is.
 
     Attributes:
@@ -87,7 +87,7 @@ class Sights(Iterator[Sight]):
         awaited = {TRUE_THREAD, SEEN_THREAD} & set(channels)
         self._going = self._go(_telling(records, begin, whole, progress), awaited)
 
-    def __next__(self) -> Sight:
+    def __next__(self) -> Observation:
         """Return the next sight.
 
         Raises:
@@ -112,9 +112,9 @@ class Sights(Iterator[Sight]):
             f"shorter than {SHORTEST:g} times the set-up's {self._length:g} m: is it another thread?"
         )
 
-    def _go(self, records: Iterator[Record], awaited: set[Channel]) -> Iterator[Sight]:
+    def _go(self, records: Iterator[Record], awaited: set[Channel]) -> Iterator[Observation]:
         """Give a sight once what belongs to it has come, or cannot be expected any more."""
-        waiting: deque[Sight | Record] = deque()
+        waiting: deque[Observation | Record] = deque()
         parts: dict[str, dict[int, Points]] = {channel.recorded: {} for channel in awaited}
         for record in records:
             if record.topic in parts:
@@ -145,7 +145,7 @@ class Sights(Iterator[Sight]):
             return  # counted and reported where the model takes it
         self._scene = scene
 
-    def _next(self, head: Sight | Record, parts: dict[str, dict[int, Points]]) -> Iterator[Sight]:
+    def _next(self, head: Observation | Record, parts: dict[str, dict[int, Points]]) -> Iterator[Observation]:
         if isinstance(head, Record):
             self._changes.append(head)
         else:
@@ -171,15 +171,15 @@ class Sights(Iterator[Sight]):
         if len(known) > 2 * EARLY:  # of a frame that never came
             del known[next(iter(known))]
 
-    def _whole(self, sight: Sight, parts: dict[str, dict[int, Points]]) -> Sight:
+    def _whole(self, sight: Observation, parts: dict[str, dict[int, Points]]) -> Observation:
         truth = parts.get(_TRUE, {}).get(sight.stamp, _NOTHING)
         seen = parts.get(_SEEN, {}).get(sight.stamp, _NOTHING)
         if not len(truth) and not len(seen):
             return sight
         seen = seen if self.source == "poses" else sight.seen
-        return Sight(sight.stamp, sight.tail, sight.heading, seen, truth, sight.reason, sight.processing)
+        return Observation(sight.stamp, sight.tail, sight.heading, seen, truth, sight.reason, sight.processing)
 
-    def _pose(self, record: Record) -> Sight:
+    def _pose(self, record: Record) -> Observation:
         """Return what a recorded pose says."""
         self.count += 1
         stamp = stamp_of(record)
@@ -188,12 +188,12 @@ class Sights(Iterator[Sight]):
             tail, heading = read_pose(record)
         except InvalidInputError as error:
             self.refused[NO_POSE] += 1
-            return Sight(stamp, reason=str(error))
+            return Observation(stamp, reason=str(error))
         self._check_place(record.topic, tail)
         self.found += 1
-        return Sight(stamp, tail, heading, _NOTHING, _NOTHING)
+        return Observation(stamp, tail, heading, _NOTHING, _NOTHING)
 
-    def _frame(self, record: Record) -> Sight:
+    def _frame(self, record: Record) -> Observation:
         """Return what a camera frame says, as `thread_model` would get it."""
         assert self._tracker is not None
         self.count += 1
@@ -213,10 +213,10 @@ class Sights(Iterator[Sight]):
         self.on_frame(stamp, seen)
         if not seen.tracked:
             self.refused[kind] += 1
-            return Sight(stamp, reason=seen.track.reason, processing=taken)
+            return Observation(stamp, reason=seen.track.reason, processing=taken)
         self.found += 1
         heading = as_told(seen.track.heading, NEEDLE_POSE.name)
-        return Sight(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
+        return Observation(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
 
     def _check_place(self, topic: str, points: Points) -> None:
         """Refuse what is farther away than the dish is wide."""

@@ -15,15 +15,15 @@ from rich.table import Table
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.closed_loop import LoopSummary
+from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.simulate import judge, simulate
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.study.loop import LoopSummary
-from magnetosuture_thread.study.picture import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
-from magnetosuture_thread.study.replayed import Instant
 from magnetosuture_thread.vision.images import decode_image
 
 TESTS = ("petri_35mm_polyamide", "petri_150mm_silk")
@@ -51,7 +51,7 @@ class BehaviorRun:
 
     name: str
     summary: LoopSummary
-    instants: Sequence[Instant]
+    instants: Sequence[FrameResult]
     frames: dict[int, NDArray[np.uint8]]
     view: DishView
     dish_diameter: float
@@ -151,7 +151,7 @@ def behavior_table(runs: Sequence[BehaviorRun]) -> Table:
     return table
 
 
-def chosen_instants(instants: Sequence[Instant]) -> list[Instant]:
+def chosen_instants(instants: Sequence[FrameResult]) -> list[FrameResult]:
     """Return the instants to show: spread evenly over the run, the last among them."""
     at = np.linspace(0, len(instants) - 1, SHOWN + 1).round().astype(int)[1:]
     return [instants[index] for index in at]
@@ -202,7 +202,7 @@ def _draw_row(figure: Figure, run: BehaviorRun, bottom: float, height: float) ->
     tidy(plot)
 
 
-def _draw_instant(axes: Axes, run: BehaviorRun, instant: Instant, time: float) -> None:
+def _draw_instant(axes: Axes, run: BehaviorRun, instant: FrameResult, time: float) -> None:
     draw_threads(axes, run.frames[instant.stamp], run.view, instant, run.obstacles, magnified=0.8)
     centre = run.view.to_pixels(np.zeros(2))
     half = (0.5 + BORDER) * run.dish_diameter / run.view.metres_per_pixel

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from magnetosuture_thread.bags.headers import DISH_END, is_in_dish, stamp_and_frame
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.remap import remapping
@@ -29,6 +28,7 @@ from magnetosuture_thread.interface import (
     TRUE_NEEDLE,
     TRUE_THREAD,
 )
+from magnetosuture_thread.messages.cdr import DISH_END, is_in_dish, stamp_and_frame
 from test.bags.bags import STRING, make, stamped
 
 SECOND = 10**9

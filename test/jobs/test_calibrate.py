@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.jobs.calibrate import Request, calibrate, material_named, settings_of
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.calibration.parameters import stiffness_over_drag
-from magnetosuture_thread.study.reference import ReferenceTrajectory
-from test.study.calibration.runs import LENGTH, rig_run
+from test.calibration.runs import LENGTH, rig_run
 
 TRUE = 1.6e-9  # m^4/s; the material's is 1.3e-9
 SETUP = """\

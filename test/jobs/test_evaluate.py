@@ -15,9 +15,12 @@ import pytest
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag, Record
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.types import MESSAGES, typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.evaluation.bag_table import TIMES, Row
+from magnetosuture_thread.evaluation.report.pictures import Picture, draw_worst_frame
+from magnetosuture_thread.evaluation.series import WorstFrame
 from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
 from magnetosuture_thread.interface import CURRENTS, NEEDLE_POSE, PREDICTED_THREAD, SCENE, SEEN_THREAD, Channel
 from magnetosuture_thread.jobs import evaluate_bag as job
@@ -25,12 +28,7 @@ from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
 from magnetosuture_thread.jobs.evaluate_bag import Options
 from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions
 from magnetosuture_thread.jobs.replay_offline import replay_offline
-from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.scene.messages import scene_message
-from magnetosuture_thread.study.bag_table import TIMES, Row
-from magnetosuture_thread.study.report.moments import Moment
-from magnetosuture_thread.study.report.pictures import Picture, draw_moment
 
 
 def without_times(rows: list[Row]) -> list[Row]:
@@ -204,17 +202,17 @@ def test_a_picture_has_the_obstacles_that_were_in_force(
     tmp_path: Path, short_bag: Path, monkeypatch: pytest.MonkeyPatch
 ):
     post = Scene(Dish(0.035), (SceneShape("post", "instrument", ObstacleDisc((0.0, 0.012), 0.002)),))
-    data = bytes(typestore().serialize_cdr(scene_message(post, header(0), make), SCENE.type_name))
+    data = bytes(typestore().serialize_cdr(MESSAGES.scene_message(0, post), SCENE.type_name))
     bag = copied(short_bag, tmp_path / "changed", [(SCENE, Bag(short_bag).start, data)], leave=SCENE.recorded)
-    shown: list[Moment] = []
+    shown: list[WorstFrame] = []
 
-    def draw(moment: Moment, *arguments: Any, **named: Any) -> Picture:
-        shown.append(moment)
-        return draw_moment(moment, *arguments, **named)
+    def draw(worst: WorstFrame, *arguments: Any, **named: Any) -> Picture:
+        shown.append(worst)
+        return draw_worst_frame(worst, *arguments, **named)
 
-    monkeypatch.setattr(job, "draw_moment", draw)
+    monkeypatch.setattr(job, "draw_worst_frame", draw)
     evaluate_bags([bag], tmp_path / "out", Options(duration=0.4))
-    assert [moment.obstacles for moment in shown] == [(ObstacleDisc((0.0, 0.012), 0.002),)] * len(shown)
+    assert [worst.frame.obstacles for worst in shown] == [(ObstacleDisc((0.0, 0.012), 0.002),)] * len(shown)
     assert shown
     assert "Simulated camera frame at" in (tmp_path / "out" / "changed.html").read_text()
 

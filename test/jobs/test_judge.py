@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
@@ -15,9 +16,8 @@ from magnetosuture_thread.interface import SCENE
 from magnetosuture_thread.jobs.judge import opened
 from magnetosuture_thread.jobs.playing import Playing
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
-from magnetosuture_thread.offline.messages import header, make
+from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
-from magnetosuture_thread.scene.messages import scene_message, scene_of
 
 POST = Scene(Dish(0.035), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.001)),))
 OLD = "vision_tracker: {ros__parameters: {dish_diameter: 0.035}}\nthread_model: {ros__parameters: {length: 0.019}}\n"
@@ -37,7 +37,7 @@ def copied(short_bag: Path, tmp_path: Path):
             for time, topic, data in records:
                 while waiting and waiting[0][0] <= time:
                     at, scene = waiting.pop(0)
-                    message = scene_message(scene, header(at), make)
+                    message = MESSAGES.scene_message(at, scene)
                     message.version = version or message.version
                     writer.write_message(SCENE.recorded, at, message)
                 writer.write(topic, time, data)

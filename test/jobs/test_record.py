@@ -10,12 +10,12 @@ import pytest
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.record import record
-from magnetosuture_thread.scene.messages import scene_of
+from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.reference import ReferenceTrajectory
 from magnetosuture_thread.vision.images import decode_image
 
 

@@ -26,16 +26,15 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.types import make, typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.interface import IMAGE, MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, Channel
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.replay_offline import replay_offline
-from magnetosuture_thread.offline.messages import make
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.reference import ReferenceTrajectory
 from magnetosuture_thread.vision.images import decode_image
 
 pytestmark = pytest.mark.whole_graph

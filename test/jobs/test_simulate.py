@@ -16,10 +16,10 @@ from magnetosuture_thread.cli import main
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.simulate import simulate
+from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.reproduce.thread_behavior import thread_behavior
 from magnetosuture_thread.resources import setup_file
 from magnetosuture_thread.scene import read_scene
-from magnetosuture_thread.scene.messages import scene_of
 
 pytestmark = pytest.mark.whole_graph
 

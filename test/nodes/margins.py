@@ -8,7 +8,7 @@ from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.serialization import deserialize_message
 
-from magnetosuture_thread.packing.thread import packed_margins
+from magnetosuture_thread.messages.packing import packed_margins
 
 
 def no_margins(stamp: Time, reason: str) -> Any:

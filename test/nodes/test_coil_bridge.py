@@ -13,7 +13,8 @@ from magnetosuture_msgs.msg import CoilBridgeState
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
 from test.nodes.bridge import EAST, LONG, TAIL, applied, armed, command, drive, driven, reasons
 
 
@@ -46,7 +47,7 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
 def test_a_pose_that_cannot_be_does_not_end_the_bridge(graph, tail):
     node = armed(graph)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_POSE, messages.pose_message(graph.now(), np.array(tail), EAST))
+    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), np.array(tail), EAST))
     graph.publish(topics.NEEDLE_COMMAND, command(graph))
     graph.wait(lambda: any("the dish's centre" in str(d.status[0].values) for d in diagnostics), "a refusal")
     assert not driven(node)
@@ -90,7 +91,7 @@ def test_a_pose_that_grows_old_stops_the_coils_while_commands_go_on(graph):
 def test_a_bad_pose_is_not_used(graph, spoil):
     node = armed(graph, **LONG)
     states, diagnostics = graph.listen(topics.BRIDGE_STATE), graph.listen(topics.DIAGNOSTICS)
-    pose = messages.pose_message(graph.now(), np.zeros(2), EAST)
+    pose = MESSAGES.pose_message(graph.now(), np.zeros(2), EAST)
     spoil(pose)
     graph.publish(topics.NEEDLE_POSE, pose)
     graph.wait(lambda: any("needle/measured_cp" in str(d.status[0].values) for d in diagnostics), "a refusal")
@@ -131,7 +132,7 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
     """With /clock standing still the coils must stop all the same; before it runs nothing is good."""
     node = armed(graph, use_sim_time=True)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_COMMAND, messages.twist_message(Time(), np.array([0.01, 0.0])))
+    graph.publish(topics.NEEDLE_COMMAND, MESSAGES.twist_message(Time(), np.array([0.01, 0.0])))
     graph.wait(lambda: any("0 is none in ROS" in str(d.status[0].values) for d in diagnostics), "a refusal")
     now = Time(sec=50)
     clock = graph.probe.create_publisher(Clock, "/clock", topics.CLOCK.qos)
@@ -142,8 +143,8 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
         return bool(node.get_clock().now().nanoseconds == 50 * 10**9)
 
     graph.wait(running, "the time")
-    graph.publish(topics.NEEDLE_POSE, messages.pose_message(now, TAIL, EAST))
-    graph.publish(topics.NEEDLE_COMMAND, messages.twist_message(now, np.array([0.01, 0.0])))
+    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(now, TAIL, EAST))
+    graph.publish(topics.NEEDLE_COMMAND, MESSAGES.twist_message(now, np.array([0.01, 0.0])))
     graph.wait(lambda: driven(node), "a current")
     graph.wait(lambda: not applied(node)[-1].any(), "zero current")
 
@@ -163,7 +164,7 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
 def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
     node = armed(graph, pose_timeout=1.0)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_POSE, messages.pose_message(graph.now(), TAIL, EAST))
+    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), TAIL, EAST))
     bad = command(graph)
     spoil(bad)
     graph.publish(topics.NEEDLE_COMMAND, bad)

@@ -21,19 +21,13 @@ from rclpy.node import Node
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.jobs.console_hosts import SimulatedHost
-from magnetosuture_thread.nodes import (
-    camera_messages,
-    console_graph,
-    console_switches,
-    messages,
-    scene_messages,
-    thread_messages,
-    topics,
-)
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.nodes import console_graph, console_switches, topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console_graph import ConsoleGraph
 from magnetosuture_thread.nodes.console_host import GraphHost, joined
 from magnetosuture_thread.nodes.console_tap import ConsoleTap
+from magnetosuture_thread.nodes.messages import MESSAGES, decoded
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
@@ -87,7 +81,7 @@ def test_a_wish_is_published_at_once_with_a_stamp_of_now(graph, console):
     wish = wishes[0]
     assert (wish.twist.linear.x, wish.twist.linear.y) == (0.003, -0.001)
     assert wish.header.frame_id == "dish"
-    assert before <= messages.nanoseconds(wish.header.stamp) <= graph.probe.get_clock().now().nanoseconds
+    assert before <= reading.nanoseconds(wish.header.stamp) <= graph.probe.get_clock().now().nanoseconds
 
 
 def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
@@ -157,9 +151,9 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     stamp = graph.now()
     assert console.state()["needle"] is None
     assert console.state()["scene"] is None
-    scene = scene_messages.scene_message(stamp, read_scene("dish_35mm_post"))
-    pose = messages.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
-    path = messages.PathMaker().message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
+    scene = MESSAGES.scene_message(stamp, read_scene("dish_35mm_post"))
+    pose = MESSAGES.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
+    path = MESSAGES.path_message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
     margins = no_margins(stamp, "no pose")
     tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
@@ -182,10 +176,10 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
 def test_until_a_scene_is_heard_that_of_the_settings_is_shown(graph, node):
     console = ConsoleGraph(node, ConsoleSettings(scene="dish_150mm"))
     assert console.state()["scene"]["dish_diameter"] == 0.15
-    damaged = scene_messages.scene_message(graph.now(), read_scene("hernia_ring"))
+    damaged = MESSAGES.scene_message(graph.now(), read_scene("hernia_ring"))
     damaged.dish_depth *= 1.5
     graph.publish(topics.SCENE, damaged)
-    good = scene_messages.scene_message(graph.now(), read_scene("dish_35mm_post"))
+    good = MESSAGES.scene_message(graph.now(), read_scene("dish_35mm_post"))
     tell(graph, topics.SCENE, good, lambda: console.state()["scene"]["dish_diameter"] == 0.035, "the scene")
     with pytest.raises(ConfigurationError, match="scene: got 'nowhere'"):
         console.begin(ConsoleSettings(scene="nowhere"))
@@ -212,9 +206,9 @@ def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     done, jpeg = cv2.imencode(".jpg", pixels)
     assert done
     if transport == "raw":
-        topic, message = topics.IMAGE, camera_messages.image(graph.now(), pixels)
+        topic, message = topics.IMAGE, MESSAGES.image(graph.now(), pixels)
     else:
-        topic, message = topics.COMPRESSED_IMAGE, camera_messages.compressed_image(graph.now(), jpeg.ravel())
+        topic, message = topics.COMPRESSED_IMAGE, MESSAGES.compressed_image(graph.now(), jpeg.ravel())
     tell(graph, topic, message, console.frame, "a frame")
     first = console.frame()
     assert first is not None
@@ -238,7 +232,7 @@ def test_with_a_simulated_clock_wishes_are_stamped_by_it(graph):
             return bool(wishes)
 
         graph.wait(heard, "a wish")
-        assert messages.nanoseconds(wishes[0].header.stamp) <= rig.time.stamp(rig.time.elapsed()) < 1000e9
+        assert reading.nanoseconds(wishes[0].header.stamp) <= rig.time.stamp(rig.time.elapsed()) < 1000e9
 
 
 def test_a_rig_is_paused_where_there_is_one(graph, console):
@@ -276,7 +270,7 @@ def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: 
 
 def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_then_on(graph, node):
     graph.listen_later(topics.SCENE)
-    graph.publish(topics.SCENE, scene_messages.scene_message(graph.now(), read_scene("dish_35mm_post")))
+    graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), read_scene("dish_35mm_post")))
     taken: list[tuple[str, int, bytes]] = []
     tap = ConsoleTap(node, [topics.SCENE, topics.CURRENTS], None, lambda *message: taken.append(message))
 
@@ -291,7 +285,7 @@ def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_t
     said = {topic: (arrival, data) for topic, arrival, data in taken}
     arrival, data = said["/coils/currents"]
     assert abs(arrival * 1e-9 - time.time()) < 60.0
-    assert list(thread_messages.decoded(topics.CURRENTS, data).current) == [1.0, 2.0]
+    assert list(decoded(topics.CURRENTS, data).current) == [1.0, 2.0]
 
 
 def test_a_bridge_that_is_heard_says_all_that_the_page_shows(graph, console):

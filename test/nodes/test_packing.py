@@ -12,11 +12,11 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.packing import packed_markers, packed_path, packed_pose
 from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState, friction_colour
 from magnetosuture_thread.model.predictor import Prediction
-from magnetosuture_thread.nodes import messages
-from magnetosuture_thread.packing.markers import packed_markers
-from magnetosuture_thread.packing.needle import packed_path, packed_pose
+from magnetosuture_thread.nodes.messages import MESSAGES
 
 WHEN, STAMP = (12, 345), Time(sec=12, nanosec=345)
 
@@ -33,7 +33,7 @@ def same(data: bytes, expected: Any) -> None:
 def test_a_pose_is_packed_as_rclpy_makes_it(when: tuple[int, int], known: bool):
     covariance = np.arange(1.0, 10.0).reshape(3, 3) if known else None
     tail, heading = np.array([1e-3, -2e-3]), np.array([-0.6, 0.8])
-    expected = messages.pose_message(Time(sec=when[0], nanosec=when[1]), tail, heading, covariance)
+    expected = MESSAGES.pose_message(Time(sec=when[0], nanosec=when[1]), tail, heading, covariance)
     data = packed_pose(when, tail, heading, covariance)
     same(data, expected)
 
@@ -41,15 +41,15 @@ def test_a_pose_is_packed_as_rclpy_makes_it(when: tuple[int, int], known: bool):
 @pytest.mark.parametrize("count", [0, 1, 2, 64])
 def test_a_path_is_packed_as_rclpy_makes_it(count: int):
     points = np.random.default_rng(count).normal(size=(count, 2))
-    expected = messages.PathMaker().message(STAMP, points)
+    expected = MESSAGES.path_message(STAMP, points)
     data = packed_path(WHEN, points)
     same(data, expected)
 
 
 def marker(number: int, kind: int, scale: Vector3, friction: Friction, points: np.ndarray) -> Marker:
     """Return what rclpy makes of a marker."""
-    made = Marker(header=messages.header(STAMP), ns="thread", id=number, type=kind, action=Marker.ADD, scale=scale)
-    made.pose = messages.flat_pose(np.zeros(2), 0.0)
+    made = Marker(header=MESSAGES.header(STAMP), ns="thread", id=number, type=kind, action=Marker.ADD, scale=scale)
+    made.pose = MESSAGES.flat_pose(np.zeros(2), 0.0)
     red, green, blue = friction_colour(friction)
     made.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
     made.points = [Point(x=x, y=y) for x, y in points.tolist()]
@@ -79,8 +79,8 @@ def test_markers_are_packed_as_rclpy_makes_them(segments: int, friction: Frictio
 def test_a_pose_that_is_handed_over_is_that_of_its_message():
     for angle in np.random.default_rng(1).uniform(-np.pi, np.pi, 1000):
         tail, heading = np.array([angle * 1e-3, -angle]), np.array([np.cos(angle), np.sin(angle)])
-        told = messages.needle_pose(deserialize_message(packed_pose(WHEN, tail, heading), PoseWithCovarianceStamped))
-        handed = messages.tracked_pose(STAMP, tail, heading)
+        told = reading.needle_pose(deserialize_message(packed_pose(WHEN, tail, heading), PoseWithCovarianceStamped))
+        handed = reading.tracked_pose(STAMP, tail, heading)
         assert told.stamp == handed.stamp
         assert told.tail.tobytes() == handed.tail.tobytes()
         assert told.heading.tobytes() == handed.heading.tobytes()

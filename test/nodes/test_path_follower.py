@@ -8,7 +8,8 @@ from builtin_interfaces.msg import Time
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from test.nodes.scenes import scene_told
@@ -19,7 +20,7 @@ EAST = np.array([1.0, 0.0])
 def pose(seconds: float, x: float):
     """Return a needle that points east."""
     stamp = Time(sec=int(seconds), nanosec=round((seconds % 1.0) * 1e9))
-    return messages.pose_message(stamp, np.array([x, 0.0]), EAST)
+    return MESSAGES.pose_message(stamp, np.array([x, 0.0]), EAST)
 
 
 def test_a_pose_is_answered_by_a_command_made_now_and_by_the_wish_at_the_pose(graph):

@@ -16,7 +16,8 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import PAUSE_RIG
-from magnetosuture_thread.nodes import messages, topics
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.nodes.rig_time import RigTime
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
@@ -28,7 +29,7 @@ SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.
 def currents(graph, *values: float) -> CoilCurrents:
     """Return currents from now on."""
     message = CoilCurrents(current=[float(value) for value in values])
-    message.header = messages.header(graph.now())
+    message.header = MESSAGES.header(graph.now())
     return message
 
 

@@ -14,9 +14,8 @@ from rclpy.serialization import serialize_message
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
-from magnetosuture_thread.nodes.messages import stamp_of
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.scene_follower import MAX_MESSAGE_BYTES, SceneFollower, initial_scene, received_scene
-from magnetosuture_thread.nodes.scene_messages import scene_message
 from magnetosuture_thread.scene import Scene, read_scene, shape_from_mapping, write_scene
 from test.scene.scenes import every_shape
 
@@ -48,7 +47,7 @@ def node(graph) -> FollowerNode:
 
 def publish(graph: Any, scene: Scene) -> None:
     """Publish a scene."""
-    graph.publish(topics.SCENE, scene_message(graph.now(), scene))
+    graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), scene))
 
 
 def refused(graph: Any, reports: list[Any], words: str) -> None:
@@ -75,7 +74,7 @@ def test_the_scene_of_the_file_is_in_force_until_another_comes(graph, node):
 
 def test_a_damaged_message_is_reported_and_the_scene_before_stays(graph, node):
     reports = graph.listen(topics.DIAGNOSTICS)
-    message = scene_message(graph.now(), HERNIA)
+    message = MESSAGES.scene_message(graph.now(), HERNIA)
     message.shapes[0].polygon[0].outline.corners[7].y += 1e-9
     graph.publish(topics.SCENE, message)
     refused(graph, reports, "refused: scene.version: got ")
@@ -111,7 +110,7 @@ def test_a_file_that_cannot_be_read_is_refused_at_once(graph, tmp_path: Path):
 
 
 def test_bytes_that_are_no_scene_are_refused():
-    whole = serialize_message(scene_message(stamp_of(0), every_shape()))
+    whole = serialize_message(MESSAGES.scene_message(MESSAGES.time(0), every_shape()))
     assert received_scene(whole) == every_shape()
     assert len(whole) < MAX_MESSAGE_BYTES
     for length in (0, 4, 40, 100, len(whole) // 2, len(whole) - 9):
@@ -127,7 +126,7 @@ def test_a_flipped_bit_is_refused_wherever_it_is():
     """All but the stamp, the heights of corners and what fills gaps is under the hash."""
     square = {"polygon": {"outline": [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01]]}}
     scene = POST.add(shape_from_mapping("square", square))
-    whole = serialize_message(scene_message(stamp_of(0), scene))
+    whole = serialize_message(MESSAGES.scene_message(MESSAGES.time(0), scene))
     for place in range(4, len(whole)):
         harmed = bytearray(whole)
         harmed[place] ^= 1 << (place % 8)

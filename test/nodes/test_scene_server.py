@@ -14,12 +14,12 @@ from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE
+from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.scene import read_scene, shape_from_mapping, write_scene
 from magnetosuture_thread.scene.editing import MAX_SHAPE_CHARS
-from magnetosuture_thread.scene.messages import scene_of
 from test.scene.scenes import every_shape
 
 SERVICES = {

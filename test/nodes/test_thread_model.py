@@ -18,8 +18,8 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.model import choices
 from magnetosuture_thread.model.formulations import rod
 from magnetosuture_thread.model.solvers import BandedSolver
-from magnetosuture_thread.nodes import messages, topics
-from magnetosuture_thread.nodes.scene_messages import scene_message
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene
 from test.model.worlds import polygon, scene_with
@@ -32,12 +32,12 @@ def stamp(seconds: float) -> Time:
 
 def pose(seconds: float, x: float = 0.0, y: float = 0.0) -> PoseWithCovarianceStamped:
     """Return a needle that points east."""
-    return messages.pose_message(stamp(seconds), np.array([x, y]), np.array([1.0, 0.0]))
+    return MESSAGES.pose_message(stamp(seconds), np.array([x, y]), np.array([1.0, 0.0]))
 
 
 def seen(seconds: float) -> Path:
     """Return a thread that lies straight behind a needle at the origin."""
-    return messages.PathMaker().message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
+    return MESSAGES.path_message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
 
 
 def test_the_thread_starts_where_it_is_seen_and_follows(graph):
@@ -88,7 +88,7 @@ def place(graph, *geometries: Disc | Polygon) -> Scene:
     """Publish a scene with these shapes, for a node that is made next."""
     scene = scene_with(*geometries)
     graph.said = graph.probe.create_publisher(SceneMessage, topics.SCENE.name, topics.LATCHED)
-    graph.said.publish(scene_message(graph.now(), scene))
+    graph.said.publish(MESSAGES.scene_message(graph.now(), scene))
     return scene
 
 
@@ -324,6 +324,6 @@ def test_an_unproven_solution_gives_no_margin(graph):
 
 def test_a_seen_thread_that_is_cut_off_is_refused_and_ends_nothing(graph):
     node = graph.add(ThreadModelNode)
-    whole = serialize_message(Path(header=messages.header(graph.now()), poses=[PoseStamped()] * 3))
+    whole = serialize_message(Path(header=MESSAGES.header(graph.now()), poses=[PoseStamped()] * 3))
     node.on_measured_thread_message(whole[:-20])
     assert node._health._refused == 1

@@ -20,11 +20,12 @@ from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.messages import reading
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.nodes import messages, topics
-from magnetosuture_thread.nodes.scene_messages import scene_message
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene, read_scene
 from test.model.worlds import scene_with
@@ -56,11 +57,11 @@ class Bench:
             nanoseconds = 1_000_000_000 + k * 33_000_000
             tail, angle = np.array([1e-4 * k, 2e-5 * k]), 0.01 * k
             heading = np.array([math.cos(angle), math.sin(angle)])
-            message = messages.pose_message(messages.stamp_of(nanoseconds), tail, heading)
+            message = MESSAGES.pose_message(MESSAGES.time(nanoseconds), tail, heading)
             self.graph.publish(topics.NEEDLE_POSE, message)
             self.shown += 1
             self.graph.wait(lambda: len(self.margins) == self.shown, "the pose's margins")
-            outcome = self.session.on_pose(nanoseconds, messages.needle_pose(message))
+            outcome = self.session.on_pose(nanoseconds, reading.needle_pose(message))
             if outcome.prediction is None:
                 continue
             self.graph.wait(partial(self._predicted_last, message), "the prediction")
@@ -79,7 +80,7 @@ class Bench:
 
     def place(self, scene: Scene) -> None:
         """Publish a scene, wait until the node goes by it, and have the session do so too."""
-        self.graph.publish(topics.SCENE, scene_message(self.graph.now(), scene))
+        self.graph.publish(topics.SCENE, MESSAGES.scene_message(self.graph.now(), scene))
         self.graph.wait(lambda: self.node._session.scene_version == scene.version, "the scene")
         self.scene = scene
         self.change()
@@ -245,7 +246,7 @@ def elsewhere(message: SceneMessage) -> SceneMessage:
 def test_a_refused_scene_is_reported_and_leaves_all_as_it_was(graph, scene, alter, words):
     bench = Bench(graph)
     bench.show(4)
-    graph.publish(topics.SCENE, alter(scene_message(graph.now(), scene)))
+    graph.publish(topics.SCENE, alter(MESSAGES.scene_message(graph.now(), scene)))
     graph.wait(lambda: bench.said(words), "a refusal")
     bench.show(4)
 
@@ -280,7 +281,7 @@ def test_who_starts_later_gets_the_last_scene_and_the_last_material(graph):
     other = graph.probe.create_publisher(ThreadMaterial, "thread/material", topics.LATCHED)
     for radius in (0.001, 0.002):
         scene = scene_with(Disc((-0.005, 0.003), radius))
-        publisher.publish(scene_message(graph.now(), scene))
+        publisher.publish(MESSAGES.scene_message(graph.now(), scene))
         other.publish(ThreadMaterial(viscosity=100.0 * radius))
     node = graph.add(ThreadModelNode)
     graph.wait(lambda: node._session.scene_version == scene.version, "the scene")
@@ -302,7 +303,7 @@ def test_a_scene_may_come_while_the_thread_is_waited_for(graph):
     assert [margins.reason for margins in bench.margins] == ["waiting for the thread to be seen"] * 3
     bench.place(scene_with(POST))
     thread = np.column_stack([1e-4 - np.linspace(0.0, 0.019, 60), np.full(60, 2e-5)])
-    graph.publish(topics.SEEN_THREAD, messages.PathMaker().message(messages.stamp_of(1_033_000_000), thread))
+    graph.publish(topics.SEEN_THREAD, MESSAGES.path_message(MESSAGES.time(1_033_000_000), thread))
     graph.wait(lambda: len(bench.predicted) == 2 and len(bench.margins) == 5, "the poses that waited")
     assert [prediction.solver_status for prediction in bench.predicted] == ["started", "solved"]
     assert 0 in bench.margins[-1].obstacle
@@ -368,7 +369,7 @@ def test_bytes_that_are_no_message_are_refused_and_end_nothing(graph):
     """As from a publisher whose definition of the type is another."""
     bench = Bench(graph)
     bench.show(2)
-    whole = serialize_message(scene_message(graph.now(), scene_with(POST)))
+    whole = serialize_message(MESSAGES.scene_message(graph.now(), scene_with(POST)))
     for data in (b"", whole[:-3], whole[:16], b"\x00\x01\x00\x00" + b"\xff" * 40):
         bench.node._scene.on_scene(data)
         bench.node._settings.on_material(data[:20])

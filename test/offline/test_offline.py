@@ -16,9 +16,10 @@ import pytest
 
 from magnetosuture_thread.bags.reader import Bag, Record
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.types import MESSAGES, make, typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
@@ -32,15 +33,12 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.replay_offline import replay_offline
+from magnetosuture_thread.messages.packing import packed_margins, packed_prediction
+from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
 from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState
-from magnetosuture_thread.offline.messages import header, make, path_message, pose_message
 from magnetosuture_thread.offline.predictions import predictions, sights
-from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
-from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
 from magnetosuture_thread.scene import SceneShape
-from magnetosuture_thread.scene.messages import scene_message
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.study.reference import ReferenceTrajectory
 
 SETUP = read_setup("petri_35mm_polyamide")
 
@@ -263,7 +261,7 @@ def test_poses_may_wait_for_their_thread(pose_bag: Path):
 @pytest.mark.parametrize("count", [0, 1, 2, 64])
 def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
     points = np.random.default_rng(count).normal(size=(count, 2))
-    message = path_message(5 * 10**9 + 7, points)
+    message = MESSAGES.path_message(5 * 10**9 + 7, points)
     for pose in message.poses:
         pose.header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id=frame)
     data = bytes(typestore().serialize_cdr(message, SEEN_THREAD.type_name))
@@ -281,7 +279,7 @@ def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
 
 def test_poses_are_read_as_a_node_gets_them():
     heading = np.array([np.cos(2.5), np.sin(2.5)])
-    message = pose_message(10**9, np.array([1e-3, -2e-3]), heading, None)
+    message = MESSAGES.pose_message(10**9, np.array([1e-3, -2e-3]), heading, None)
     data = bytes(typestore().serialize_cdr(message, NEEDLE_POSE.type_name))
     given = Record(NEEDLE_POSE.recorded, NEEDLE_POSE.type_name, 3, data)
     tail, along = read_pose(given)
@@ -330,7 +328,7 @@ def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
         for record in source.records(set(source.topics)):
             writer.write(record.topic, record.time, record.data)
         stamp = round(1.39e9)
-        writer.write_message(SCENE.recorded, stamp, scene_message(wider, header(stamp), make))
+        writer.write_message(SCENE.recorded, stamp, MESSAGES.scene_message(stamp, wider))
     for start, found in ((0.0, 12), (0.5, 0)):
         seen = sights(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
         # In a dish of twice the diameter, what was the needle is twice as long.
@@ -352,12 +350,12 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
             writer.write(record.topic, record.time, record.data)
         for time, told, version in ((1.39, scene, scene.version), (1.5, scene, "f" * 16), (1.61, too_fine, "")):
             stamp = round(time * 1e9)
-            message = scene_message(told, header(stamp), make)
+            message = MESSAGES.scene_message(stamp, told)
             message.version = version or message.version
             writer.write_message(SCENE.recorded, stamp, message)
         silk = make(
             MATERIAL.type_name,
-            header=header(stamp),
+            header=MESSAGES.header(stamp),
             name="silk_6_0",
             diameter=0.0,
             elastic_modulus=0.0,

@@ -10,13 +10,14 @@ import pytest
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from rclpy.serialization import deserialize_message, serialize_message
 
+from magnetosuture_thread.bags.types import MESSAGES as BAG_MESSAGES
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.interface import SCENE
-from magnetosuture_thread.nodes.messages import stamp_of
-from magnetosuture_thread.nodes.scene_messages import scene_message
-from magnetosuture_thread.scene import Dish, Scene, SceneShape, messages, read_scene
+from magnetosuture_thread.messages import scene as messages
+from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 from test.scene.scenes import every_shape
 
 LARGE = Polygon(
@@ -32,24 +33,18 @@ SCENES = {
 
 def sent(scene: Scene) -> SceneMessage:
     """Return a scene as a node gets it."""
-    return deserialize_message(serialize_message(scene_message(stamp_of(7), scene)), SceneMessage)
+    return deserialize_message(serialize_message(MESSAGES.scene_message(7, scene)), SceneMessage)
 
 
 def recorded(scene: Scene) -> Any:
     """Return a scene as a bag gives it."""
-    return typestore().deserialize_cdr(serialize_message(scene_message(stamp_of(7), scene)), SCENE.type_name)
+    return typestore().deserialize_cdr(serialize_message(MESSAGES.scene_message(7, scene)), SCENE.type_name)
 
 
 def written(scene: Scene) -> Any:
     """Return a scene as a bag gives it that rosbags has written itself."""
     store = typestore()
-
-    def make(type_name: str, **fields: Any) -> Any:
-        return store.types[type_name](**fields)
-
-    stamp = store.types["builtin_interfaces/msg/Time"](sec=0, nanosec=7)
-    header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="dish")
-    data = store.serialize_cdr(messages.scene_message(scene, header, make), SCENE.type_name)
+    data = store.serialize_cdr(BAG_MESSAGES.scene_message(7, scene), SCENE.type_name)
     assert messages.scene_of(deserialize_message(bytes(data), SceneMessage)) == scene  # a node reads it too
     return store.deserialize_cdr(data, SCENE.type_name)
 

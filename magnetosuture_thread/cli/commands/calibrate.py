@@ -71,8 +71,8 @@ def add(subparsers: Subparsers) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Fit the thread's parameters to recorded bags."""
+    from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
     from magnetosuture_thread.jobs.calibrate import Request, calibrate
-    from magnetosuture_thread.study.calibration.table import bag_table, calibration_lines, parameter_table
 
     console = make_console()
     say = sayer(console)

@@ -109,9 +109,9 @@ def _refuse(options: argparse.Namespace, unset: Mapping[str, object], why: str) 
 
 def _evaluate_bags(options: argparse.Namespace) -> int:
     from magnetosuture_thread.errors import ConfigurationError
+    from magnetosuture_thread.evaluation.bag_table import bags_table
     from magnetosuture_thread.jobs.evaluate import evaluate_bags
     from magnetosuture_thread.jobs.evaluate_bag import Options
-    from magnetosuture_thread.study.bag_table import bags_table
 
     if options.output is None:
         raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
@@ -135,10 +135,10 @@ def _evaluate_bags(options: argparse.Namespace) -> int:
 
 
 def _score_references(options: argparse.Namespace) -> int:
+    from magnetosuture_thread.evaluation.case_plot import draw_case
+    from magnetosuture_thread.evaluation.reference_scores import CaseResult, find_references, score
+    from magnetosuture_thread.evaluation.tables import evaluation_table
     from magnetosuture_thread.jobs.rig import score_rig
-    from magnetosuture_thread.study.course_picture import draw_course
-    from magnetosuture_thread.study.evaluation import Course, find_references, score
-    from magnetosuture_thread.study.table import evaluation_table
 
     console = make_console()
     paths = [path for folder in options.paths for path in find_references(folder)]
@@ -148,9 +148,9 @@ def _score_references(options: argparse.Namespace) -> int:
     formulation = options.formulation or "rod"
     name = "rig" if options.rig else formulation
 
-    def keep(course: Course) -> None:
+    def keep(case: CaseResult) -> None:
         if options.pictures:
-            draw_course(options.pictures / f"{course.score.name}.png", course, name)
+            draw_case(options.pictures / f"{case.score.name}.png", case, name)
 
     with progress(console, "evaluate") as advance:
         if options.rig:

@@ -53,9 +53,9 @@ def run(options: argparse.Namespace) -> int:
     if options.noise and not options.poses:
         raise ConfigurationError("--noise", options.noise, "none without --poses")
 
+    from magnetosuture_thread.evaluation.reference import read_reference
     from magnetosuture_thread.jobs.record import record
     from magnetosuture_thread.setups import read_setup
-    from magnetosuture_thread.study.reference import read_reference
 
     console = make_console()
     setup = read_setup(options.setup)

@@ -53,9 +53,9 @@ def run(options: argparse.Namespace) -> int:
         if options.offline and getattr(options, name):
             raise ConfigurationError(f"--{name}", getattr(options, name), "none with --offline, which knows no time")
 
+    from magnetosuture_thread.evaluation.tables import summary_table
     from magnetosuture_thread.jobs.replay import replay
     from magnetosuture_thread.jobs.replay_offline import replay_offline
-    from magnetosuture_thread.study.table import summary_table
 
     console = make_console()
     say = sayer(console)

@@ -91,9 +91,9 @@ def run_draw(options: argparse.Namespace) -> int:
     if options.output.suffix not in PICTURES:
         raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
 
+    from magnetosuture_thread.evaluation.scene_plot import draw_scene
     from magnetosuture_thread.jobs.output import whole_file
     from magnetosuture_thread.scene import read_scene
-    from magnetosuture_thread.study.scene_picture import draw_scene
 
     scene = read_scene(options.file)
     with whole_file(options.output) as partial:

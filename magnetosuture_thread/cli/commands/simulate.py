@@ -43,8 +43,8 @@ def add(subparsers: Subparsers) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the whole graph around a simulated rig."""
+    from magnetosuture_thread.evaluation.tables import loop_table
     from magnetosuture_thread.jobs.simulate import simulate
-    from magnetosuture_thread.study.table import loop_table
 
     console = make_console()
     say = sayer(console)

@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
+from magnetosuture_thread.evaluation.plots import FAINT, INK, tidy
+from magnetosuture_thread.evaluation.scene_plot import shape_patch
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.friction import Friction, FrictionState, friction_colour
 from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredInstant
 from magnetosuture_thread.reproduce.hernia.steering import HerniaRun
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.study.picture import FAINT, INK, tidy
-from magnetosuture_thread.study.scene_picture import shape_patch
 
 FLOOR, RIM = "#f4f1ec", "#c9c3ba"
 TISSUE, EDGE = "#f0b9b4", "#c98680"

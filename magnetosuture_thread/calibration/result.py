@@ -1,0 +1,226 @@
+"""What a calibration found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.calibration.passage import Passage
+from magnetosuture_thread.calibration.replays import frame_errors, mean_across, mean_error
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.settings import ThreadModelSettings
+
+WORSE = 1.05  # times the error before, from which on a person should know
+IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the data say of one number.
+
+    Attributes:
+        name: for a person.
+        setting: the field of the settings that it belongs to.
+        unit: of the values.
+        value: that is used from now on.
+        start: what the set-up and the material say.
+        low: lower end of the 95 % interval of the fit to all that is unknown; not a number where there is none.
+        high: upper end.
+        status: `identified`; `fixed` at what the set-up says, as the data cannot tell; `stand-in`: the data cannot
+            tell it, but contradict what the set-up says, or it predicts worse, so that the fitted one stands in; or
+            `unfinished`.
+        reason: why it cannot be identified; else empty.
+        effect_percent: how far a change that counts moves the prediction, what others make up for left out
+            [% of length].
+        logarithmic: whether a logarithmic scale shows it best.
+    """
+
+    name: str
+    setting: str
+    unit: str
+    value: float
+    start: float
+    low: float = math.nan
+    high: float = math.nan
+    status: str = IDENTIFIED
+    reason: str = ""
+    effect_percent: float = math.nan
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class AttachmentVerdict:
+    """Which attachment fits better.
+
+    Attributes:
+        value: that is used.
+        start: what the set-up says.
+        errors: mean distance across the thread with each that was fitted [% of length].
+        reason: why they cannot be told apart; empty where they can.
+        looked: whether both were fitted.
+    """
+
+    value: str
+    start: str
+    errors: dict[str, float]
+    reason: str = ""
+    looked: bool = True
+
+
+@dataclass(frozen=True)
+class BagErrors:
+    """Prediction errors of one bag, mean over time [% of length]; not a number where there is none.
+
+    Attributes:
+        name: of the bag.
+        frames: that were compared.
+        before: with what the set-up says, against what was fitted to.
+        after: calibrated.
+        held_out: calibrated by the other bags.
+        truth_before: against the truth, with what the set-up says.
+        truth_after: calibrated.
+        truth_held_out: calibrated by the other bags.
+        across_before: mean distance across the thread, with what the set-up says.
+        across_after: calibrated; this is what was made least.
+    """
+
+    name: str
+    frames: int
+    before: float
+    after: float
+    held_out: float = math.nan
+    truth_before: float = math.nan
+    truth_after: float = math.nan
+    truth_held_out: float = math.nan
+    across_before: float = math.nan
+    across_after: float = math.nan
+
+    @property
+    def warning(self) -> str:
+        """What a person should know of a bag whose nodes are farther off than before, in words; else empty."""
+        if not self.after > WORSE * self.before:
+            return ""
+        better = self.across_after <= self.across_before
+        end = "what is left lies along it, where noise moves what is seen" if better else "do not use"
+        return (
+            f"{self.name}: the nodes are {self.after:.3g} % of the length off after the fit, {self.before:.3g} % "
+            "before; "
+            f"across the thread, which is what was fitted, {self.across_after:.3g} % after, {self.across_before:.3g} % "
+            f"before: {end}"
+        )
+
+
+@dataclass(frozen=True)
+class BagFit:
+    """One bag before and after, for the picture.
+
+    Attributes:
+        passage: the bag.
+        before: predicted nodes with what the set-up says, shape (K, n + 1, 2) [m].
+        after: calibrated.
+    """
+
+    passage: Passage
+    before: Points
+    after: Points
+
+    def error(self, vertices: Points, length: float) -> NDArray[np.float64]:
+        """Return the prediction error of each compared frame [% of length]."""
+        return frame_errors(vertices, self.passage.targets, length)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration found.
+
+    Attributes:
+        settings: of the thread model, calibrated.
+        start: what the set-up and the material say.
+        against: `seen` or `truth`.
+        estimates: of all numbers that were asked for.
+        attachment: which fits better; None if it was not asked for.
+        scores: of each bag.
+        simulated: what of each bag is simulated; empty for what nothing says so of.
+        replays: how many passages were replayed.
+        finished: whether it came to its end; else this is the best so far.
+    """
+
+    settings: ThreadModelSettings
+    start: ThreadModelSettings
+    against: str
+    estimates: tuple[Estimate, ...]
+    attachment: AttachmentVerdict | None
+    scores: tuple[BagErrors, ...]
+    simulated: tuple[str, ...]
+    replays: int
+    finished: bool = True
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a person should know, in words."""
+        lines = []
+        for estimate in self.estimates:
+            if estimate.status == STAND_IN:
+                lines.append(
+                    f"{estimate.name} cannot be identified in this data: {estimate.reason}; {estimate.value:.4g} "
+                    f"{estimate.unit}".rstrip()
+                    + " stands in, as it predicts better than what the set-up says"
+                )
+            elif estimate.reason:
+                lines.append(f"{estimate.name} cannot be identified in this data: {estimate.reason}")
+        if self.attachment is not None and self.attachment.reason:
+            lines.append(f"the attachment cannot be told: {self.attachment.reason}")
+        return lines + [score.warning for score in self.scores if score.warning]
+
+    @property
+    def error(self) -> float:
+        """Mean over the bags of the prediction error, calibrated [% of length]."""
+        return float(np.mean([score.after for score in self.scores]))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all as plain values; None for what is not known."""
+        return {
+            "finished": self.finished,
+            "material": self.settings.material,
+            "formulation": self.settings.formulation,
+            "against": self.against,
+            "parameters": [_plain(asdict(estimate)) for estimate in self.estimates],
+            "attachment": asdict(self.attachment) if self.attachment is not None else None,
+            "bags": [
+                {**_plain(asdict(score)), "simulated": words}
+                for score, words in zip(self.scores, self.simulated, strict=True)
+            ],
+            "warnings": self.warnings,
+            "replays": self.replays,
+        }
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in values.items()
+    }
+
+
+def scores_of(fits: Sequence[BagFit], length: float, held_out: Sequence[Points] | None = None) -> tuple[BagErrors, ...]:
+    """Return the errors of all bags.
+
+    Args:
+        fits: each bag before and after.
+        length: of the thread [m].
+        held_out: predicted nodes of each, calibrated by the other bags.
+    """
+    scores = []
+    for index, fit in enumerate(fits):
+        predicted = (fit.before, fit.after, held_out[index] if held_out else None)
+        seen, truth = (
+            [math.nan if vertices is None else mean_error(vertices, targets, length) for vertices in predicted]
+            for targets in (fit.passage.targets, fit.passage.truths)
+        )
+        off = [mean_across(vertices, fit.passage, length) for vertices in (fit.before, fit.after)]
+        scores.append(BagErrors(fit.passage.name, len(fit.passage.frames), *seen, *truth, *off))
+    return tuple(scores)

@@ -1,0 +1,251 @@
+"""The way of a calibration: several starts, the fit to all that is unknown, what it tells, and what that predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from magnetosuture_thread.calibration.fit import Array, Objective, Solution, scale_of
+from magnetosuture_thread.calibration.identifiability import Identifiability, assess_identifiability
+from magnetosuture_thread.calibration.parameters import (
+    OF_FORMULATION,
+    STIFFNESS_OVER_DRAG,
+    Parameter,
+    chosen,
+)
+from magnetosuture_thread.calibration.passage import Passage
+from magnetosuture_thread.calibration.replays import Best, Replays, Run, mean_across
+from magnetosuture_thread.calibration.result import (
+    FIXED,
+    IDENTIFIED,
+    STAND_IN,
+    UNFINISHED,
+    AttachmentVerdict,
+    BagFit,
+    Calibration,
+    Estimate,
+    scores_of,
+)
+from magnetosuture_thread.calibration.stages import Stages
+from magnetosuture_thread.calibration.starts import starts
+from magnetosuture_thread.calibration.uncertainty import BLOCKS
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.session import ThreadSession
+from magnetosuture_thread.model.settings import ThreadModelSettings
+
+TOLD = 0.05  # % of length by which an attachment must fit better, besides the noise
+GIVEN_WAY = 0.1  # % of length; a default that predicts worse by more gives way to what was fitted
+NARROWER = 0.5  # of the robust loss's scale, where the fit is repeated with the smaller one
+
+Say = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+def calibrate(
+    passages: Sequence[Passage],
+    settings: ThreadModelSettings,
+    names: Sequence[str] = (),
+    *,
+    run: Run | None = None,
+    best: Best | None = None,
+    progress: Progress = lambda share: None,
+    say: Say = lambda line: None,
+) -> tuple[Calibration, list[BagFit]]:
+    """Fit what the passages can tell of a thread.
+
+    1. Stiffnesses from a hundredth to a hundred times the material's are tried with each attachment, and the best
+       of them fitted alone, by the whole distance of prediction and thread.
+    2. All that is unknown is fitted, by the distance across the thread, with a robust loss.
+    3. The attachment is the one that fits better, if the difference is beyond its own scatter over blocks of time.
+    4. What cannot be identified is put back to what the set-up says, and the rest is fitted again.
+    5. With several passages, each is predicted by a fit to the others.
+
+    Args:
+        passages: recorded runs of one thread.
+        settings: what the set-up and the material say; where the fit starts.
+        names: of settings to fit; all that the formulation has if empty.
+        run: gives the predictions of tasks; here, one after the other, if None.
+        best: is told the best so far at every moment.
+        progress: is told the share done.
+        say: is told a line at the end of each stage.
+
+    Returns:
+        What was found, and each bag before and after.
+
+    Raises:
+        ConfigurationError: a name is unknown, the thread is not in a liquid, or an obstacle cannot be used.
+    """
+    parameters, both = chosen(settings.formulation, names)
+    if settings.medium != "liquid":
+        raise ConfigurationError("thread_model.medium", settings.medium, "liquid: what is fitted is bending over drag")
+    replays = Replays(passages, run, best)
+    stages = Stages(replays.best, progress, say)
+    for scene in dict.fromkeys(passage.scene for passage in passages):
+        ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
+    replays.tell(stages.told)
+    return _Search(replays, settings, parameters, both, stages).go()
+
+
+def unfinished(
+    passages: Sequence[Passage], settings: ThreadModelSettings, best: Best
+) -> tuple[Calibration, list[BagFit]]:
+    """Return the best that an interrupted search had come to, without intervals.
+
+    Args:
+        passages: recorded runs.
+        settings: where it started.
+        best: of the search; its settings must be known.
+    """
+    found = best.settings or settings
+    parameters = [p for p in OF_FORMULATION[settings.formulation] if p.read(found) != p.read(settings)]
+    estimates = tuple(
+        Estimate(p.name, p.setting, p.unit, p.read(found), p.read(settings), status=UNFINISHED) for p in parameters
+    )
+    attachment = None
+    if found.attachment != settings.attachment:
+        attachment = AttachmentVerdict(found.attachment, settings.attachment, {}, looked=False)
+    fits = [BagFit(*parts) for parts in zip(passages, best.first, best.vertices, strict=True)]
+    scores, simulated = scores_of(fits, settings.thread_length), tuple(passage.simulated for passage in passages)
+    against = passages[0].against
+    done = Calibration(found, settings, against, estimates, attachment, scores, simulated, best.replays, finished=False)
+    return done, fits
+
+
+@dataclass
+class _Search:
+    replays: Replays
+    start: ThreadModelSettings
+    parameters: tuple[Parameter, ...]
+    both: bool
+    stages: Stages
+
+    def go(self) -> tuple[Calibration, list[BagFit]]:
+        passages, count = self.replays.passages, len(self.replays.passages)
+        self.replays.error(self.start)
+        candidates = starts(self.replays, self.start, self.parameters, self.both, self.stages)
+        self.stages.begin("fit", count * len(candidates) * 6 * (len(self.parameters) + 1))
+        solutions = [self._fitted(Objective(self.replays, settings, self.parameters)) for settings in candidates]
+        solution, attachment = self._attached(solutions)
+        self.stages.end("fitted all that is unknown")
+        verdicts = assess_identifiability(solution, passages)
+        self.stages.begin("identified", count * 4 * len(self.parameters))
+        settings, statuses = self._identified(solution, verdicts)
+        self.stages.end("fitted what can be identified")
+        fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
+        held_out = None
+        if count > 1:
+            self.stages.begin("held out", count * (count - 1) * 3 * (len(fitted) + 1))
+            held_out = [self._held_out(settings, fitted, solution.scale, index) for index in range(count)]
+            self.stages.end("predicted each bag by the others")
+        before, after = self.replays.of([self.start, settings])
+        fits = [BagFit(*parts) for parts in zip(passages, before, after, strict=True)]
+        calibration = Calibration(
+            settings,
+            self.start,
+            passages[0].against,
+            tuple(
+                self._estimate(solution, index, verdict, status, settings)
+                for index, (verdict, status) in enumerate(zip(verdicts, statuses, strict=True))
+            ),
+            attachment,
+            scores_of(fits, self.start.thread_length, held_out),
+            tuple(passage.simulated for passage in passages),
+            self.replays.best.replays,
+        )
+        self.stages.done()
+        return calibration, fits
+
+    def _fitted(self, objective: Objective, scale: float | None = None) -> Solution:
+        """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
+        if scale is not None:
+            return objective.fit(scale=scale)
+        scale = scale_of(objective.residuals(objective.start()))
+        solution = objective.fit(scale=scale)
+        narrower = scale_of(solution.residuals)
+        return objective.fit(solution.x, narrower) if narrower < NARROWER * scale else solution
+
+    def _attached(self, solutions: Sequence[Solution]) -> tuple[Solution, AttachmentVerdict | None]:
+        """Return the solution whose attachment fits better, or the set-up's where that cannot be told."""
+        if not self.both:
+            return solutions[0], None
+        errors = {s.settings.attachment: self.replays.error(s.settings) for s in solutions}
+        best = min(solutions, key=lambda s: float(np.mean(self._blocks(s))))
+        if len(solutions) == 1:
+            return best, AttachmentVerdict(best.settings.attachment, self.start.attachment, errors)
+        other = next(s for s in solutions if s is not best)
+        difference = self._blocks(other) - self._blocks(best)
+        middle, count = float(difference.mean()), len(difference)
+        half = float(student.ppf(0.975, count - 1) * difference.std(ddof=1) / np.sqrt(count))
+        reason = ""
+        if middle < max(TOLD, half):
+            reason = f"{other.settings.attachment} is worse by {middle:.2g} ± {half:.2g} % of the length only"
+            best = next(s for s in solutions if s.settings.attachment == self.start.attachment)
+        return best, AttachmentVerdict(best.settings.attachment, self.start.attachment, errors, reason)
+
+    def _blocks(self, solution: Solution) -> Array:
+        """Return the mean distance across the thread in each block of time of each passage [% of length]."""
+        result = []
+        for residual, passage in zip(solution.residuals, self.replays.passages, strict=True):
+            block = np.minimum(BLOCKS * passage.times / passage.times[-1], BLOCKS - 1).astype(int)
+            result += [
+                100.0 * float(np.abs(residual[block == index])[passage.known[block == index]].mean())
+                for index in np.unique(block)
+            ]
+        return np.array(result)
+
+    def _identified(
+        self, solution: Solution, verdicts: Sequence[Identifiability]
+    ) -> tuple[ThreadModelSettings, list[str]]:
+        """Return the fit of what can be identified, and what became of each number."""
+        statuses = [self._status(solution, index, verdict) for index, verdict in enumerate(verdicts)]
+        if all(verdict.identified for verdict in verdicts):
+            return solution.settings, statuses
+        spare = [index for index, status in enumerate(statuses) if status == FIXED]
+        spare.sort(key=lambda i: (self.parameters[i] is not STIFFNESS_OVER_DRAG, -verdicts[i].effect))
+        most = self._error(solution.settings) + GIVEN_WAY
+        while True:
+            base = solution.settings
+            for parameter, status in zip(self.parameters, statuses, strict=True):
+                base = base if status != FIXED else parameter.reset(base, self.start)
+            fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
+            settings = self._fitted(Objective(self.replays, base, fitted), solution.scale).settings if fitted else base
+            if self._error(settings) <= most or not spare:
+                return settings, statuses
+            statuses[spare.pop(0)] = STAND_IN
+
+    def _status(self, solution: Solution, index: int, verdict: Identifiability) -> str:
+        """Return what becomes of a number at first: the set-up's is kept unless the data contradict it."""
+        if verdict.identified:
+            return IDENTIFIED
+        parameter = self.parameters[index]
+        off = abs(parameter.to_fit(parameter.read(self.start)) - float(solution.x[index]))
+        return STAND_IN if off > verdict.half else FIXED
+
+    def _error(self, settings: ThreadModelSettings) -> float:
+        """Return the mean distance across the thread [% of length]."""
+        pairs = zip(self.replays.of([settings])[0], self.replays.passages, strict=True)
+        return float(np.mean([mean_across(v, p, settings.thread_length) for v, p in pairs]))
+
+    def _held_out(self, settings: ThreadModelSettings, fitted: Sequence[Parameter], scale: float, index: int) -> Points:
+        """Return what is predicted of a passage by a fit to the others."""
+        others = [other for other in range(len(self.replays.passages)) if other != index]
+        if fitted:
+            settings = Objective(self.replays, settings, fitted, others).fit(scale=scale).settings
+        return self.replays.of([settings], [index])[0][0]
+
+    def _estimate(
+        self, solution: Solution, index: int, verdict: Identifiability, status: str, settings: ThreadModelSettings
+    ) -> Estimate:
+        parameter = self.parameters[index]
+        value = parameter.read(settings)
+        low = high = float("nan")
+        if np.isfinite(verdict.half):
+            middle = parameter.to_fit(value) if status == IDENTIFIED else float(solution.x[index])
+            low, high = parameter.interval(middle, verdict.half)
+        start, effect = parameter.read(self.start), 100.0 * verdict.effect
+        named = parameter.name, parameter.setting, parameter.unit
+        return Estimate(*named, value, start, low, high, status, verdict.reason, effect, parameter.kind == "log")

@@ -1,0 +1,120 @@
+"""A calibration as a ROS 2 parameter file that `thread_model` loads."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from typing import Any
+
+from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
+from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, Calibration, Estimate
+from magnetosuture_thread.model.settings import ThreadModelSettings
+
+WIDTH = 118
+# Of the thread and its liquid, what gives the fitted numbers their meaning; with 0 the material's diameter counts.
+GIVEN = ("material", "diameter", "thread_length", "segments", "viscosity", "wetted_fraction")
+UNITS = {"elastic_modulus": "Pa", "rest_curvature": "1/m", OFFSET: "m, along and left"}
+STIFFNESS = (
+    "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
+    "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
+    "thread's own as far as these are true."
+)
+
+
+def to_yaml(calibration: Calibration) -> str:
+    """Return the text of the file, the same for the same calibration."""
+    lines = [*_header(calibration), "/**/thread_model:", "  ros__parameters:"]
+    settings = calibration.settings
+    if settings.formulation != "rod":
+        lines.append(f"    formulation: {settings.formulation}")
+    for name in GIVEN:
+        value = getattr(settings, name)
+        if name != "diameter" or value:
+            lines.append(f"    {name}: {_written(value)}")
+    if settings.formulation == "rod":
+        lines += _attachment(calibration)
+    groups: dict[str, list[Estimate]] = {}
+    for estimate in calibration.estimates:
+        groups.setdefault(estimate.setting, []).append(estimate)
+    for name, estimates in groups.items():
+        lines += _entry(name, estimates, settings)
+    return "\n".join(lines) + "\n"
+
+
+def _header(calibration: Calibration) -> list[str]:
+    words = [
+        "A thread calibrated by `magnetosuture calibrate`, for the node thread_model: put the lines into the set-up's"
+    ]
+    words[0] += " own section, or give the node both files, this one last."
+    if not calibration.finished:
+        words.insert(0, "BEST SO FAR, NOT FINISHED: the calibration was interrupted. There are no intervals.")
+    for score, simulated in zip(calibration.scores, calibration.simulated, strict=True):
+        source = f"simulated: {simulated}" if simulated else "nothing in it says that it is simulated"
+        held = "" if math.isnan(score.held_out) else f", by the other bags {score.held_out:.3g}"
+        figures = f"{score.before:.3g} before, {score.after:.3g} after{held}"
+        words.append(
+            f"From {score.name} ({source}), {score.frames} frames: prediction error {figures} % of the length."
+        )
+        if not math.isnan(score.truth_after):
+            held = "" if math.isnan(score.truth_held_out) else f", by the other bags {score.truth_held_out:.3g}"
+            words.append(
+                f"  Against the truth: {score.truth_before:.3g} before, {score.truth_after:.3g} after{held} %."
+            )
+    compared = "the seen centreline" if calibration.against == "seen" else "the truth"
+    if calibration.finished:
+        words.append(f"Fitted to {compared}. Intervals are of 95 %.")
+    if calibration.settings.formulation == "rod" and any(
+        estimate.setting == "elastic_modulus" for estimate in calibration.estimates
+    ):
+        words.append(STIFFNESS)
+    return [line for text in words for line in _comment(text)]
+
+
+def _comment(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
+
+
+def _attachment(calibration: Calibration) -> list[str]:
+    verdict, value = calibration.attachment, calibration.settings.attachment
+    if verdict is None:
+        return [f"    {ATTACHMENT}: {value} # as in the set-up"]
+    if verdict.reason:
+        return _comment(f"{ATTACHMENT} is left out, as this data cannot tell it: {verdict.reason}", "    ")
+    errors = ", ".join(f"{kind} {error:.3g} %" for kind, error in sorted(verdict.errors.items()))
+    return [f"    {ATTACHMENT}: {value}" + (f" # best fits: {errors}" if len(verdict.errors) > 1 else "")]
+
+
+def _entry(name: str, estimates: list[Estimate], settings: ThreadModelSettings) -> list[str]:
+    """Return the lines of one setting, with why it is left out or what stands in."""
+    lines = []
+    for estimate in estimates:
+        if estimate.reason:
+            what = "is left out" if estimate.status == FIXED else "is no measurement but what predicts best"
+            if estimate.status == FIXED and any(other.status != FIXED for other in estimates):
+                what = f"stays {estimate.start:.4g} {estimate.unit}"
+            lines += _comment(f"{estimate.name} {what}, as this data cannot tell it: {estimate.reason}", "    ")
+    if all(estimate.status == FIXED for estimate in estimates):
+        return lines
+    value = getattr(settings, name)
+    if name == OFFSET and not value:
+        value = (0.0, 0.0)
+    intervals = "; ".join(_interval(estimate) for estimate in estimates if estimate.status == IDENTIFIED)
+    note = " ".join(part for part in (UNITS.get(name, ""), "" if not intervals else f"[{intervals}]") if part)
+    if name == "elastic_modulus":
+        note = f"Pa; B = {stiffness_over_drag(settings):.4g} m^4/s" + (f" [{intervals}]" if intervals else "")
+    return [*lines, f"    {name}: {_written(value)}" + (f" # {note}" if note else "")]
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{estimate.low:.3g} to {estimate.high:.3g}"
+
+
+def _written(value: Any) -> str:
+    """Return a value as ROS and any YAML reader take it: a float has its point, a list one kind."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_written(entry) for entry in value) + "]"
+    if not isinstance(value, float):
+        return str(value)
+    text = f"{value:.6g}"
+    mantissa, exponent, power = text.partition("e")
+    return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power

@@ -1,0 +1,1 @@
+"""Scores of predicted threads: on bags, in closed loops and on reference trajectories."""

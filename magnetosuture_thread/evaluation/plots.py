@@ -1,0 +1,237 @@
+"""The picture of a replayed bag, and what all plots share: colours, axes, and a frame with the threads in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
+from magnetosuture_thread.evaluation.metrics import SOLID_KINDS
+from magnetosuture_thread.evaluation.series import TimeSeries
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
+
+INK, FAINT = "#22303c", "#7b8794"
+SEEN, TRUTH = "#0f6fc6", "#8a6d00"
+MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", ["#c8102e", "#f28c28", "#1f9d55"])
+FULL_CLEARANCE_MM = 1.0
+CLOSE_UP = 2e-3  # m; half of the side of what is magnified
+
+
+def draw_summary(
+    path: Path,
+    frame: NDArray[np.uint8],
+    view: DishView,
+    chosen: FrameResult,
+    at: float,
+    series: TimeSeries,
+    obstacles: Sequence[Obstacle],
+    summary: ReplaySummary,
+) -> None:
+    """Draw the summary and write it as PNG.
+
+    Args:
+        path: of the picture.
+        frame: BGR or grey camera image of the chosen frame.
+        view: where the dish is in it.
+        chosen: the frame to show.
+        at: its time since the bag's start [s].
+        series: of all predicted frames.
+        obstacles: discs and polygons [m].
+        summary: the figures.
+    """
+    figure = Figure(figsize=(14.0, 7.2), dpi=110, facecolor="white")
+    scene = figure.add_axes((0.015, 0.115, 0.44, 0.775))
+    line = _draw_frame(scene, frame, view, chosen, obstacles)
+    _draw_close_up(scene, frame, view, chosen, obstacles)
+    _draw_colours(figure, line)
+    figure.text(
+        0.015,
+        0.905,
+        f"frame at {at:.2f} s, where the prediction is farthest from what is seen",
+        fontsize=9.5,
+        color=INK,
+    )
+    plots = figure.subplots(
+        3, 1, sharex=True, gridspec_kw={"left": 0.51, "right": 0.985, "top": 0.87, "bottom": 0.085, "hspace": 0.33}
+    )
+    _draw_error(plots[0], series)
+    _draw_clearance(plots[1], series)
+    _draw_strain(plots[2], series)
+    for axes in plots:
+        axes.axvline(at, color=FAINT, linewidth=0.9, linestyle=(0, (2, 2)), zorder=0)
+        tidy(axes)
+    plots[2].set_xlim(series.times[0], series.times[-1])
+    plots[2].set_xlabel("time since the bag's start [s]", color=INK)
+    figure.text(0.015, 0.938, _title(summary), fontsize=12, color=INK, linespacing=1.4)
+    figure.savefig(path)
+
+
+def _title(summary: ReplaySummary) -> str:
+    found = "frames tracked" if summary.source == "camera" else "recorded poses taken"
+    words = f"{Path(summary.bag).name}, set-up {summary.setup}: {summary.tracked} of {summary.frames} {found}"
+    if summary.simulated:
+        words += "\nsimulated: " + summary.simulated
+    return words
+
+
+def _draw_frame(
+    axes: Axes, frame: NDArray[np.uint8], view: DishView, chosen: FrameResult, obstacles: Sequence[Obstacle]
+) -> LineCollection:
+    """Draw the dish, filling the axes, and return the predicted thread's line."""
+    line = draw_threads(axes, frame, view, chosen, obstacles, magnified=1.0)
+    if len(chosen.tail):
+        _draw_heading(axes, view, chosen)
+    height, width = frame.shape[:2]
+    middle, half = view.to_pixels(np.zeros(2)), 0.5 * min(height, width)
+    axes.set_xlim(max(-0.5, middle[0] - half), min(width - 0.5, middle[0] + half))
+    axes.set_ylim(height - 0.5, -0.5)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    bar = 5e-3 / view.metres_per_pixel
+    left, low = axes.get_xlim()[0] + 14.0, height - 16.0
+    axes.plot([left, left + bar], [low, low], color="white", linewidth=3.0, solid_capstyle="butt")
+    axes.text(left + 0.5 * bar, low - 7.0, "5 mm", color="white", fontsize=8.5, ha="center")
+    return line
+
+
+def draw_threads(
+    axes: Axes,
+    frame: NDArray[np.uint8],
+    view: DishView,
+    chosen: FrameResult,
+    obstacles: Sequence[Obstacle],
+    magnified: float,
+) -> LineCollection:
+    """Draw frame, obstacles, seen and predicted thread."""
+    axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for obstacle in obstacles:
+        if isinstance(obstacle, Disc):
+            centre = view.to_pixels(np.asarray(obstacle.centre))
+            radius = obstacle.radius / view.metres_per_pixel
+            axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, color=INK, linewidth=0.9))
+        elif isinstance(obstacle, Polygon):
+            for ring in obstacle.rings:
+                corners = view.to_pixels(np.vstack([ring, ring[:1]]))
+                axes.plot(corners[:, 0], corners[:, 1], color=INK, linewidth=0.9)
+    if len(chosen.seen) > 1:
+        seen = view.to_pixels(chosen.seen)
+        axes.plot(seen[:, 0], seen[:, 1], color=SEEN, linewidth=5.0 * magnified, alpha=0.45, solid_capstyle="round")
+    vertices = view.to_pixels(chosen.vertices)
+    clearance = chosen.clearance
+    segments = np.stack([vertices[:-1], vertices[1:]], axis=1)
+    norm = Normalize(0.0, FULL_CLEARANCE_MM)
+    line = LineCollection(list(segments), cmap=MARGIN_COLOURS, norm=norm, linewidth=2.0, capstyle="round")
+    line.set_array(np.clip(1e3 * np.minimum(clearance[:-1], clearance[1:]), 0.0, FULL_CLEARANCE_MM))
+    axes.add_collection(line)
+    dots: dict[str, Any] = {"markersize": 2.0 * magnified, "markeredgecolor": INK, "markeredgewidth": 0.4}
+    axes.plot(vertices[:, 0], vertices[:, 1], "o", color="white", **dots)
+    return line
+
+
+def _draw_close_up(
+    scene: Axes, frame: NDArray[np.uint8], view: DishView, chosen: FrameResult, obstacles: Sequence[Obstacle]
+) -> None:
+    """Draw the surroundings of the node nearest to an obstacle, or of the thread's end, magnified."""
+    vertices = view.to_pixels(chosen.vertices)
+    clearance = chosen.clearance
+    nearest = int(np.argmin(clearance)) if np.isfinite(clearance).any() else len(vertices) - 1
+    centre, half = vertices[nearest], CLOSE_UP / view.metres_per_pixel
+    # Into the corner of the picture that is farthest from the thread.
+    left, right = scene.get_xlim()
+    bottom, top = scene.get_ylim()
+    everything = np.vstack([vertices, view.to_pixels(chosen.tail[None])])
+    corners = [(x, y) for x in (0.0, 0.62) for y in (0.0, 0.62)]
+    middles = [np.array([left + (x + 0.19) * (right - left), bottom + (y + 0.19) * (top - bottom)]) for x, y in corners]
+    room = [np.linalg.norm(everything - middle, axis=1).min() for middle in middles]
+    x, y = corners[int(np.argmax(room))]
+    inset = scene.inset_axes(
+        (x + 0.01 * (x == 0.0) - 0.01 * (x > 0), y + 0.01 * (y == 0.0) - 0.01 * (y > 0), 0.38, 0.38)
+    )
+    draw_threads(inset, frame, view, chosen, obstacles, magnified=1.8)
+    inset.set_xlim(centre[0] - half, centre[0] + half)
+    inset.set_ylim(centre[1] + half, centre[1] - half)
+    for side in inset.spines.values():
+        side.set_color(INK)
+        side.set_linewidth(0.8)
+    box = (centre[0] - half, centre[1] - half, 2.0 * half, 2.0 * half)
+    scene.indicate_inset(box, inset, edgecolor=INK, alpha=0.7, linewidth=0.7)
+
+
+def _draw_colours(figure: Figure, line: LineCollection) -> None:
+    """Draw the key: what is seen, what is predicted, and the colours of the margin."""
+    seen = figure.add_axes((0.015, 0.055, 0.03, 0.02))
+    seen.axhline(0.5, color=SEEN, linewidth=5.0, alpha=0.45)
+    seen.set_axis_off()
+    figure.text(0.05, 0.059, "seen by the camera", fontsize=9, color=INK)
+    bar = figure.colorbar(line, cax=figure.add_axes((0.185, 0.062, 0.25, 0.014)), orientation="horizontal")
+    bar.set_label("predicted, by its nodes' distance from the obstacles [mm]", fontsize=8.5, color=INK)
+    bar.ax.tick_params(labelsize=8, colors=INK, length=2)
+    bar.outline.set_visible(False)
+
+
+def _draw_heading(axes: Axes, view: DishView, chosen: FrameResult) -> None:
+    tail = view.to_pixels(chosen.tail)
+    ahead = 34.0 * np.array([np.cos(chosen.heading), -np.sin(chosen.heading)])
+    outline = [patheffects.withStroke(linewidth=3.0, foreground="white")]
+    style: dict[str, Any] = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.3, "path_effects": outline}
+    axes.annotate("", xy=tuple(tail + ahead), xytext=tuple(tail), arrowprops=style)
+
+
+def _draw_error(axes: Axes, series: TimeSeries) -> None:
+    seen = series.column("error_seen")
+    axes.plot(series.times, seen, color=SEEN, linewidth=1.4, label="against the seen centreline")
+    if series.has("error_truth"):
+        truth = series.column("error_truth")
+        axes.plot(series.times, truth, color=TRUTH, linewidth=1.4, label="against the simulated truth")
+    axes.set_ylim(0.0, 1.3 * axes.get_ylim()[1])  # room for the legend
+    axes.set_title("prediction error [% of the thread's length]", fontsize=9.5, color=INK, loc="left")
+    axes.legend(loc="upper right", fontsize=8.5, frameon=False, ncols=2)
+
+
+def _draw_clearance(axes: Axes, series: TimeSeries) -> None:
+    clearance = 1e3 * np.fmin.reduce([series.column(f"margin_{kind}") for kind in SOLID_KINDS])
+    axes.set_title("least distance of a node from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
+    if not np.isfinite(clearance).any():
+        axes.text(0.5, 0.5, "no obstacle near the thread", transform=axes.transAxes, ha="center", color=FAINT)
+        return
+    axes.plot(series.times, clearance, color="#1f9d55", linewidth=1.4)
+    top = max(1.05 * float(np.nanmax(clearance)), 1e-3)
+    axes.set_ylim(-0.06 * top, top)
+    axes.axhspan(-0.06 * top, 0.0, color="#c8102e", alpha=0.15, linewidth=0)
+
+
+def _draw_strain(axes: Axes, series: TimeSeries) -> None:
+    values = np.maximum(100.0 * series.column("strain"), 1e-7)
+    axes.set_yscale("log")
+    axes.set_ylim(values.min() / 3.0, values.max() * 3.0)
+    axes.plot(series.times, values, color=INK, linewidth=1.2)
+    axes.set_title("greatest stretch or compression of a segment [%]", fontsize=9.5, color=INK, loc="left")
+
+
+def tidy(axes: Axes) -> None:
+    """Give a plot the look of all of ours."""
+    axes.grid(True, color="#e4e8ec", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=8.5, colors=INK, length=3)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(FAINT)

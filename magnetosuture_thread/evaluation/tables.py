@@ -1,0 +1,155 @@
+"""Tables for a terminal: of a replayed bag, a closed loop, and an evaluation on reference trajectories."""
+
+from __future__ import annotations
+
+import math
+
+from rich.table import Table
+
+from magnetosuture_thread.evaluation.closed_loop import LoopSummary
+from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
+from magnetosuture_thread.evaluation.metrics import Percentiles
+from magnetosuture_thread.evaluation.reference_scores import Evaluation
+
+
+def summary_table(summary: ReplaySummary) -> Table:
+    """Return the figures of a replayed bag as a table."""
+    table = _figures_table(f"{summary.bag}, set-up {summary.setup}")
+    live, by_camera = summary.speed is None, summary.source == "camera"
+    simulated = "simulated" if summary.simulated else ""
+    table.add_row("camera frames" if by_camera else "recorded poses", str(summary.frames), simulated)
+    table.add_row(
+        "  tracked" if by_camera else "  usable", str(summary.tracked), _share(summary.tracked, summary.frames)
+    )
+    table.add_row("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames))
+    for why, count in summary.refused.items():
+        table.add_row("  not used", str(count), why)
+    if live:
+        table.add_row("velocity commands", str(summary.commands), simulated)
+        table.add_row("  reached the coils", str(summary.driven), _share(summary.driven, summary.commands))
+        table.add_row("messages dropped", str(sum(summary.dropped.values())), "played, and lost on the way")
+        for way, count in summary.dropped.items():
+            if count:
+                table.add_row("  dropped", str(count), way)
+    if summary.damage:
+        table.add_row("the bag is damaged", "", summary.damage)
+    if summary.remark:
+        table.add_row("set-up in doubt", "", summary.remark)
+    table.add_section()
+    table.add_row("latency, median" if live else "times, median", "", "99th percentile, greatest")
+    for stage, found in summary.latency.items():
+        table.add_row(f"  {stage}", _milliseconds(found), _tail(found))
+    table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
+    if summary.speed is not None:
+        table.add_row("speed", f"{summary.speed:.3g}", "times as fast as recorded")
+    table.add_section()
+    table.add_row("least margin", "", "0 or more is safe; lengths are met to 0.1 %")
+    for margin in summary.least_margins:
+        where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
+        table.add_row(f"  {margin.kind}", f"{_micrometres(margin.clearance)} µm", f"{where}, at {margin.time:.2f} s")
+    table.add_row("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted))
+    table.add_row("greatest stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment")
+    table.add_row("greatest residual", f"{summary.residual:.1e}", "scaled; not the solver's own word")
+    table.add_section()
+    _add_errors(table, summary, truth="simulated truth", missing="no frame could be scored")
+    if (apart := summary.currents) is not None:
+        table.add_section()
+        tail = f"{apart.p99:.2f}, {apart.greatest:.2f} A; recorded: {apart.recorded:.2f} A rms"
+        table.add_row("currents off the recorded", f"{apart.difference:.3f} A", tail)
+        table.add_row("  stopped in one only", f"{100.0 * apart.stopped_apart:.1f} %", f"of {apart.compared}")
+    return table
+
+
+def loop_table(summary: LoopSummary) -> Table:
+    """Return the figures of a closed loop as a table."""
+    table = _figures_table(f"{summary.setup}, closed loop, simulated")
+    table.add_row("camera frames", str(summary.frames), f"over {summary.duration:.1f} s of steering")
+    table.add_row("  skipped", str(summary.skipped), "the rig had no time for them")
+    table.add_row("  tracked", str(summary.tracked), f"{summary.lost} looked at and lost")
+    table.add_row("  wrong poses", str(summary.wrong), "more than 0.3 mm or 5 degrees from the truth")
+    table.add_row("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames))
+    table.add_section()
+    table.add_row("needle from its path", f"{1e3 * summary.path_error:.3f} mm", _greatest(summary.path_error_greatest))
+    table.add_row("tracked tail from the truth", f"{1e3 * summary.tail_error:.3f} mm", "root of the mean square")
+    heading = math.degrees(summary.heading_error)
+    table.add_row("tracked heading", f"{heading:.2f} deg", "root of the mean square")
+    table.add_row("currents at a limit", f"{100.0 * summary.saturated:.1f} %", "of the commands")
+    table.add_section()
+    table.add_row("latency from the frame's stamp", "", "99th percentile, greatest")
+    for name, found in summary.latency.items():
+        table.add_row(f"  to {name}", _milliseconds(found), _tail(found))
+    table.add_row("  tracker alone", _milliseconds(summary.processing), _tail(summary.processing))
+    table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
+    table.add_section()
+    _add_errors(table, summary, truth="truth")
+    return table
+
+
+def evaluation_table(evaluation: Evaluation) -> Table:
+    """Return the scores of a set of trajectories as a table that fits 80 columns."""
+    title = f"formulation {evaluation.formulation}, solver {evaluation.solver}"
+    table = Table(title=title, title_justify="left", title_style="bold", caption_justify="left")
+    residual = max(case.max_residual for case in evaluation.cases)
+    marked = sum(case.fallbacks for case in evaluation.cases)
+    table.caption = (
+        "errors in % of the length, mean and greatest over time; stretch in %;\n"
+        "deepest node in an obstacle in m; step in µs of wall clock, median and p99;\n"
+        f"largest residual {residual:.0e}, {marked} steps fell back or did not converge"
+    )
+    table.add_column("case", no_wrap=True)
+    for name in ("error", "greatest", "stretch", "depth", "step", "p99"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for case in evaluation.cases:
+        table.add_row(
+            case.name,
+            f"{case.mean_error_percent:.3f}",
+            f"{case.max_error_percent:.3f}",
+            f"{100.0 * case.max_stretch:.3f}",
+            f"{case.max_penetration_m:.0e}" if case.max_penetration_m else "none",
+            f"{1e6 * case.step_median_s:.0f}",
+            f"{1e6 * case.step_p99_s:.0f}",
+        )
+    table.add_section()
+    table.add_row("mean of the cases", f"{evaluation.mean_error_percent:.3f}")
+    table.add_row("worst case", f"{evaluation.worst_error_percent:.3f}")
+    return table
+
+
+def _figures_table(title: str) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold")
+    table.add_column("", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("remark", style="dim")
+    return table
+
+
+def _add_errors(table: Table, summary: ReplaySummary | LoopSummary, truth: str, missing: str = "") -> None:
+    table.add_row("thread seen, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")
+    table.add_row("prediction error, mean", "", "greatest; % of the length")
+    if summary.error_seen is None and missing:
+        table.add_row("  against the seen centreline", "none", missing)
+    for name, figures in (("seen centreline", summary.error_seen), (truth, summary.error_truth)):
+        if figures is not None:
+            scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
+            table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
+
+
+def _micrometres(metres: float) -> str:
+    """Return a margin in micrometres; what is 0 within the solvers' tolerance is written so."""
+    return f"{metres * 1e6:+.3f}" if abs(metres) > 1e-9 else "0.000"
+
+
+def _greatest(metres: float) -> str:
+    return f"root of the mean square; greatest {1e3 * metres:.3f} mm"
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{100.0 * part / whole:.1f} %" if whole else ""
+
+
+def _milliseconds(found: Percentiles | None) -> str:
+    return f"{1e3 * found.median:.1f} ms" if found else "no pairs"
+
+
+def _tail(found: Percentiles | None) -> str:
+    return f"{1e3 * found.p99:.1f}, {1e3 * found.maximum:.1f} ms" if found else ""

@@ -1,0 +1,250 @@
+"""Packs the messages of every pose as CDR bytes, each with one format: pose, path, prediction, margins, markers."""
+
+from __future__ import annotations
+
+import struct
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.geometry.orientation import angle_of, turned
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.messages.building import ADD, IN_PLANE, LINE_STRIP
+from magnetosuture_thread.messages.cdr import (
+    BEGIN,
+    DISH,
+    EMPTY,
+    HEADER,
+    KEPT,
+    REAL,
+    Time,
+    array_codes,
+    form,
+    numbers,
+    points_of,
+    text,
+    text_codes,
+)
+from magnetosuture_thread.model.friction import Friction, FrictionState, friction_colour
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.predictor import Prediction
+
+_UNKNOWN, _FREE, _TOUCHING = 0, 1, 2  # as in SafetyMargins.msg
+_KIND, _NODE, _OBSTACLE = (np.dtype(code) for code in ("u1", "<u4", "<i4"))
+_PLACES = [6 * row + column for row in IN_PLANE for column in IN_PLANE]
+_POSE = form(*HEADER, *"d" * 7, *"d" * 36)
+_PATH = form(*HEADER, "I")
+# One PoseStamped of a path begins at a multiple of 8, as the next does.
+_STAMPED = np.dtype(
+    {
+        "names": ["sec", "nanosec", "length", "frame", "x", "y", "w"],
+        "formats": ["<i4", "<u4", "<u4", f"S{DISH[0]}", REAL, REAL, REAL],
+        "offsets": [0, 4, 8, 12, 24, 32, 72],
+        "itemsize": 80,
+    }
+)
+SPHERE_LIST = 7  # as in Marker.msg
+_NAMESPACE = text("thread")
+_UPRIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def packed_pose(
+    time: Time, tail: NDArray[np.float64], heading: NDArray[np.float64], covariance: NDArray[np.float64] | None = None
+) -> bytes:
+    """Return the needle's pose, a PoseWithCovarianceStamped: position of the tail, x axis along the needle there.
+
+    Args:
+        time: of the frame that it was measured in, seconds and nanoseconds.
+        tail: shape (2,) [m].
+        heading: unit vector, shape (2,).
+        covariance: of x, y [m] and the angle of the heading [rad], shape (3, 3); zeros, which say in ROS
+            that it is not known, if None.
+    """
+    whole = [0.0] * 36
+    if covariance is not None:
+        for place, value in zip(_PLACES, covariance.ravel().tolist(), strict=True):
+            whole[place] = value
+    z, w = turned(angle_of(heading))
+    return BEGIN + _POSE.pack(*time, *DISH, tail[0], tail[1], 0.0, 0.0, 0.0, z, w, *whole)
+
+
+def packed_path(time: Time, points: Points) -> bytes:
+    """Return a polyline of shape (m, 2) [m] as a Path.
+
+    Args:
+        time: seconds and nanoseconds.
+        points: of the polyline.
+    """
+    poses = np.zeros(len(points), _STAMPED)
+    poses["sec"], poses["nanosec"] = time
+    poses["length"], poses["frame"] = DISH
+    poses["x"], poses["y"], poses["w"] = points[:, 0], points[:, 1], 1.0
+    return BEGIN + _PATH.pack(*time, *DISH, len(points)) + poses.tobytes()
+
+
+def packed_prediction(time: Time, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:
+    """Return a PredictedThread.
+
+    Args:
+        time: of the pose, seconds and nanoseconds.
+        prediction: the thread.
+        material: its name.
+        step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
+    """
+    vertices = prediction.vertices
+    words = (prediction.formulation, prediction.scene_version, material, prediction.solver, prediction.status)
+    formulation, scene, thread, solver, status = map(text, words)
+    sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.stretch), solver[0], status[0])
+    return BEGIN + _prediction_form(*sizes).pack(
+        *time,
+        *DISH,
+        *formulation,
+        *scene,
+        *thread,
+        len(vertices),
+        points_of(vertices),
+        len(prediction.stretch),
+        numbers(prediction.stretch, REAL),
+        *solver,
+        *status,
+        prediction.residual,
+        prediction.interval,
+        prediction.substeps,
+        step_time,
+    )
+
+
+def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_version: str = "") -> bytes:
+    """Return a SafetyMargins: every barrier, the least of each kind, and what touches; or why there are none.
+
+    Args:
+        time: of the pose, seconds and nanoseconds.
+        margins: of its prediction; None where there are none.
+        reason: why there are none.
+        scene_version: of the scene in force where there are none.
+    """
+    scene = text(scene_version if margins is None else margins.scene_version)
+    if margins is None:
+        words = text(reason)
+        return BEGIN + _no_margins_form(scene[0], words[0]).pack(
+            *time, *DISH, *scene, False, *words, *[0] * 6, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
+        )
+    count = len(margins.kind)
+    friction = margins.friction
+    layout = _margins_form(scene[0], count, len(margins.least), len(margins.touching), len(friction.nodes))
+    return BEGIN + layout.pack(
+        *time,
+        *DISH,
+        *scene,
+        True,
+        *EMPTY,
+        count,
+        numbers(margins.kind, _KIND),
+        count,
+        numbers(margins.node, _NODE),
+        count,
+        numbers(margins.obstacle, _OBSTACLE),
+        count,
+        numbers(margins.value, REAL),
+        count,
+        numbers(margins.clearance, REAL),
+        len(margins.least),
+        *[
+            number
+            for least in margins.least
+            for number in (least.kind, least.node, least.obstacle, least.value, least.clearance)
+        ],
+        _TOUCHING if margins.touching else _FREE,
+        len(margins.touching),
+        *margins.touching,
+        friction.state,
+        len(friction.nodes),
+        *friction.nodes,
+        friction.slowdown,
+    )
+
+
+@lru_cache(KEPT)
+def _prediction_form(
+    formulation: int, scene: int, material: int, vertices: int, stretch: int, solver: int, status: int
+) -> struct.Struct:
+    """Return the format of a PredictedThread with texts of these lengths, and so many vertices and segments."""
+    begin = (*HEADER, *text_codes(formulation), *text_codes(scene), *text_codes(material))
+    arrays = (*array_codes(vertices, "d", 3), *array_codes(stretch, "d"))
+    return form(*begin, *arrays, *text_codes(solver), *text_codes(status), "d", "d", "I", "d")
+
+
+@lru_cache(KEPT)
+def _margins_form(scene: int, barriers: int, least: int, touching: int, squeezed: int) -> struct.Struct:
+    """Return the format of a SafetyMargins with so many barriers, least ones, nodes that touch, and under friction."""
+    arrays = [code for kind in "BIidd" for code in array_codes(barriers, kind)]
+    return form(
+        *HEADER,
+        *text_codes(scene),
+        "?",
+        *text_codes(EMPTY[0]),
+        *arrays,
+        "I",
+        *"BIidd" * least,
+        *_nodes(touching),
+        *_nodes(squeezed),
+        "d",
+    )
+
+
+@lru_cache(KEPT)
+def _no_margins_form(scene: int, reason: int) -> struct.Struct:
+    """Return the format of a SafetyMargins without any, but a reason of this length."""
+    return form(*HEADER, *text_codes(scene), "?", *text_codes(reason), *"IIIIII", *_nodes(0), *_nodes(0), "d")
+
+
+def _nodes(count: int) -> tuple[str, ...]:
+    """Return the codes of a state and the nodes that it is about."""
+    return "B", "I", *"I" * count
+
+
+def packed_markers(time: Time, prediction: Prediction, friction: Friction, diameter: float) -> bytes:
+    """Return the predicted thread as a line in the colour of its friction, and the nodes under friction as balls.
+
+    A MarkerArray.
+
+    Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback": green where free, orange, darker
+    with every node, where pulled under friction, blue where it rests. Deviation: grey where nobody knows.
+
+    Args:
+        time: of the pose, seconds and nanoseconds.
+        prediction: the thread.
+        friction: of it.
+        diameter: of the thread [m].
+    """
+    width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
+    colour = (*friction_colour(friction), 1.0)
+    balls = prediction.vertices[list(friction.nodes)]
+    line = _marker(time, 0, LINE_STRIP, (width, 0.0, 0.0), colour, len(prediction.vertices))
+    spheres = _marker(time, 1, SPHERE_LIST, (2.0 * width,) * 3, colour, len(balls))
+    packed = _markers_form(len(prediction.vertices), len(balls)).pack(
+        2, *line, points_of(prediction.vertices), *_REST, *spheres, points_of(balls), *_REST
+    )
+    return BEGIN + packed
+
+
+def _marker(
+    time: Time, number: int, kind: int, scale: tuple[float, ...], colour: tuple[float, ...], points: int
+) -> tuple[object, ...]:
+    return (*time, *DISH, *_NAMESPACE, number, kind, ADD, *_UPRIGHT, *scale, *colour, 0, 0, False, points)
+
+
+# Colours of single points, a texture with its header and picture, its coordinates, a text, a mesh and its file.
+_REST = (0, *EMPTY, 0, 0, *EMPTY, *EMPTY, 0, 0, *EMPTY, *EMPTY, *EMPTY, 0, False)
+_EMPTY = text_codes(EMPTY[0])
+_REST_CODES = ("I", *_EMPTY, "i", "I", *_EMPTY, *_EMPTY, "I", "I", *_EMPTY, *_EMPTY, *_EMPTY, "I", "?")
+
+
+@lru_cache(KEPT)
+def _markers_form(line: int, balls: int) -> struct.Struct:
+    codes = ["I"]
+    for points in (line, balls):
+        codes += [*HEADER, *text_codes(_NAMESPACE[0]), "i", "i", "i", *"d" * 7, *"d" * 3, *"f" * 4, "i", "I", "?"]
+        codes += [*array_codes(points, "d", 3), *_REST_CODES]
+    return form(*codes)

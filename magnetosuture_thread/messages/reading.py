@@ -1,0 +1,205 @@
+"""Reads messages of any library, and the headers, poses and paths among CDR bytes, many times faster than decoded.
+
+Of bytes, what is not laid out as these readers expect is left to whoever decodes all messages.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.orientation import as_told, heading_of
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_POSE, SEEN_THREAD
+from magnetosuture_thread.messages.building import IN_PLANE
+from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish
+from magnetosuture_thread.model.predictor import NeedlePose
+
+_POSE = struct.Struct("<7d")  # position and quaternion
+_COUNT = struct.Struct("<I")
+_MAX_NAME = 256  # bytes of the names of frames that are passed over in a path
+_POSE_AT, _COUNT_AT = aligned(DISH_END, 8), aligned(DISH_END, 4)
+_PATH_AT = _COUNT_AT + _COUNT.size
+_NAME_AT = _PATH_AT + 8  # the length of the frame's name in a path's first pose
+_ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Return a time message in nanoseconds."""
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
+
+
+def checked_nanoseconds(stamp: Any, field: str) -> int:
+    """Return a time message in nanoseconds, or refuse one with a second's or more beside its seconds."""
+    if stamp.nanosec >= 1_000_000_000:
+        raise InvalidInputError(f"{field}.header.stamp.nanosec", stamp.nanosec, "less than a second's")
+    return nanoseconds(stamp)
+
+
+def seconds(stamp: Any) -> float:
+    """Return a time message in seconds."""
+    return nanoseconds(stamp) * 1e-9
+
+
+def require_dish_frame(frame: str, field: str) -> None:
+    """Refuse a message in another frame than the dish's."""
+    if frame != DISH_FRAME:
+        raise InvalidInputError(f"{field}.header.frame_id", repr(frame), repr(DISH_FRAME))
+
+
+def needle_pose(message: Any) -> NeedlePose:
+    """Return the needle's pose in the plane, of a PoseWithCovarianceStamped.
+
+    Raises:
+        InvalidInputError: wrong frame, no stamp, or no unit quaternion.
+    """
+    require_dish_frame(message.header.frame_id, NEEDLE_POSE.name)
+    stamp = message.header.stamp
+    checked_nanoseconds(stamp, NEEDLE_POSE.name)  # the prediction could not be stamped by another
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    heading = heading_of(q.x, q.y, q.z, q.w, _ORIENTATION)
+    return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
+
+
+def tracked_pose(stamp: Any, tail: NDArray[np.float64], heading: NDArray[np.float64]) -> NeedlePose:
+    """Return a needle's pose as `needle_pose` returns it of its message, to the last bit.
+
+    Raises:
+        InvalidInputError: no stamp.
+    """
+    checked_nanoseconds(stamp, NEEDLE_POSE.name)
+    along = as_told(heading, _ORIENTATION)
+    return NeedlePose(seconds(stamp), np.array([float(tail[0]), float(tail[1])]), along)
+
+
+def pose_covariance(message: Any) -> NDArray[np.float64] | None:
+    """Return the covariance of x, y [m] and the heading's angle [rad], shape (3, 3); None for zeros, as for unknown.
+
+    Raises:
+        InvalidInputError: it is not finite, or a variance is negative.
+    """
+    whole = np.asarray(message.pose.covariance).reshape(6, 6)
+    if not whole.any():
+        return None
+    covariance = whole[np.ix_(IN_PLANE, IN_PLANE)]
+    if not np.isfinite(covariance).all() or (np.diag(covariance) < 0.0).any():
+        diagonal = np.diag(covariance).tolist()
+        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", diagonal, "finite variances of at least 0")
+    return np.asarray(covariance)
+
+
+def planar_pose(pose: Any) -> tuple[float, float, float]:
+    """Return x, y [m] and the angle [rad] of a Pose in the plane."""
+    turn = pose.orientation
+    return pose.position.x, pose.position.y, 2.0 * float(np.arctan2(turn.z, turn.w))
+
+
+def path_points(message: Any, field: str = SEEN_THREAD.name) -> Points:
+    """Return a Path as an array of shape (m, 2) [m].
+
+    Raises:
+        InvalidInputError: wrong frame.
+    """
+    require_dish_frame(message.header.frame_id, field)
+    return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
+
+
+def plane_velocity(message: Any, field: str) -> NDArray[np.float64]:
+    """Return the velocity of a TwistStamped in the dish plane, shape (2,) [m/s].
+
+    Raises:
+        InvalidInputError: wrong frame, or a motion that the needle cannot make: out of the plane, or a turn
+            apart from that which the tip's velocity amounts to.
+    """
+    require_dish_frame(message.header.frame_id, field)
+    linear, angular = message.twist.linear, message.twist.angular
+    others = [linear.z, angular.x, angular.y, angular.z]
+    if any(value != 0.0 for value in others):
+        raise InvalidInputError(f"{field}.twist", f"linear.z, angular = {others}", "zeros: x and y alone count")
+    return np.array([linear.x, linear.y])
+
+
+class Record(Protocol):
+    """A recorded message."""
+
+    @property
+    def topic(self) -> str:
+        """Its topic."""
+
+    @property
+    def time(self) -> int:
+        """When it was recorded [ns]."""
+
+    @property
+    def data(self) -> bytes:
+        """Its CDR bytes."""
+
+    def decode(self) -> Any:
+        """Return the message.
+
+        Raises:
+            BagError: it cannot be decoded.
+        """
+
+
+def stamp_of(record: Record) -> int:
+    """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
+    stamp = header_stamp(record.data)
+    return record.time if stamp is None else stamp
+
+
+def read_pose(record: Record) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return tail and heading of a recorded needle pose, each of shape (2,), as `thread_model` gets them.
+
+    Raises:
+        BagError: it cannot be decoded.
+        InvalidInputError: it is of another frame, or its orientation is none.
+    """
+    data = record.data
+    if _is_plain(data) and len(data) >= _POSE_AT + _POSE.size:
+        x, y, _, qx, qy, qz, qw = _POSE.unpack_from(data, _POSE_AT)
+        return np.array([x, y]), heading_of(qx, qy, qz, qw, _ORIENTATION)
+    message = record.decode()
+    require_dish_frame(message.header.frame_id, record.topic)
+    position, q = message.pose.pose.position, message.pose.pose.orientation
+    return np.array([position.x, position.y]), heading_of(q.x, q.y, q.z, q.w, _ORIENTATION)
+
+
+def read_path(record: Record) -> Points:
+    """Return a recorded path as an array of shape (m, 2) [m].
+
+    Raises:
+        BagError: it cannot be decoded.
+        InvalidInputError: it is of another frame.
+    """
+    found = _plain_path(record.data)
+    return path_points(record.decode(), record.topic) if found is None else found
+
+
+def _plain_path(data: bytes) -> Points | None:
+    """Return a path whose poses all have frames of one length, so that they lie at equal distances."""
+    if not _is_plain(data) or len(data) < _PATH_AT:
+        return None
+    (count,) = _COUNT.unpack_from(data, _COUNT_AT)
+    if count == 0:
+        return np.empty((0, 2))
+    if len(data) < _NAME_AT + _COUNT.size:
+        return None
+    (name,) = _COUNT.unpack_from(data, _NAME_AT)
+    first = aligned(_NAME_AT + _COUNT.size + name, 8)
+    stride = first + _POSE.size - _PATH_AT
+    if len(data) < _PATH_AT + count * stride or (count > 1 and name > _MAX_NAME):
+        return None
+    names = np.ndarray((count,), "<u4", data, _NAME_AT, (stride,))
+    if names.tobytes() != data[_NAME_AT : _NAME_AT + _COUNT.size] * count:
+        return None
+    return np.array(np.ndarray((count, 2), "<f8", data, first, (stride, 8)), np.float64)
+
+
+def _is_plain(data: bytes) -> bool:
+    """Return whether a message is in the dish frame, and written as our machines write it."""
+    return data[:2] == LITTLE_ENDIAN and is_in_dish(data)

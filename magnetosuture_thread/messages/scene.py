@@ -1,0 +1,116 @@
+"""Scenes as the fields of a message magnetosuture_msgs/Scene of any library, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
+from magnetosuture_thread.interface import DISH_FRAME, SCENE
+from magnetosuture_thread.scene.scene import (
+    MAX_HOLES,
+    MAX_NAME_CHARS,
+    MAX_SHAPES,
+    MAX_VERTICES,
+    VERSION_CHARS,
+    Dish,
+    Scene,
+    SceneShape,
+)
+
+Ring = tuple[tuple[float, float], ...]
+
+
+def scene_fields(scene: Scene) -> dict[str, Any]:
+    """Return what a message says of a scene, in plain values by the names of the fields, all but the header.
+
+    A shape has `disc`, a list of none or one of x, y, radius, and `polygon`, a list of none or one of `outline` and
+    `holes`. An outline is a dictionary whose `corners` are dictionaries of x, y and z.
+    """
+    return {
+        "version": scene.version,
+        "dish_diameter": scene.dish.diameter,
+        "dish_depth": scene.dish.depth,
+        "shapes": [_shape_fields(shape) for shape in scene.shapes],
+    }
+
+
+def scene_of(message: Any) -> Scene:
+    """Return the scene that a message tells, once it is known to be whole.
+
+    Args:
+        message: a magnetosuture_msgs/Scene of any library.
+
+    Raises:
+        InvalidInputError: another frame, anything out of bounds, or a content whose hash is not the message's
+            version: it is damaged, or was made by other rules.
+    """
+    frame = message.header.frame_id
+    if frame != DISH_FRAME:
+        raise InvalidInputError(f"{SCENE.name}.header.frame_id", repr(frame[:MAX_NAME_CHARS]), repr(DISH_FRAME))
+    _require_bounds(message)
+    try:
+        dish = Dish(float(message.dish_diameter), float(message.dish_depth))
+        scene = Scene(dish, tuple(_shape_of(shape) for shape in message.shapes))
+    except ConfigurationError as error:
+        raise InvalidInputError(f"{SCENE.name}.{error.name}", repr(error.value), error.expectation) from None
+    if message.version != scene.version:
+        given = repr(message.version[: 2 * VERSION_CHARS])
+        raise InvalidInputError(f"{SCENE.name}.version", given, f"{scene.version!r}, the hash of the content")
+    return scene
+
+
+def _shape_fields(shape: SceneShape) -> dict[str, Any]:
+    geometry = shape.geometry
+    fields: dict[str, Any] = {"name": shape.name, "kind": shape.kind, "disc": [], "polygon": []}
+    if isinstance(geometry, Disc):
+        fields["disc"] = [{"x": geometry.centre[0], "y": geometry.centre[1], "radius": geometry.radius}]
+    else:
+        rings = [_outline_fields(ring) for ring in (geometry.outline, *geometry.holes)]
+        fields["polygon"] = [{"outline": rings[0], "holes": rings[1:]}]
+    return fields
+
+
+def _outline_fields(ring: Ring) -> dict[str, Any]:
+    return {"corners": [{"x": x, "y": y, "z": 0.0} for x, y in ring]}
+
+
+def _require_bounds(message: Any) -> None:
+    """Refuse more than a scene may have before anything is made of it, which takes time."""
+
+    def require(field: str, count: int, most: int) -> None:
+        if count > most:
+            raise InvalidInputError(f"{SCENE.name}.{field}", count, f"at most {most}")
+
+    require("shapes", len(message.shapes), MAX_SHAPES)
+    vertices = 0
+    for index, shape in enumerate(message.shapes):
+        field = f"shapes[{index}]"
+        require(f"{field}.name", len(shape.name), MAX_NAME_CHARS)
+        require(f"{field}.kind", len(shape.kind), MAX_NAME_CHARS)
+        if len(shape.disc) + len(shape.polygon) != 1:
+            given = f"{len(shape.disc)} discs and {len(shape.polygon)} polygons"
+            raise InvalidInputError(f"{SCENE.name}.{field}", given, "one disc or one polygon")
+        for polygon in shape.polygon:
+            require(f"{field}.polygon.holes", len(polygon.holes), MAX_HOLES)
+            vertices += sum(len(ring.corners) for ring in (polygon.outline, *polygon.holes))
+    require("shapes.polygon.corners", vertices, MAX_VERTICES)
+
+
+def _shape_of(shape: Any) -> SceneShape:
+    geometry: Disc | Polygon
+    if len(shape.disc):
+        disc = shape.disc[0]
+        geometry = Disc((float(disc.x), float(disc.y)), float(disc.radius))
+    else:
+        polygon = shape.polygon[0]
+        try:
+            geometry = Polygon(_ring(polygon.outline), tuple(_ring(hole) for hole in polygon.holes))
+            triangulate(geometry)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{shape.name}.{error.name}", error.value, error.expectation) from None
+    return SceneShape(shape.name, shape.kind, geometry)
+
+
+def _ring(outline: Any) -> Ring:
+    return tuple((float(corner.x), float(corner.y)) for corner in outline.corners)

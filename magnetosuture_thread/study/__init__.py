@@ -1,1 +1,0 @@
-"""Study: reference trajectories, scores, tables and pictures."""

@@ -1,0 +1,175 @@
+"""How numbers enter the settings, and the file that comes of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from magnetosuture_thread.calibration.parameters import (
+    OF_FORMULATION,
+    STIFFNESS_OVER_DRAG,
+    chosen,
+    known_settings,
+    stiffness_over_drag,
+    with_stiffness_over_drag,
+)
+from magnetosuture_thread.calibration.result import (
+    FIXED,
+    AttachmentVerdict,
+    BagErrors,
+    Calibration,
+    Estimate,
+)
+from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
+from magnetosuture_thread.calibration.yaml_text import to_yaml
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.parameter_files import load_setup
+
+SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12)
+
+ALL = [(formulation, parameter) for formulation, many in OF_FORMULATION.items() for parameter in many]
+
+
+@pytest.mark.parametrize(("formulation", "parameter"), ALL, ids=[parameter.name for _, parameter in ALL])
+def test_a_number_goes_in_and_comes_out(formulation, parameter):
+    settings = replace(SETTINGS, formulation=formulation)
+    low, high = parameter.fit_bounds(settings)
+    assert low < parameter.to_fit(parameter.read(settings)) <= high
+    for part in (0.001, 0.3, 0.999):
+        value = parameter.from_fit(low + part * (high - low))
+        changed = parameter.write(settings, value)
+        assert parameter.read(changed) == pytest.approx(value, rel=1e-9, abs=1e-15)
+        assert parameter.reset(changed, settings) == settings
+    lower, upper = parameter.interval(parameter.to_fit(parameter.read(settings)), 1e-6)
+    assert lower < parameter.read(settings) < upper
+
+
+def test_only_the_ratio_of_stiffness_and_drag_counts():
+    thick = replace(SETTINGS, viscosity=3.0, diameter=8e-5)
+    one, other = (STIFFNESS_OVER_DRAG.write(settings, 2e-9).thread() for settings in (SETTINGS, thick))
+    for thread in (one, other):
+        assert thread.bending_stiffness / thread.medium.drag_across == pytest.approx(2e-9)
+    assert other.bending_stiffness > 2.5 * one.bending_stiffness
+
+
+def test_names_of_settings_are_checked():
+    assert chosen("rod", ["attachment"]) == ((), True)
+    assert [parameter.name for parameter in chosen("rod", ["attachment_offset"])[0]] == ["offset along", "offset left"]
+    assert known_settings("paper") == ("paper_damping", "paper_stiffness_weight")
+    with pytest.raises(ConfigurationError, match="did you mean drag_anisotropy"):
+        chosen("rod", ["drag_anisotopy"])
+
+
+def found(**changes: Any) -> Calibration:
+    """Return a calibration as a search gives it."""
+    settings = replace(
+        with_stiffness_over_drag(SETTINGS, 2e-9), rest_curvature=12.0, attachment="glued", attachment_offset=(1e-4, 0.0)
+    )
+    estimates = (
+        Estimate("stiffness over drag", "elastic_modulus", "m^4/s", 2e-9, 1.3e-9, 1.8e-9, 2.2e-9),
+        Estimate("drag anisotropy", "drag_anisotropy", "", 0.5, 0.5, 0.2, 1.1, FIXED, "too wide to be of use"),
+        Estimate("rest curvature", "rest_curvature", "1/m", 12.0, 0.0, 11.0, 13.0),
+        Estimate("offset along", "attachment_offset", "m", 1e-4, 0.0, 5e-5, 1.5e-4),
+        Estimate("offset left", "attachment_offset", "m", 0.0, 0.0, -1.0, 1.0, FIXED, "too little to be seen"),
+    )
+    given: dict[str, Any] = {
+        "settings": settings,
+        "start": SETTINGS,
+        "against": "seen",
+        "estimates": estimates,
+        "attachment": AttachmentVerdict("glued", "pinned", {"pinned": 9.0, "glued": 0.4}),
+        "scores": (BagErrors("a/bag", 600, 3.0, 0.4, 0.5, 2.9, 0.1, 0.2), BagErrors("b", 100, 3.0, 0.4)),
+        "simulated": ("camera frames", ""),
+        "replays": 60,
+    }
+    return Calibration(**{**given, **changes})
+
+
+def loaded(text: str, folder: Path) -> ThreadModelSettings:
+    """Return the settings that a node would have from a file."""
+    path = folder / "found.yaml"
+    path.write_text(text, encoding="utf-8")
+    settings = load_setup(path, [ThreadModelSettings])["thread_model"]
+    assert isinstance(settings, ThreadModelSettings)
+    return settings
+
+
+def test_the_file_is_what_thread_model_loads(tmp_path: Path):
+    text = to_yaml(found())
+    settings = loaded(text, tmp_path)
+    assert stiffness_over_drag(settings) == pytest.approx(2e-9, rel=1e-5)
+    assert replace(settings, elastic_modulus=1.0) == replace(found().settings, elastic_modulus=1.0)
+    assert "drag_anisotropy:" not in text
+    assert "# drag anisotropy is left out, as this data cannot tell it: too wide to be of use" in text
+    assert "# offset left stays 0 m, as this data cannot tell it: too little to be seen" in text
+    assert "m^4/s [1.8e-09 to 2.2e-09]" in text
+    assert "From a/bag (simulated: camera frames), 600 frames" in text
+    assert "nothing in it says that it is simulated" in text
+    assert "the viscosity" in text
+    for line in text.splitlines():
+        assert len(line) <= 120
+
+
+def test_a_whole_number_is_written_with_its_point(tmp_path: Path):
+    settings = replace(SETTINGS, elastic_modulus=2e9, rest_curvature=12.0)
+    text = to_yaml(found(settings=settings, estimates=found().estimates[:3], attachment=None))
+    assert "elastic_modulus: 2.0e+09 #" in text
+    assert "rest_curvature: 12.0 #" in text
+    assert "attachment: pinned # as in the set-up" in text
+    assert loaded(text, tmp_path) == settings
+
+
+def test_an_attachment_that_cannot_be_told_is_left_out():
+    verdict = AttachmentVerdict("pinned", "pinned", {"pinned": 0.4, "glued": 0.41}, "glued is worse by 0.01 only")
+    text = to_yaml(found(attachment=verdict))
+    assert "# attachment is left out, as this data cannot tell it: glued is worse by 0.01 only" in text
+    assert "    attachment: " not in text
+
+
+def test_the_paper_s_file_says_so(tmp_path: Path):
+    settings = replace(SETTINGS, formulation="paper", paper_damping=0.9, paper_stiffness_weight=3.0)
+    estimates = (
+        Estimate("kappa", "paper_damping", "", 0.9, 0.95, 0.8, 0.95),
+        Estimate("W_stiff", "paper_stiffness_weight", "", 3.0, 0.01, 1.0, 9.0),
+    )
+    text = to_yaml(found(settings=settings, estimates=estimates, attachment=None))
+    assert loaded(text, tmp_path) == settings
+    assert "EI / zeta_perp" not in text
+
+
+def test_what_is_not_finished_says_so():
+    unfinished = replace(found(), finished=False)
+    assert to_yaml(unfinished).startswith("# BEST SO FAR, NOT FINISHED")
+    assert unfinished.to_json()["finished"] is False
+    assert "not finished" in str(parameter_table(unfinished.to_json()).title)
+
+
+def test_tables_and_lines_say_what_is_there():
+    values = found().to_json()
+    assert parameter_table(values).row_count == 6
+    table = bag_table(values)
+    assert [" ".join(str(column.header).split()) for column in table.columns] == [
+        *("bag", "frames", "before", "after", "held out"),
+        *("truth before", "truth after", "truth held out"),
+    ]
+    lines = calibration_lines(values)
+    assert lines[0] == "warning: drag anisotropy cannot be identified in this data: too wide to be of use"
+    assert lines[-1] == "simulated: a/bag"
+    assert math.isclose(values["bags"][0]["held_out"], 0.5)
+    assert values["bags"][1]["held_out"] is None
+
+
+def test_nodes_that_are_farther_off_after_the_fit_are_a_warning():
+    assert BagErrors("a", 100, 0.2, 0.2, across_before=0.1, across_after=0.05).warning == ""
+    assert BagErrors("a", 100, math.nan, math.nan).warning == ""
+    words = BagErrors("a", 100, 0.15, 0.21, across_before=0.1, across_after=0.05).warning
+    assert words.startswith("a: the nodes are 0.21 % of the length off after the fit, 0.15 % before")
+    assert (
+        "across the thread, which is what was fitted, 0.05 % after, 0.1 % before: what is left lies along it" in words
+    )
+    assert BagErrors("a", 100, 0.15, 0.21, across_before=0.1, across_after=0.2).warning.endswith("do not use")

@@ -1,0 +1,153 @@
+"""A calibration finds what was put in, and says what cannot be found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.calibration.parameters import stiffness_over_drag
+from magnetosuture_thread.calibration.passage import passage_of
+from magnetosuture_thread.calibration.replays import Best
+from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, Calibration, Estimate
+from magnetosuture_thread.calibration.search import calibrate, unfinished
+from magnetosuture_thread.calibration.starts import local_minima
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.model.settings import ThreadModelSettings
+from test.calibration.runs import SETTINGS, SILK, model_run, noisy, rig_passage, rig_run, stiff
+
+TRUE = 1.3e-9  # m^4/s
+
+
+def of(found: Calibration, name: str) -> Estimate:
+    """Return an estimate by its name."""
+    return next(estimate for estimate in found.estimates if estimate.name == name)
+
+
+@pytest.mark.parametrize(("start", "noise"), [(0.2, 0.0), (5.0, 3e-5)])
+def test_the_stiffness_of_the_rigs_own_rod_is_found_from_a_wrong_start(start: float, noise: float):
+    shares: list[float] = []
+    found, fits = calibrate(
+        [rig_passage(TRUE, noise)],
+        stiff(start * TRUE),
+        ["elastic_modulus", "drag_anisotropy", "rest_curvature"],
+        progress=shares.append,
+    )
+    stiffness = of(found, "stiffness over drag")
+    assert stiffness.status == IDENTIFIED
+    assert stiffness.value == pytest.approx(TRUE, rel=0.05)
+    assert stiffness.low < TRUE < stiffness.high
+    assert stiffness.high / stiffness.low < 1.5
+    assert stiffness_over_drag(found.settings) == pytest.approx(stiffness.value, rel=1e-9)
+    score = found.scores[0]
+    assert score.truth_after < 0.3 < score.truth_before
+    assert len(fits[0].after) == score.frames
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_bags_are_one_fit_and_each_is_predicted_by_the_others():
+    passages = [rig_passage(TRUE, 2e-5, phase, name=str(phase)) for phase in (0.0, 1.5)]
+    found, _ = calibrate(passages, stiff(3.0 * TRUE), ["elastic_modulus"])
+    assert of(found, "stiffness over drag").value == pytest.approx(TRUE, rel=0.05)
+    for score in found.scores:
+        assert score.truth_held_out < 0.3 < score.truth_before
+        assert score.truth_held_out == pytest.approx(score.truth_after, abs=0.05)
+
+
+@pytest.mark.parametrize("glued", [False, True])
+def test_the_attachment_is_told_from_how_the_thread_moves(glued: bool):
+    wrong = replace(stiff(TRUE), attachment="pinned" if glued else "glued")
+    found, _ = calibrate([rig_passage(TRUE, 2e-5, glued=glued)], wrong, ["attachment", "elastic_modulus"])
+    assert found.settings.attachment == ("glued" if glued else "pinned")
+    assert found.attachment is not None
+    assert found.attachment.reason == ""
+    assert of(found, "stiffness over drag").value == pytest.approx(TRUE, rel=0.05)
+
+
+def test_the_attachment_can_be_asked_for_alone():
+    wrong = replace(stiff(TRUE), attachment="glued")
+    found, _ = calibrate([rig_passage(TRUE)], wrong, ["attachment"])
+    assert (found.settings, found.estimates) == (stiff(TRUE), ())
+    assert found.attachment is not None
+    assert found.attachment.errors["glued"] > 3.0 * found.attachment.errors["pinned"]
+
+
+@pytest.mark.parametrize("noise", [0.0, 4e-5])
+def test_of_silk_the_stiffness_cannot_be_told(noise: float):
+    sights = model_run(SILK, 8.0, scale=0.04, period=40.0)
+    passage = passage_of("silk", noisy(sights, noise) if noise else sights, SILK)
+    found, _ = calibrate([passage], SILK, ["elastic_modulus", "drag_anisotropy"])
+    stiffness = of(found, "stiffness over drag")
+    assert stiffness.status == FIXED
+    assert "elsewhere it goes where it is pulled" in stiffness.reason
+    assert found.settings.elastic_modulus == SILK.elastic_modulus
+    assert any("stiffness over drag cannot be identified" in warning for warning in found.warnings)
+
+
+def test_what_the_set_up_says_gives_way_where_it_predicts_worse_though_it_cannot_be_told():
+    sights = model_run(SILK, 8.0, scale=0.012, period=12.0)
+    found, _ = calibrate(
+        [passage_of("silk", sights, SILK)], stiff(100.0 * stiffness_over_drag(SILK), SILK), ["elastic_modulus"]
+    )
+    stiffness = of(found, "stiffness over drag")
+    assert stiffness.status == "stand-in"
+    assert found.scores[0].after < found.scores[0].before - 0.1
+    assert any("stands in" in warning for warning in found.warnings)
+
+
+def test_what_the_model_itself_made_is_found_exactly():
+    true = replace(stiff(2.0 * TRUE), drag_anisotropy=0.65, rest_curvature=20.0)
+    passage = passage_of("run", model_run(true), SETTINGS)
+    found, _ = calibrate([passage], SETTINGS, ["elastic_modulus", "drag_anisotropy", "rest_curvature"])
+    assert of(found, "stiffness over drag").value == pytest.approx(2.0 * TRUE, rel=0.02)
+    assert of(found, "drag anisotropy").value == pytest.approx(0.65, rel=0.02)
+    assert of(found, "rest curvature").value == pytest.approx(20.0, abs=0.5)
+    assert found.error < 0.1
+
+
+def test_the_paper_s_numbers_are_fitted_too():
+    settings = replace(SETTINGS, formulation="paper", paper_damping=0.999)
+    found, _ = calibrate([passage_of("run", rig_run(TRUE, 4.5), settings)], settings, ["paper_damping"])
+    assert [estimate.setting for estimate in found.estimates] == ["paper_damping"]
+    assert found.scores[0].after < found.scores[0].before - 1.0
+
+
+def test_an_interrupted_search_has_its_best():
+    class InterruptError(Exception):
+        pass
+
+    best, passage = Best(), rig_passage(TRUE)
+
+    def stop(share: float) -> None:
+        if best.replays > 18:
+            raise InterruptError
+
+    with pytest.raises(InterruptError):
+        calibrate([passage], stiff(5.0 * TRUE), best=best, progress=stop)
+    found, fits = unfinished([passage], stiff(5.0 * TRUE), best)
+    assert not found.finished
+    assert found.error < found.scores[0].before
+    assert found.error == pytest.approx(best.error)
+    assert {estimate.status for estimate in found.estimates} == {"unfinished"}
+    assert np.isfinite(fits[0].after).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "names", "words"),
+    [
+        (SETTINGS, ["elastic_module"], "did you mean elastic_modulus"),
+        (SETTINGS, ["paper_damping"], "expected some of"),
+        (replace(SETTINGS, medium="air"), [], "liquid: what is fitted is bending over drag"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_refused(settings: ThreadModelSettings, names: list[str], words: str):
+    with pytest.raises(ConfigurationError, match=words):
+        calibrate([rig_passage(TRUE)], settings, names)
+
+
+def test_minima_of_a_row():
+    assert local_minima([1.0, 2.0, 3.0]) == [0]
+    assert local_minima([3.0, 3.0, 3.0]) == [0]
+    assert local_minima([5.0, 4.0, 6.0, 1.0, 2.0]) == [3, 1]

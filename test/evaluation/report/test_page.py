@@ -1,0 +1,333 @@
+"""The page of one bag: whole in itself, with the figures in it, and nothing of a bag's words run."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import re
+import shutil
+import subprocess
+import zlib
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from magnetosuture_thread.evaluation.frames import FrameResult, Observation
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures
+from magnetosuture_thread.evaluation.report.headlines import headlines
+from magnetosuture_thread.evaluation.report.page import write_page
+from magnetosuture_thread.evaluation.report.pictures import Photo, draw_worst_frame
+from magnetosuture_thread.evaluation.report.plots import page_data
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.model.margins import LeastBarrier, Margins
+
+LENGTH = 0.019
+NODES = np.column_stack([0.004 - LENGTH * np.arange(26) / 25, np.zeros(26)])
+EVIL = '<script>alert("x")</script>\'"&'
+ABOUT = BagDetails("loop", "/data/loop", "petri", length=LENGTH, segments=25, dish_diameter=0.035, duration=10.0)
+VOID = {"meta", "img", "br", "link"}
+
+
+def margins(clearance: float) -> Margins:
+    """Return margins of one node at a post."""
+    least = (LeastBarrier(2, 7, 0, clearance, clearance),)
+    one = np.array([clearance])
+    kind, node, obstacle = np.array([2], np.uint8), np.array([7], np.uint32), np.array([0], np.int32)
+    return Margins(kind, node, obstacle, one, one, least, (7,) if clearance <= 0 else ())
+
+
+def made_metrics(frames: int = 300, targets: tuple[str, ...] = ("truth", "seen")) -> RunMetrics:
+    """Return the metrics of frames whose predictions are off by more and more, with a needle lost in between."""
+    metrics = RunMetrics(LENGTH, 10**9, targets, recorded=True)
+    for index in range(frames):
+        stamp, off = 10**9 + index * 33_333_333, 1e-6 * index
+        seen, truth = NODES + np.array([0.0, off]), NODES + np.array([0.0, 2.0 * off])
+        sight = Observation(stamp, NODES[0], np.array([1.0, 0.0]), seen, truth, processing=3e-3)
+        if 100 <= index < 120:
+            metrics.observe(Observation(stamp, reason=f"hidden by {EVIL}"))
+            continue
+        metrics.observe(sight)
+        prediction: Any = SimpleNamespace(vertices=NODES, stretch=np.array([0.0, -1e-5]), residual=1e-9)
+        frame = FrameResult.of(sight, prediction, margins(1e-3 - 1e-5 * index), 1e-4, recorded=seen)
+        metrics.add(frame)
+    return metrics
+
+
+def made_page(about: BagDetails = ABOUT, *, live: LiveFigures | None = None) -> str:
+    """Return a page."""
+    metrics = made_metrics()
+    figures = BagFigures.of(metrics, live)
+    pictures = [
+        draw_worst_frame(worst, None, target=metrics.target, length=LENGTH, dish_diameter=0.035)
+        for worst in metrics.worst_frames()
+    ]
+    return write_page(about, metrics, figures, pictures)
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    """A page."""
+    return made_page()
+
+
+class Reader(HTMLParser):
+    """Reads a page: its tags, closed in order; its text; its scripts."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.scripts: list[str] = []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag == "script":
+            self.scripts.append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "script":
+            self.scripts[-1] += data
+        elif not self.open or self.open[-1] != "style":
+            self.text += data
+
+
+def test_every_tag_is_closed(page: str):
+    reader = Reader(page)
+    assert reader.open == []
+    ids = [attributes["id"] for _, attributes in reader.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+
+
+def test_nothing_is_loaded_from_anywhere(page: str):
+    reader = Reader(page)
+    for tag, attributes in reader.tags:
+        assert tag not in {"link", "iframe", "object", "embed", "base"}
+        for name in ("src", "href", "srcset", "data", "action", "poster"):
+            assert (attributes.get(name) or "#").startswith(("#", "data:image/jpeg;base64,"))
+    assert "http:" not in page
+    assert "https:" not in page
+    assert not re.search(r"@import|url\(", page)
+    policy = next(a["content"] for t, a in reader.tags if t == "meta" and a.get("http-equiv"))
+    assert policy is not None
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "showSendToCloud: false" in page
+
+
+def test_the_policy_lets_the_page_s_own_scripts_run_and_no_other(page: str):
+    reader = Reader(page)
+    data, library, script = reader.scripts
+    plotly = zlib.decompress(base64.b64decode(library)).decode()
+    assert plotly.startswith("/**\n* plotly.js")
+    for source in (script, plotly):
+        assert f"'sha256-{base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()}'" in page
+    assert page.count("'sha256-") == 2
+    assert json.loads(data)["plots"]
+
+
+def test_the_data_is_that_of_the_figures(page: str):
+    data = json.loads(Reader(page).scripts[0])
+    figures = BagFigures.of(made_metrics())
+    lines = {line["id"]: line for plot in data["plots"] for line in plot["series"]}
+    for target in ("truth", "seen"):
+        error = figures.error[target]
+        assert error is not None
+        values = [value for value in lines[f"error_{target}"]["values"] if value is not None]
+        assert len(values) == error["count"] == 280
+        assert max(values) == pytest.approx(error["maximum"], rel=1e-4)
+        assert np.mean(values) == pytest.approx(error["mean"], rel=1e-4)
+    assert max(value or 0.0 for value in lines["recorded_error_seen"]["values"]) == 0.0
+    assert min(v for v in lines["margin_obstacle"]["values"] if v is not None) == pytest.approx(1e3 * (1e-3 - 2.99e-3))
+    assert data["lost"] == [[pytest.approx(100 / 30, abs=1e-3), pytest.approx(119 / 30, abs=1e-3)]]
+    assert len(data["map"]["errors"]) == 25
+    assert data["moments"][0]["error"] == pytest.approx(lines["error_truth"]["values"][-1])
+    assert len(data["times"]["predicted"]) == len(lines["strain"]["values"])
+
+
+def test_the_head_says_the_figures_in_words(page: str):
+    text = Reader(page).text
+    for words in ("280 of 300", "broken: obstacle", "The bag does not say whether it is simulated.", "not in this bag"):
+        assert words in text
+    assert "Simulated:" not in text
+
+
+def test_what_is_simulated_and_broken_is_said():
+    about = replace(ABOUT, simulated="camera frames", damage=("chunk 7",), refused={"too old": 3}, remarks=("odd",))
+    live = LiveFigures({"frame to prediction": Percentiles(0.012, 0.018, 0.02)})
+    text = Reader(made_page(about, live=live)).text
+    for words in ("Simulated: camera frames", "chunk 7", "3: too old", "12.0 ms", "within two frames", "odd"):
+        assert words in " ".join(text.split())
+
+
+def test_words_of_a_bag_are_shown_and_never_run():
+    about = replace(
+        ABOUT,
+        name=EVIL,
+        path=EVIL,
+        setup=EVIL,
+        simulated=EVIL,
+        damage=(EVIL,),
+        refused={EVIL: 1},
+        topics={EVIL: (EVIL, 1)},
+        settings=((EVIL, EVIL, EVIL),),
+        remarks=(EVIL,),
+        software=((EVIL, EVIL),),
+    )
+    reader = Reader(made_page(about))
+    assert reader.open == []
+    assert len(reader.scripts) == 3
+    assert reader.text.count(EVIL) >= 13
+    assert not any(name.startswith("on") for _, attributes in reader.tags for name in attributes)
+
+
+def test_a_long_bag_makes_no_large_page():
+    metrics = made_metrics(20_000)
+    data = page_data(metrics, [])
+    assert all(len(line["values"]) <= 5010 for plot in data["plots"] for line in plot["series"])
+    assert len(data["map"]["times"]) <= 1300
+    assert len(json.dumps(data)) < 2_000_000
+
+
+def test_without_anything_to_hold_it_against_a_prediction_is_not_scored():
+    metrics = made_metrics(targets=())
+    page = write_page(ABOUT, metrics, BagFigures.of(metrics), [])
+    assert "error-truth" not in page
+    assert metrics.worst_frames() == []
+    assert Reader(page).open == []
+
+
+@pytest.mark.parametrize("with_frame", [True, False])
+def test_a_picture_shows_frame_or_plan_and_says_what(view, with_frame: bool):
+    metrics = made_metrics()
+    photo = Photo(np.full((480, 640, 3), 90, np.uint8), view) if with_frame else None
+    worst = metrics.worst_frames()[0]
+    worst.frame.obstacles = (Disc((0.0, 0.009), 0.002),)
+    picture = draw_worst_frame(worst, photo, target="truth", length=LENGTH, dish_diameter=0.035)
+    kind, _, data = picture.source.partition(",")
+    assert kind == "data:image/jpeg;base64"
+    image = imread(io.BytesIO(base64.b64decode(data)), format="jpeg")
+    assert image.shape == (595, 1200, 3)
+    assert np.median(image) == pytest.approx(90 if with_frame else 244, abs=3)
+    assert picture.is_plan != with_frame
+    assert picture.words.startswith("Camera frame at 9.97 s" if with_frame else "Plan of the dish at 9.97 s")
+    assert len(data) < 300_000
+
+
+def drawn(browser: str, folder: Path, page: str) -> str:
+    """Return a page as a browser has made it."""
+    (folder / "a b.html").write_text(page)
+    return subprocess.run(
+        [
+            *(browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}"),
+            *("--virtual-time-budget=20000", "--dump-dom", (folder / "a b.html").as_uri()),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    ).stdout
+
+
+BROWSERS = [path for name in ("chromium", "google-chrome") if (path := shutil.which(name))][:1]
+
+
+@pytest.mark.parametrize("browser", [None, *BROWSERS])
+def test_a_browser_draws_all_plots_where_there_is_one(tmp_path: Path, page: str, browser: str | None):
+    """The page's script has a place for each plot; a real browser, where there is one, fills them."""
+    plots = [plot["id"] for plot in json.loads(Reader(page).scripts[0])["plots"]]
+    assert {f"plot-{name}" for name in (*plots, "map")} <= {a.get("id") for _, a in Reader(page).tags}
+    if browser is None:
+        return
+    shown = drawn(browser, tmp_path, page)
+    assert f'data-drawn="{len(plots) + 1}"' in shown
+    assert shown.count('class="main-svg"') >= len(plots) + 1
+    assert "The plots cannot be drawn" not in shown.split("<script")[0]
+
+
+@pytest.mark.parametrize("browser", BROWSERS)
+def test_one_prediction_alone_is_seen_in_every_plot(tmp_path: Path, browser: str):
+    metrics = made_metrics(1)
+    about = replace(ABOUT, simulated="all")
+    shown = drawn(browser, tmp_path, write_page(about, metrics, BagFigures.of(metrics), [])).split("<script")
+    dots = [part.count('class="point"') for part in "".join(shown).split('id="plot-')[1:]]
+    assert len(dots) >= 4
+    assert all(dots[0:1] + dots[2:])  # the second is the map
+    assert "".join(shown).count(">simulated</text>") == len(dots)
+
+
+def test_all_times_are_shown_and_a_second_at_the_least():
+    assert page_data(made_metrics(1), [])["range"] == [-0.5, 0.5]
+    assert page_data(made_metrics(300), [])["range"] == pytest.approx([0.0, 299 * 0.033333333])
+
+
+def test_of_very_many_losses_none_is_left_out():
+    metrics = made_metrics()
+    metrics.lost = [[float(k), k + 0.5] for k in range(1000)]
+    metrics.lost[500] = [500.0, 500.9]  # so that these two are nearest
+    bands = page_data(metrics, [])["lost"]
+    assert len(bands) == 400
+    assert all(any(a <= begin and end <= b for a, b in bands) for begin, end in metrics.lost)
+    metrics.lost = metrics.lost[:400]
+    assert page_data(metrics, [])["lost"] == metrics.lost
+
+
+def test_the_head_shows_the_margin_that_is_broken():
+    metrics = made_metrics(3)
+    holds = MinimumMargin("obstacle", 1e-3, 7, 0, 0.1)
+    broken = MinimumMargin("connectivity", -1e-4, 3, -1, 0.2)
+    figures = replace(BagFigures.of(metrics), minimum={"connectivity": broken, "obstacle": holds})
+    tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
+    assert (tile.name, tile.verdict) == ("least margin, connectivity", "broken: connectivity")
+    figures = replace(figures, minimum={"connectivity": replace(broken, clearance=0.0), "obstacle": holds})
+    tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
+    assert (tile.name, tile.verdict) == ("least margin, obstacle", "every barrier holds")
+
+
+def test_one_frame_is_not_frames():
+    tile = headlines(ABOUT, BagFigures.of(made_metrics(1)))[0]
+    assert "over 1 frame;" in tile.detail
+
+
+def test_a_rendered_frame_is_said_to_be_one(view):
+    photo = Photo(np.full((480, 640, 3), 90, np.uint8), view)
+    worst = made_metrics().worst_frames()[0]
+    drawn_as = [
+        draw_worst_frame(worst, photo, target="truth", length=LENGTH, dish_diameter=0.035, simulated=simulated)
+        for simulated in (True, False)
+    ]
+    assert drawn_as[0].words.startswith("Simulated camera frame")
+    assert drawn_as[0].source != drawn_as[1].source
+
+
+def test_the_figures_are_the_worst_and_the_counts_of_all_frames():
+    metrics = RunMetrics(LENGTH, 0, ("truth",))
+    for index, (clearance, residual) in enumerate([(1e-4, 1e-9), (-1e-5, 1e-7), (2e-4, 1e-8)]):
+        sight = Observation(index * 10**8, NODES[0], np.array([1.0, 0.0]), NODES, NODES)
+        metrics.observe(sight)
+        prediction: Any = SimpleNamespace(vertices=NODES, stretch=np.zeros(25), residual=residual)
+        metrics.add(FrameResult.of(sight, prediction, margins(clearance), 1e-4))
+    for index in range(3, 40):
+        metrics.observe(Observation(index * 10**8, reason=f"{index % 20}"))
+    figures = BagFigures.of(metrics)
+    assert figures.minimum["obstacle"].clearance == -1e-5
+    assert figures.minimum["obstacle"].time == pytest.approx(0.1)
+    assert (figures.residual, figures.contact_frames) == (1e-7, 1)
+    assert metrics.lost == [[pytest.approx(0.3), pytest.approx(3.9)]]
+    assert len(metrics.reasons) <= 13
+    assert metrics.reasons["others"] > 0

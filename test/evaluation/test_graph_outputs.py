@@ -1,0 +1,168 @@
+"""Putting outputs side by side."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from types import SimpleNamespace as Message
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, ReplaySummary, stage_latencies
+from magnetosuture_thread.evaluation.metrics import Percentiles, error_figures
+from magnetosuture_thread.evaluation.tables import summary_table
+
+
+def header(nanoseconds: int) -> Message:
+    """Return a header."""
+    return Message(stamp=Message(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9))
+
+
+def path(nanoseconds: int, points: np.ndarray) -> Message:
+    """Return a path."""
+    return Message(
+        header=header(nanoseconds), poses=[Message(pose=Message(position=Message(x=x, y=y))) for x, y in points]
+    )
+
+
+def prediction(nanoseconds: int, points: np.ndarray) -> Message:
+    """Return a predicted thread."""
+    return Message(
+        header=header(nanoseconds),
+        vertices=[Message(x=x, y=y) for x, y in points],
+        stretch=[0.0, -0.002, 0.001, 0.0],
+        residual=1e-8,
+        step_time=0.004,
+    )
+
+
+def margins(nanoseconds: int, clearance: float, valid: bool = True) -> Message:
+    """Return margins of one obstacle row for node 3 and one connectivity row for node 1."""
+    segment = Message(kind=0, node=1, obstacle=-1, clearance=1e-9)
+    post = Message(kind=2, node=3, obstacle=0, clearance=clearance)
+    return Message(
+        header=header(nanoseconds),
+        valid=valid,
+        kind=[0, 2],
+        node=[1, 3],
+        clearance=[1e-9, clearance],
+        least=[segment, post],
+        contact_nodes=[3] if clearance <= 0.0 else [],
+    )
+
+
+STRAIGHT = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])
+
+
+def test_messages_of_one_stamp_are_put_together():
+    collector = GraphCollector(length=1.0)
+    for k, clearance in ((1, 0.5), (2, -0.1), (3, 0.2)):
+        collector.take("/thread/predicted", prediction(k * 10**9, STRAIGHT))
+        collector.take("/thread/measured", path(k * 10**9, STRAIGHT + np.array([0.0, 0.01])))
+        collector.take("/thread/margins", margins(k * 10**9, clearance))
+    collector.take("/truth/thread", path(2 * 10**9, STRAIGHT + np.array([0.0, 0.02])))
+    collector.take("/thread/measured", path(9 * 10**9, STRAIGHT))  # without a prediction
+    collector.take("/thread/margins", margins(9 * 10**9, -7.0, valid=False))
+    metrics, instants = collector.metrics(start=10**9), collector.frames()
+    assert [instant.stamp for instant in instants] == [10**9, 2 * 10**9, 3 * 10**9]
+    assert [instant.error_seen for instant in instants] == pytest.approx([1.0] * 3)
+    assert instants[1].error_truth == pytest.approx(2.0)
+    assert np.isnan(instants[0].error_truth)
+    assert instants[0].strain == pytest.approx(0.002)
+    assert instants[0].clearance.tolist() == [np.inf, np.inf, np.inf, 0.5, np.inf]
+    assert metrics.contact_frames == 1
+    assert [(m.kind, m.clearance, m.node, m.obstacle, m.time) for m in metrics.minimum_margins.values()] == [
+        ("connectivity", 1e-9, 1, -1, 0.0),
+        ("obstacle", -0.1, 3, 0, 1.0),
+    ]
+
+
+def test_a_command_counts_as_driven_only_if_it_was_followed():
+    collector = GraphCollector(length=1.0)
+    collector.take("/coils/currents", Message(header=header(7), command=header(5).stamp, stop=""))
+    collector.take("/coils/currents", Message(header=header(8), command=header(6).stamp, stop="no command for 0.2 s"))
+    assert collector.driven == {5}
+
+
+def test_the_last_word_of_every_node_is_kept():
+    collector = GraphCollector(length=1.0)
+    for text in ("starting", "lost"):
+        status = Message(name="vision_tracker: state", message=text)
+        collector.take("/diagnostics", Message(header=header(1), status=[status]))
+    assert collector.health == {"vision_tracker": "lost"}
+
+
+def test_latencies_pair_stamps():
+    published = {"camera/image_raw/compressed": {1: 0.0, 2: 1.0}, "needle/servo_cv": {1: 0.5}}
+    arrived = {"needle/measured_cp": {1: 0.01, 2: 1.03}, "thread/predicted": {2: 1.04}, "coils/currents": {7: 0.1}}
+    found = stage_latencies(published, arrived, driven={1})
+    pose, step = found["frame to needle pose"], found["pose to prediction"]
+    assert pose is not None
+    assert step is not None
+    assert pose.median == pytest.approx(0.02)
+    assert pose.maximum == pytest.approx(0.03)
+    assert step.median == pytest.approx(0.01)
+    assert found["command to currents"] is None
+
+
+def test_figures_of_nothing_are_none():
+    assert error_figures([]) is None
+    assert error_figures([float("nan")]) is None
+    assert Percentiles.of([]) is None
+
+
+def test_the_table_says_what_is_simulated_and_fits_a_terminal():
+    spread = Percentiles(0.012, 0.02, 0.03)
+    summary = ReplaySummary(
+        bag="bag",
+        setup="petri",
+        simulated="all of it",
+        frames=10,
+        tracked=9,
+        predicted=8,
+        commands=0,
+        driven=0,
+        latency={"frame to needle pose": spread, "command to currents": None},
+        step_time=spread,
+        least_margins=[],
+        contact_frames=2,
+        stretch=1e-6,
+        residual=1e-9,
+        seen_share=0.9,
+        error_seen={"count": 8, "mean": 0.5, "median": 0.4, "p99": 0.9, "maximum": 1.0},
+        error_truth=None,
+    )
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(summary_table(summary))
+    text = console.export_text()
+    for words in ("simulated", "90.0 %", "12.0 ms", "no pairs", "0.500 %", "8 frames scored", "90.0 %"):
+        assert words in text
+    assert "truth" not in text
+    assert max(len(line) for line in text.splitlines()) <= 80
+    poses = replace(
+        summary,
+        source="poses",
+        speed=52.4,
+        latency={},
+        refused={"a pose that is none": 2},
+        damage="the end is missing",
+        remark="it is another thread",
+    )
+    text = shown(poses)
+    for words in ("recorded poses", "usable", "a pose that is none", "52.4", "the end is missing", "another thread"):
+        assert words in text
+    for words in ("camera frames", "velocity", "latency", "dropped"):
+        assert words not in text
+    text = shown(replace(summary, dropped={"frames not taken by vision_tracker": 3, "poses without an answer": 0}))
+    assert "messages dropped" in text
+    assert "frames not taken" in text
+    assert "without an answer" not in text
+
+
+def shown(summary: ReplaySummary) -> str:
+    """Return a summary as a terminal shows it."""
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(summary_table(summary))
+    return console.export_text()

@@ -1,0 +1,70 @@
+"""The picture of a replayed bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
+from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.evaluation.plots import MARGIN_COLOURS, SEEN, draw_summary
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.model.margins import LeastBarrier, Margins
+
+NODES = np.column_stack([0.004 - 0.00076 * np.arange(26), np.zeros(26)])
+
+
+def run(clearance: float) -> RunMetrics:
+    """Return two frames with all nodes at one distance from an obstacle."""
+    metrics, count = RunMetrics(0.019), len(NODES) if np.isfinite(clearance) else 0
+    least = (LeastBarrier(2, 0, 0, clearance, clearance),) if count else ()
+    distances = np.full(count, clearance)
+    nodes, obstacles = np.arange(count, dtype=np.uint32), np.zeros(count, np.int32)
+    margins = Margins(np.full(count, 2, np.uint8), nodes, obstacles, distances, distances, least, ())
+    for k in (1, 2):
+        seen = NODES + np.array([0.0, 0.0004 * k])
+        frame = FrameResult(k * 10**9, NODES, strain=1e-6, margins=margins, seen=seen, tail=NODES[0], heading=0.0)
+        metrics.add(frame)
+    return metrics
+
+
+def draw(path: Path, view, clearance: float, discs: tuple[Disc, ...] = ()) -> np.ndarray:
+    """Draw a picture and return its pixels, red, green, blue."""
+    found = run(clearance)
+    chosen = found.worst_measured
+    assert chosen is not None
+    assert chosen.stamp == 2 * 10**9
+    summary = ReplaySummary("bag", "petri", "all", 2, 2, 2, 0, 0, {}, None, [], 0, 1e-6, 1e-9, 1.0, None, None)
+    frame = np.full((480, 640, 3), 225, np.uint8)
+    draw_summary(path, frame, view, chosen, 2.0, found.series, discs, summary)
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image[:, :, ::-1]
+
+
+def share(image: np.ndarray, colour: tuple[float, ...]) -> float:
+    """Return the share of the dish's pixels that are near a colour, in 0 to 1."""
+    dish = image[90:600, 60:660].astype(float) / 255.0
+    return float((np.abs(dish - np.asarray(colour[:3])).max(axis=2) < 0.06).mean())
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.5e-3, 5e-3])
+def test_the_predicted_thread_has_the_colour_of_its_margin(tmp_path: Path, view, clearance: float):
+    image = draw(tmp_path / "a.png", view, clearance, (Disc((0.0, 0.009), 0.002),))
+    shares = [share(image, MARGIN_COLOURS(c)) for c in (0.0, 0.5, 1.0)]
+    assert int(np.argmax(shares)) == {0.0: 0, 0.5e-3: 1, 5e-3: 2}[clearance]
+    assert max(shares) > 1e-3
+
+
+def test_the_seen_thread_is_drawn_beside_it(tmp_path: Path, view):
+    image = draw(tmp_path / "a.png", view, 5e-3)
+    blue = np.array([int(SEEN[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+    assert share(image, tuple(0.45 * blue + 0.55 * 225 / 255.0)) > 1e-3
+
+
+def test_without_obstacles_there_is_a_picture_too(tmp_path: Path, view):
+    assert draw(tmp_path / "a.png", view, np.inf).shape[1] > 1000
