@@ -10,19 +10,23 @@
 
 PYTHON ?= python3
 VENV := .venv
+EXTRAS := ros dev colcon
 READY := $(VENV)/.ready
 RUN := $(VENV)/bin
 DEMO := output/demo
 MESSAGES := $(wildcard msg_defs/*.* msg_defs/*/*)
 
-.PHONY: demo test lint colcon peers clean help
+# What is imported is compiled then: the half of all modules. (pip takes this "no" for a yes.)
+INSTALL = PIP_CONSTRAINT=constraints.txt PIP_NO_COMPILE=no $(RUN)/python -m pip install -qq --disable-pip-version-check
+
+.PHONY: demo test lint colcon peers clean help packages messages
 
 demo: $(READY)
 	@rm -rf $(DEMO)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
 test: $(READY)
-	$(RUN)/python -m pytest --numprocesses=2 -m "not whole_graph"
+	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph"
 	$(RUN)/python -m pytest -m whole_graph
 
 lint: $(READY)
@@ -36,7 +40,7 @@ colcon: $(READY)
 
 # From the extra `peers`, without building the package again.
 peers: $(READY)
-	PIP_CONSTRAINT=constraints.txt $(RUN)/python -m pip install -qq --disable-pip-version-check clarabel 'mujoco<4' piqp pyelastica
+	$(INSTALL) clarabel 'mujoco<4' piqp pyelastica
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -44,11 +48,20 @@ help:
 clean:
 	rm -rf $(VENV) build install log output
 
+# The packages, and the messages that pip builds in an environment of its own, at the same time: most of
+# either keeps one processor busy.
 $(READY): pyproject.toml constraints.txt $(MESSAGES)
-	@echo "Setting up $(VENV): ROS 2 Jazzy and the other packages, then building the messages (2 to 4 minutes)"
+	@echo "Setting up $(VENV): ROS 2 Jazzy and the other packages, and building the messages (2 to 4 minutes)"
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if (3, 10) <= v < (3, 14) else f"Python {v[0]}.{v[1]} found, 3.10 to 3.13 needed; name one by: make PYTHON=python3.12")'
 	@command -v c++ >/dev/null || { echo "no C++ compiler found; on Debian or Ubuntu: apt install build-essential python3-dev" >&2; exit 1; }
 	@rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
-	PIP_CONSTRAINT=constraints.txt $(RUN)/python -m pip install -qq --disable-pip-version-check --editable '.[ros,dev,colcon]'
+	@$(MAKE) --no-print-directory --jobs=2 packages messages
 	@touch $@
+
+packages:
+	$(RUN)/python .ci/requirements.py $(EXTRAS) >$(VENV)/requirements.txt
+	$(INSTALL) --requirement $(VENV)/requirements.txt
+
+messages:
+	$(INSTALL) --no-deps --editable .
