@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.coverage import Box, box_around, covered, line_covered
+from magnetosuture_thread.rig.camera.coverage import Box, Light, blurred, box_around, covered, lay, line_covered
 from magnetosuture_thread.rig.camera.scene import Lighting, Scene
-from magnetosuture_thread.rig.camera.still_life import Light, StillLife
+from magnetosuture_thread.rig.camera.still_life import StillLife
 
 Image = NDArray[np.uint8]
 
 STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
 LAMP = (-0.5, 0.86)  # direction towards the lamp, in the dish frame
-SHADOW_SHIFT_PX = (2.5, 3.5)
+SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
+SHADOW_BEGIN_PX = (-10, -9)  # shifted by 2.5 and 3.5 px, less 12.5 of the blur
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 NOISE_FIELDS = 12  # drawn once; a frame takes one of them
 NOISE_LEVEL = 1.6  # of white light of level 90, before the sensor's interpolation spreads it
@@ -54,10 +55,6 @@ def encode_jpeg(image: Image, quality: int) -> NDArray[np.uint8]:
     if not done:
         raise ValueError(f"an image of shape {image.shape} cannot be encoded")
     return np.asarray(data, dtype=np.uint8).ravel()
-
-
-def _colour(bgr: tuple[float, float, float]) -> Light:
-    return np.asarray(bgr, dtype=np.float32)
 
 
 class DishCamera:
@@ -127,27 +124,24 @@ class DishCamera:
     ) -> None:
         scene, scale = self._scene, self.view.metres_per_pixel
         strand = line_covered(box, line, MENISCUS * scene.thread_diameter / scale)
-        shade = 0.35 * strand
+        shade = np.float32(0.35) * strand
         near = box_around(outline, self.size, REACH_PX)
-        needle = gleam = None
+        needle = None
         if near is not None:
             needle = covered(near, lambda canvas, at: cv2.fillPoly(canvas, [at(outline)], 255, cv2.LINE_8, 4))
-            gleam = line_covered(near, self.view.to_pixels(self._gleam(tail, heading)), 1.0)
             inside = _within(near, box)
             np.maximum(shade[inside], needle, out=shade[inside])
-        shift = np.array([[1.0, 0.0, SHADOW_SHIFT_PX[0]], [0.0, 1.0, SHADOW_SHIFT_PX[1]]])
-        shade = cv2.warpAffine(shade, shift, (shade.shape[1], shade.shape[0]))
-        region *= 1.0 - 0.16 * cv2.GaussianBlur(shade, (0, 0), 3.0)[:, :, None]
-        region += strand[:, :, None] * (_colour(scene.thread_bgr) - region)
-        if near is not None and needle is not None and gleam is not None:
-            part = region[inside]
-            part += needle[:, :, None] * (_colour(STEEL_BGR) - part)
-            part += gleam[:, :, None] * (_colour(GLEAM_BGR) - part)
+        lay(region, blurred(shade, SHADOW, *SHADOW_BEGIN_PX), 0.16, (0.0, 0.0, 0.0))
+        lay(region, strand, 1.0, scene.thread_bgr)
+        if near is not None and needle is not None:
+            lay(region[inside], needle, 1.0, STEEL_BGR)
+            lay(
+                region[inside], line_covered(near, self.view.to_pixels(self._gleam(tail, heading)), 1.0), 1.0, GLEAM_BGR
+            )
 
     def _add_cover(self, region: Light, box: Box, cover: Cover, edge: Points) -> None:
         hidden = covered(box, lambda canvas, at: cv2.fillPoly(canvas, [at(edge)], 255, cv2.LINE_8, 4))
-        hidden = cover.opacity * cv2.GaussianBlur(hidden, (0, 0), cover.blur_px)
-        region += hidden[:, :, None] * (_colour(cover.bgr) - region)
+        lay(region, cv2.GaussianBlur(hidden, (0, 0), cover.blur_px), cover.opacity, cover.bgr)
 
     def _needle_outline(self, tail: Points, heading: float) -> Points:
         """Return the needle's outline in pixels: a body of one width, the last fifth tapering to a fine point."""

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.coverage import box_around, covered
+from magnetosuture_thread.rig.camera.coverage import Light, box_around, covered
 from magnetosuture_thread.rig.camera.scene import SILICONE, Lighting, Look, Scene
-
-Light = NDArray[np.float32]
 
 RIM_DEPTHS = ((0.22e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))  # beyond the radius, width [m]; depth
 DROP_SHADOW_PX = np.array([3.0, 4.0])

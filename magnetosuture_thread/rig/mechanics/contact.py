@@ -18,6 +18,9 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 
 LEAST_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
+GRID = 128  # cells along the longer side of all that can be touched
+FAR = 8.0  # cells; clearances are not found beyond
+RUN = 12  # edges of a polygon that share a box: what is far from the box is not compared with each
 
 
 class Shapes(NamedTuple):
@@ -28,6 +31,10 @@ class Shapes(NamedTuple):
         corners: of all polygons, the solid to the left of every edge, shape (c, 2) [m].
         starts: where each polygon begins in `corners`, and the end, shape (p + 1,).
         boxes: least x, least y, greatest x, greatest y of each polygon, shape (p, 4) [m].
+        runs: the same of every `RUN` edges of a polygon, shape (r, 4) [m].
+        first_runs: where each polygon begins in `runs`, and the end, shape (p + 1,).
+        grid: least x and y of the cells of `clearances`, and their side, shape (3,) [m].
+        clearances: at the least, of all points of a cell, rows along y, shape (h, w) [m].
         convex: 1 at corners that stick out of the solid, else 0, shape (c,).
         wall: radius of the dish's wall around the origin, infinite if there is none [m].
         stiffness: k of every contact [N/m].
@@ -37,6 +44,10 @@ class Shapes(NamedTuple):
     corners: NDArray[np.float64]
     starts: NDArray[np.int64]
     boxes: NDArray[np.float64]
+    runs: NDArray[np.float64]
+    first_runs: NDArray[np.int64]
+    grid: NDArray[np.float64]
+    clearances: NDArray[np.float64]
     convex: NDArray[np.float64]
     wall: float
     stiffness: float
@@ -79,9 +90,28 @@ class Surface:
         rings = [_directed(ring) for ring in self.polygons]
         corners = np.concatenate([np.zeros((0, 2)), *rings])
         starts = np.cumsum([0, *(len(ring) for ring in rings)]).astype(np.int64)
-        boxes = np.array([(*ring.min(axis=0), *ring.max(axis=0)) for ring in rings], dtype=np.float64).reshape(-1, 4)
+        # An edge ends at the corner of its number, and begins at the one before.
+        runs = [
+            [np.take(ring, range(i - 1, min(i + RUN, len(ring))), axis=0) for i in range(0, len(ring), RUN)]
+            for ring in rings
+        ]
+        first_runs = np.cumsum([0, *(len(run) for run in runs)]).astype(np.int64)
         convex = np.concatenate([np.zeros(0), *(_convex(ring) for ring in rings)])
-        return Shapes(discs, corners, starts, boxes, convex, float(wall), float(self.stiffness))
+        boxes, edges = _boxes(rings), _boxes([points for run in runs for points in run])
+        reached = [*boxes, *((x - r, y - r, x + r, y + r) for x, y, r in [*discs, (0.0, 0.0, wall)] if r < math.inf)]
+        grid, cells = np.array([0.0, 0.0, 1.0]), np.full((1, 1), np.inf)
+        if reached:
+            low, high = np.min(reached, axis=0)[:2], np.max(reached, axis=0)[2:]
+            grid = np.array([*low, float(max(high - low)) / GRID])
+            cells = np.full(np.ceil((high - low)[::-1] / grid[2]).astype(int), np.inf)
+        wall, stiffness = float(wall), float(self.stiffness)
+        shapes = Shapes(discs, corners, starts, boxes, edges, first_runs, grid, cells, convex, wall, stiffness)
+        _find_clearances(shapes)
+        return shapes
+
+
+def _boxes(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.array([(*part.min(axis=0), *part.max(axis=0)) for part in parts], dtype=np.float64).reshape(-1, 4)
 
 
 def _directed(given: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -103,45 +133,86 @@ def _convex(ring: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @compiled
-def inside(x: float, y: float, corners: NDArray[np.float64], first: int, end: int) -> bool:
-    """Return whether a point is in a simple polygon: a ray from it crosses the outline an odd number of times."""
+def inside(x: float, y: float, shapes: Shapes, p: int) -> bool:
+    """Return whether a point is in polygon p: a ray from it crosses the outline an odd number of times."""
+    corners, start, end = shapes.corners, shapes.starts[p], shapes.starts[p + 1]
     within = False
-    j = end - 1
-    for i in range(first, end):
-        if (corners[i, 1] > y) != (corners[j, 1] > y):
-            part = (y - corners[i, 1]) / (corners[j, 1] - corners[i, 1])
-            if x < corners[i, 0] + part * (corners[j, 0] - corners[i, 0]):
-                within = not within
-        j = i
+    for run in range(shapes.first_runs[p], shapes.first_runs[p + 1]):
+        first = start + RUN * (run - shapes.first_runs[p])
+        if not shapes.runs[run, 1] <= y < shapes.runs[run, 3] or x > shapes.runs[run, 2]:
+            continue
+        j = first - 1 if first > start else end - 1
+        for i in range(first, min(first + RUN, end)):
+            if (corners[i, 1] > y) != (corners[j, 1] > y):
+                part = (y - corners[i, 1]) / (corners[j, 1] - corners[i, 1])
+                if x < corners[i, 0] + part * (corners[j, 0] - corners[i, 0]):
+                    within = not within
+            j = i
     return within
 
 
 @compiled
-def polygon_gap(
-    x: float, y: float, corners: NDArray[np.float64], first: int, end: int
-) -> tuple[float, float, float, float]:
-    """Return signed distance from a polygon, its gradient (n_x, n_y), and its curvature [m, 1, 1, 1/m]."""
-    least, px, py, corner = np.inf, 0.0, 0.0, False
+def polygon_gap(x: float, y: float, shapes: Shapes, p: int, reach: float) -> tuple[float, float, float, float]:
+    """Return signed distance from polygon p, its gradient (n_x, n_y), and its curvature [m, 1, 1, 1/m].
+
+    The distance of a point that is farther outside than `reach` is infinite.
+    """
+    corners, start, end = shapes.corners, shapes.starts[p], shapes.starts[p + 1]
+    within = inside(x, y, shapes, p)
+    least, px, py, corner = np.inf if within else reach * reach, np.inf, np.inf, False
     nx, ny = 1.0, 0.0
-    j = end - 1
-    for i in range(first, end):
-        ex, ey = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1]
-        dx, dy = x - corners[j, 0], y - corners[j, 1]
-        s = (dx * ex + dy * ey) / (ex * ex + ey * ey)
-        t = min(max(s, 0.0), 1.0)
-        ox, oy = dx - t * ex, dy - t * ey
-        distance = ox * ox + oy * oy
-        if distance < least:
-            least, px, py, corner = distance, ox, oy, t != s
-            size = math.sqrt(ex * ex + ey * ey)
-            nx, ny = ey / size, -ex / size
-        j = i
+    for run in range(shapes.first_runs[p], shapes.first_runs[p + 1]):
+        first = start + RUN * (run - shapes.first_runs[p])
+        ox = max(shapes.runs[run, 0] - x, x - shapes.runs[run, 2], 0.0)
+        oy = max(shapes.runs[run, 1] - y, y - shapes.runs[run, 3], 0.0)
+        if ox * ox + oy * oy >= least:
+            continue
+        j = first - 1 if first > start else end - 1
+        for i in range(first, min(first + RUN, end)):
+            ex, ey = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1]
+            dx, dy = x - corners[j, 0], y - corners[j, 1]
+            s = (dx * ex + dy * ey) / (ex * ex + ey * ey)
+            t = min(max(s, 0.0), 1.0)
+            ox, oy = dx - t * ex, dy - t * ey
+            distance = ox * ox + oy * oy
+            if distance < least:
+                least, px, py, corner = distance, ox, oy, t != s
+                size = math.sqrt(ex * ex + ey * ey)
+                nx, ny = ey / size, -ex / size
+            j = i
+    if px == np.inf:
+        return np.inf, nx, ny, 0.0
     distance = math.sqrt(least)
-    sign = -1.0 if inside(x, y, corners, first, end) else 1.0
     if distance < 1e-12:
         return 0.0, nx, ny, 0.0
-    gap = sign * distance
+    gap = -distance if within else distance
     return gap, px / gap, py / gap, 1.0 / gap if corner else 0.0
+
+
+@compiled
+def _find_clearances(shapes: Shapes) -> None:
+    least, side = FAR * shapes.grid[2], shapes.grid[2]
+    for i in range(shapes.clearances.shape[0]):
+        for j in range(shapes.clearances.shape[1]):
+            x, y = shapes.grid[0] + (j + 0.5) * side, shapes.grid[1] + (i + 0.5) * side
+            gap = min(least, shapes.wall - math.sqrt(x * x + y * y))
+            for disc in shapes.discs:
+                gap = min(gap, math.sqrt((x - disc[0]) ** 2 + (y - disc[1]) ** 2) - disc[2])
+            for p in range(shapes.boxes.shape[0]):
+                gap = min(gap, polygon_gap(x, y, shapes, p, least)[0])
+            shapes.clearances[i, j] = gap - 0.75 * side  # half a diagonal and more
+
+
+@compiled
+def clear(x: float, y: float, reach: float, grid: NDArray[np.float64], clearances: NDArray[np.float64]) -> bool:
+    """Return whether nothing is within reach, as far as the grid tells; from beyond the grid all is as far or farther.
+
+    All but the wall, that is, which is in the cells at the border already.
+    """
+    rows, columns = clearances.shape
+    i = int(min(max((y - grid[1]) / grid[2], 0.0), rows - 1.0))
+    j = int(min(max((x - grid[0]) / grid[2], 0.0), columns - 1.0))
+    return bool(clearances[i, j] > reach)
 
 
 @compiled
@@ -176,7 +247,7 @@ def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: NDAr
     for p in range(shapes.boxes.shape[0]):
         box = shapes.boxes[p]
         if box[0] - radius < x < box[2] + radius and box[1] - radius < y < box[3] + radius:
-            gap, nx, ny, bend = polygon_gap(x, y, shapes.corners, shapes.starts[p], shapes.starts[p + 1])
+            gap, nx, ny, bend = polygon_gap(x, y, shapes, p, radius)
             if gap < radius:
                 rows[count, 0], rows[count, 1], rows[count, 2], rows[count, 3] = radius - gap, nx, ny, bend
                 count += 1
@@ -237,24 +308,28 @@ def segment_contacts(
             rows[count, 0], rows[count, 1], rows[count, 2] = reach - gap, nx, ny
             rows[count, 3], rows[count, 4] = gap, s
             count += 1
+    near = radius + 0.75 * size  # of the middle: half of the length along, and what is near across
     for p in range(shapes.boxes.shape[0]):
         box = shapes.boxes[p]
         around = radius + 0.5 * size
         if not (box[0] - around < mx < box[2] + around and box[1] - around < my < box[3] + around):
             continue
         first, end = shapes.starts[p], shapes.starts[p + 1]
-        for i in range(first, end):
-            if shapes.convex[i] == 0.0:
+        for run in range(shapes.first_runs[p], shapes.first_runs[p + 1]):
+            box, begin = shapes.runs[run], first + RUN * (run - shapes.first_runs[p])
+            if not (box[0] - near < mx < box[2] + near and box[1] - near < my < box[3] + near):
                 continue
-            cx, cy = shapes.corners[i, 0], shapes.corners[i, 1]
-            gap, nx, ny, s = _segment_gap(ax, ay, bx, by, cx, cy)
-            # A chord this deep behind a corner passes beside it, not over it.
-            if not (0.0 < s < 1.0 and gap < max(radius, 0.25 * size)):
-                continue
-            if inside(ax + s * (bx - ax), ay + s * (by - ay), shapes.corners, first, end):
-                gap, nx, ny = -gap, -nx, -ny
-            if gap < radius and count < rows.shape[0]:
-                rows[count, 0], rows[count, 1], rows[count, 2] = radius - gap, nx, ny
-                rows[count, 3], rows[count, 4] = gap, s
-                count += 1
+            for i in range(begin, min(begin + RUN, end)):
+                if shapes.convex[i] == 0.0:
+                    continue
+                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, shapes.corners[i, 0], shapes.corners[i, 1])
+                # A chord this deep behind a corner passes beside it, not over it.
+                if not (0.0 < s < 1.0 and gap < max(radius, 0.25 * size)):
+                    continue
+                if inside(ax + s * (bx - ax), ay + s * (by - ay), shapes, p):
+                    gap, nx, ny = -gap, -nx, -ny
+                if gap < radius and count < rows.shape[0]:
+                    rows[count, 0], rows[count, 1], rows[count, 2] = radius - gap, nx, ny
+                    rows[count, 3], rows[count, 4] = gap, s
+                    count += 1
     return count

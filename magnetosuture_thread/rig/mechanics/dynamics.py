@@ -106,7 +106,7 @@ class RigDynamics:
             (glue, 0.5 * thread.rest_curvature * length**2),
         )
         self._memory = make_memory(thread.segments, _contacts(self._shapes))
-        self._poles = np.zeros((2, 3))
+        self._poles, self._flux = np.zeros((2, 3)), np.zeros((2, 2))  # tail and tip, and the field there [T]
         self._move, self._held = 0.0, np.zeros(0)
         self.time, self.residual, self.converged = 0.0, 0.0, True
         self.iterations = self.substeps = self.halvings = 0
@@ -230,18 +230,17 @@ class RigDynamics:
     def _take(self, h: float, currents: NDArray[np.float64] | None) -> bool:
         """Take one step; return whether it converged, and change nothing if not."""
         ratio = h / self._last_dt if self._last_dt > 0.0 else 0.0
-        ahead = self._q + ratio * (self._q - self._before)
-        field = np.zeros((2, 2))
         if currents is not None and self.field is not None:
-            self._poles[0, :2], self._poles[1, :2] = ahead[1:3], self._tip_of(ahead)
-            field[:] = np.tensordot(currents, self.field.per_current(self._poles), axes=1)[:, :2]
+            ahead = self._q[:3] + ratio * (self._q[:3] - self._before[:3])
+            self._poles[0, :2], self._poles[1, :2] = ahead[1:], self._tip_of(ahead)
+            self._flux[:] = (currents @ self.field.per_current(self._poles).reshape(-1, 6)).reshape(2, 3)[:, :2]
         start = self._q.copy()
         iterations, self._move, residual = advance(
             self._q,
             self._before,
             h,
             ratio,
-            field,
+            self._flux,
             self._needle,
             self._rod,
             self._shapes,

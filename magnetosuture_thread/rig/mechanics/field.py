@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ellipe, ellipk
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
 
 MU_0 = 4e-7 * math.pi  # T m/A
-SERIES_BELOW = 0.02  # of the parameter m: there the closed form would lose digits
-SERIES_TERMS = 9
+LEAST_MEAN = 1e-8  # of c_n: the next one is its square
+MOST_MEANS = 40
 
 
 @dataclass(frozen=True)
@@ -80,17 +80,12 @@ class CoilField:
         if not coils:
             raise ConfigurationError("coils", "none", "at least one coil")
         self.coils = tuple(coils)
-        loops = [_loops(coil, along, across) for coil in coils]
-        self._starts = np.concatenate([[0], np.cumsum([len(part) for part in loops])[:-1]])
-        parts = np.concatenate(loops)
-        self._radius = parts[:, 0, None]
-        self._radius_squared = self._radius**2
-        owner = np.repeat(np.arange(len(coils)), [len(part) for part in loops])
-        axes = np.array([coil.axis for coil in coils])
-        self._axes = axes[owner][:, None, :]
-        self._centres = np.array([coil.centre for coil in coils])[owner] + parts[:, 1, None] * axes[owner]
-        self._centres = self._centres[:, None, :]
-        self._strength = MU_0 * parts[:, 2, None] / (2.0 * math.pi)
+        rows = [
+            (index, *(np.array(coil.centre) + place * np.array(coil.axis)), *coil.axis, radius, turns)
+            for index, coil in enumerate(coils)
+            for radius, place, turns in _loops(coil, along, across)
+        ]
+        self._loops = np.array(rows, dtype=np.float64)
 
     def per_current(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the flux density that one ampere in each coil makes.
@@ -99,8 +94,7 @@ class CoilField:
             B_rho = mu_0 I z / (2 pi b rho) (-K(m) + (r^2 + rho^2 + z^2) / a^2 E(m))
             a^2 = (r - rho)^2 + z^2,    b^2 = (r + rho)^2 + z^2,    m = 1 - a^2 / b^2
 
-        for each loop of radius r; near the axis B_rho / rho by its power series in m. On a loop itself it
-        is not finite.
+        for each loop of radius r. On a loop itself it is not finite.
 
         Args:
             points: shape (m, 3) [m].
@@ -108,25 +102,12 @@ class CoilField:
         Returns:
             Shape (k, m, 3) for k coils [T/A].
 
-        Source: J. D. Jackson, Classical Electrodynamics, 3rd ed., section 5.5. Deviation: B_rho is
-        factored, so that it has no division by rho.
+        Source: J. D. Jackson, Classical Electrodynamics, 3rd ed., section 5.5. Deviation: B_rho is factored, so
+        that it has no division by rho; see `_integrals`.
         """
-        offset = points[None, :, :] - self._centres
-        z = np.einsum("lmi,lmi->lm", offset, self._axes)
-        across = offset - z[:, :, None] * self._axes
-        rho_squared = np.einsum("lmi,lmi->lm", across, across)
-        double = 2.0 * self._radius * np.sqrt(rho_squared)
-        square = z * z + rho_squared
-        whole = self._radius_squared + square
-        far = whole + double
-        near = whole - double
-        m = 2.0 * double / far
-        k, e = ellipk(m), ellipe(m)
-        common = self._strength / np.sqrt(far)
-        axial = common * (k + (self._radius_squared - square) / near * e)
-        radial = common * z * (16.0 * self._radius_squared / (far * near)) * _radial_factor(m, k, e)
-        field = axial[:, :, None] * self._axes + radial[:, :, None] * across
-        return np.add.reduceat(field, self._starts, axis=0)
+        field = np.zeros((len(self.coils), len(points), 3))
+        _add_loops(np.ascontiguousarray(points, dtype=np.float64), self._loops, field)
+        return field
 
 
 def _loops(coil: Coil, along: int, across: int) -> NDArray[np.float64]:
@@ -148,25 +129,49 @@ def _gauss(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return nodes, 0.5 * weights
 
 
-def _series() -> NDArray[np.float64]:
-    """Return the coefficients of ((1 - m / 2) E - (1 - m) K) / m^2 in powers of m, the highest first."""
-    count = SERIES_TERMS + 2
-    c = np.array([(math.comb(2 * i, i) / 4.0**i) ** 2 for i in range(count)])
-    k = 0.5 * math.pi * c
-    e = -k / (2.0 * np.arange(count) - 1.0)
-    total = e - k
-    total[1:] += k[:-1] - 0.5 * e[:-1]
-    return np.asarray(total[2:][::-1])
+@compiled
+def _integrals(m: float, rest: float) -> tuple[float, float, float]:
+    """Return K(m), E(m) and ((1 - m / 2) E - (1 - m) K) / m^2, which is 3 pi / 32 at m = 0.
+
+        a_n = (a + b) / 2,    b_n = sqrt(a b),    c_n = c^2 / (4 a_n),    a_0 = 1,  b_0^2 = 1 - m,  c_0^2 = m
+        K = pi / 2 a,    E = K (1 - m / 2 - m^2 T),    T = sum from 1 on of 2^(n - 1) (c_n / m)^2
+
+    Args:
+        m: the parameter, from 0 to 1.
+        rest: 1 - m, with digits of its own.
+
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, section 17.6. Deviation: c_n / m in the place
+    of c_n, so that the third value, K (1 / 4 - (1 - m / 2) T), loses no digits where m is small.
+    """
+    a, b, weight, total, square = 1.0, math.sqrt(rest), 1.0, 0.0, 1.0
+    for _ in range(MOST_MEANS):
+        a, b = 0.5 * (a + b), math.sqrt(a * b)
+        part = square / (4.0 * a)
+        total += weight * part * part
+        weight, square = 2.0 * weight, m * part * part
+        if m * part < LEAST_MEAN:
+            break
+    k = 0.5 * math.pi / a
+    return k, k * (1.0 - m * (0.5 + m * total)), k * (0.25 - (1.0 - 0.5 * m) * total)
 
 
-SERIES = _series()
-
-
-def _radial_factor(m: NDArray[np.float64], k: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ((1 - m / 2) E - (1 - m) K) / m^2, which is 3 pi / 32 on the axis."""
-    small = m < SERIES_BELOW
-    if not small.any():
-        return np.asarray(((1.0 - 0.5 * m) * e - (1.0 - m) * k) / (m * m))
-    safe = np.where(small, 1.0, m)
-    closed = ((1.0 - 0.5 * m) * e - (1.0 - m) * k) / (safe * safe)
-    return np.where(small, np.polyval(SERIES, m), closed)
+@compiled
+def _add_loops(points: NDArray[np.float64], loops: NDArray[np.float64], field: NDArray[np.float64]) -> None:
+    """Add the field of loops with rows of: coil's number, centre, axis, radius, turns; see `per_current`."""
+    for row in range(loops.shape[0]):
+        coil, cx, cy, cz, ax, ay, az, radius, turns = loops[row]
+        for i in range(points.shape[0]):
+            x, y, z = points[i, 0] - cx, points[i, 1] - cy, points[i, 2] - cz
+            along = x * ax + y * ay + z * az
+            x, y, z = x - along * ax, y - along * ay, z - along * az
+            square = x * x + y * y + z * z
+            rho = math.sqrt(square)
+            far, near = (radius + rho) ** 2 + along * along, (radius - rho) ** 2 + along * along
+            k, e, factor = _integrals(4.0 * radius * rho / far, near / far)
+            common = MU_0 * turns / (2.0 * math.pi * math.sqrt(far))
+            axial = common * (k + (radius * radius - square - along * along) / near * e)
+            radial = common * along * 16.0 * radius * radius / (far * near) * factor
+            at = field[int(coil), i]
+            at[0] += axial * ax + radial * x
+            at[1] += axial * ay + radial * y
+            at[2] += axial * az + radial * z

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts
 
 NODES = 16  # of the integration along the body
 
@@ -216,6 +216,8 @@ def add_needle(
     for i in range(needle.outline.shape[0]):
         ox = c * needle.outline[i, 0] - s * needle.outline[i, 1]
         oy = s * needle.outline[i, 0] + c * needle.outline[i, 1]
+        if clear(q[1] + ox, q[2] + oy, needle.radius, shapes.grid, shapes.clearances):
+            continue
         for row in range(point_contacts(q[1] + ox, q[2] + oy, needle.radius, shapes, rows)):
             depth, nx, ny = rows[row, 0], rows[row, 1], rows[row, 2]
             bend = -rows[row, 3] * depth

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts, segment_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts, segment_contacts
 
 WIDTH = 6  # of the band: half-width and diagonal
 
@@ -188,7 +188,10 @@ def add_contact(
     w = np.empty(4)
     v = np.empty(4)
     z = np.empty(4)
+    grid, clearances = shapes.grid, shapes.clearances
     for a in range(3, q.shape[0] - 1, 2):
+        if clear(q[a], q[a + 1], rod.radius, grid, clearances):
+            continue
         for row in range(point_contacts(q[a], q[a + 1], rod.radius, shapes, rows)):
             depth, nx, ny, bend = rows[row, 0], rows[row, 1], rows[row, 2], -rows[row, 3] * rows[row, 0]
             if convex:
@@ -202,12 +205,14 @@ def add_contact(
     if shapes.discs.shape[0] + shapes.boxes.shape[0] == 0:
         return energy
     for a in range(1, q.shape[0] - 2, 2):
+        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
+        size = math.sqrt(ex * ex + ey * ey)
+        if clear(q[a] + 0.5 * ex, q[a + 1] + 0.5 * ey, rod.radius + 0.75 * size, grid, clearances):
+            continue
         count = segment_contacts(q[a], q[a + 1], q[a + 2], q[a + 3], rod.segment, rod.radius, shapes, rows)
         for row in range(count):
             depth, nx, ny, gap, s = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
             energy += 0.5 * k * depth * depth
-            ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
-            size = math.sqrt(ex * ex + ey * ey)
             w[0], w[1], w[2], w[3] = (1.0 - s) * nx, (1.0 - s) * ny, s * nx, s * ny
             v[0], v[1], v[2], v[3] = -nx, -ny, nx, ny
             tx, ty = ex / size, ey / size

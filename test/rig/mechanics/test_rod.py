@@ -174,11 +174,11 @@ def test_the_distance_from_a_polygon():
         ((0.9e-3, 0.8e-3), -math.hypot(0.1e-3, 0.2e-3), (0.1 / math.hypot(0.1, 0.2), 0.2 / math.hypot(0.1, 0.2)), None),
     ]
     for point, gap, normal, curvature in cases:
-        found = polygon_gap(*point, shapes.corners, 0, 6)
+        found = polygon_gap(*point, shapes, 0, math.inf)
         assert found[0] == pytest.approx(gap, rel=1e-12)
         assert found[1:3] == pytest.approx(normal, abs=1e-12)
         assert found[3] == pytest.approx(1.0 / gap if curvature is None else curvature, abs=1e-9)
-    assert polygon_gap(2e-3, 0.0, shapes.corners, 0, 6)[:3] == pytest.approx((0.0, 0.0, -1.0))
+    assert polygon_gap(2e-3, 0.0, shapes, 0, math.inf)[:3] == pytest.approx((0.0, 0.0, -1.0))
     np.testing.assert_array_equal(np.flatnonzero(shapes.convex == 0.0), [np.argmin(abs(shapes.corners - 1e-3).sum(1))])
 
 
