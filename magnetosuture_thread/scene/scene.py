@@ -166,6 +166,22 @@ class Scene:
             if not far:
                 raise refusal(shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres")
 
+    @classmethod
+    def create(cls, dish_diameter: float = 0.035, **shapes: Disc | Polygon) -> Scene:
+        """Return a scene with named shapes, all of them tissue.
+
+        >>> Scene.create(0.035, post=Disc((0.0, 0.0), 0.0025)).names
+        ('post',)
+
+        Args:
+            dish_diameter: inner diameter of the dish [m].
+            shapes: by name.
+
+        Raises:
+            ConfigurationError: a shape cannot be used.
+        """
+        return cls(Dish(dish_diameter), tuple(SceneShape(name, KINDS[0], shape) for name, shape in shapes.items()))
+
     @cached_property
     def version(self) -> str:
         """Hash of the content: equal for scenes with the same dish, names, kinds and geometry, bit for bit."""

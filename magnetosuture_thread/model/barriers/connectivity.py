@@ -7,13 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import (
+    COMPRESSION,
+    CONNECTIVITY,
+    ENHANCED_CONNECTIVITY,
+    NO_OBSTACLE,
+    BarrierRows,
+    CompiledBarrier,
+)
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers.rows import NO_OBSTACLE, BarrierKind, BarrierRows
 
 
 @dataclass(frozen=True)
-class Connectivity:
+class Connectivity(CompiledBarrier):
     """No segment is longer than its rest length.
 
         h_con,i = (D^2 - |x_i - x_{i-1}|^2) / 2,    i = 1 ... n
@@ -26,15 +33,16 @@ class Connectivity:
         segment_length: D, in the unit of the positions.
     """
 
+    name = CONNECTIVITY
     segment_length: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _rows(positions, 1, self.segment_length, BarrierKind.CONNECTIVITY, 1.0)
+        return _rows(positions, 1, self.segment_length, self.name, 1.0)
 
 
 @dataclass(frozen=True)
-class EnhancedConnectivity:
+class EnhancedConnectivity(CompiledBarrier):
     """No two nodes with one between them are farther apart than two rest lengths.
 
         h_enh,i = ((2 D)^2 - |x_i - x_{i-2}|^2) / 2,    i = 2 ... n
@@ -50,15 +58,16 @@ class EnhancedConnectivity:
         segment_length: D, in the unit of the positions.
     """
 
+    name = ENHANCED_CONNECTIVITY
     segment_length: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n - 1 rows at positions of shape (n + 1, d)."""
-        return _rows(positions, 2, 2.0 * self.segment_length, BarrierKind.ENHANCED_CONNECTIVITY, 1.0)
+        return _rows(positions, 2, 2.0 * self.segment_length, self.name, 1.0)
 
 
 @dataclass(frozen=True)
-class Compression:
+class Compression(CompiledBarrier):
     """No segment is shorter than its rest length.
 
         h_cmp,i = (|x_i - x_{i-1}|^2 - D_i^2) / 2,    i = 1 ... n
@@ -73,11 +82,12 @@ class Compression:
         segment_length: D_i, of all segments or of each, shape (n,), in the unit of the positions.
     """
 
+    name = COMPRESSION
     segment_length: float | NDArray[np.float64]
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _rows(positions, 1, self.segment_length, BarrierKind.COMPRESSION, -1.0)
+        return _rows(positions, 1, self.segment_length, self.name, -1.0)
 
 
 @compiled
@@ -136,13 +146,11 @@ def _write(
         clearance[i] = sign * (longest[i] - np.sqrt(square))
 
 
-def _rows(
-    positions: Points, apart: int, longest: float | NDArray[np.float64], kind: BarrierKind, sign: float
-) -> BarrierRows:
+def _rows(positions: Points, apart: int, longest: float | NDArray[np.float64], name: str, sign: float) -> BarrierRows:
     positions = np.ascontiguousarray(positions)
     count, dimension = len(positions) - apart, positions.shape[1]
     bound, nodes = np.empty(count), np.empty((count, 2), dtype=np.intp)
     value, gradient, clearance = np.empty(count), np.empty((count, 2, dimension)), np.empty(count)
     bound[:] = longest
     _write(positions, apart, bound, sign, nodes, value, gradient, clearance)
-    return BarrierRows(kind, nodes, np.full(count, NO_OBSTACLE), value, gradient, clearance)
+    return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), value, gradient, clearance)

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magnetosuture_thread.barrier import OBSTACLE, BarrierRows, CompiledBarrier
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import WALL, Surroundings
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers.rows import BarrierKind, BarrierRows
 
 
 @dataclass(frozen=True)
-class ObstacleAvoidance:
+class ObstacleAvoidance(CompiledBarrier):
     """Every node, the needle's tail among them, keeps its distance from every obstacle that is near.
 
         h_obs,i,O = sd_O(x_i) - rho,    i = 0 ... n,  O = 1 ... M
@@ -32,6 +32,7 @@ class ObstacleAvoidance:
         distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
+    name = OBSTACLE
     surroundings: Surroundings
     distance: float
 
@@ -41,7 +42,7 @@ class ObstacleAvoidance:
         chosen = found.nearest & (found.obstacle != WALL)
         value = found.distance[chosen] - self.distance
         return BarrierRows(
-            kind=BarrierKind.OBSTACLE,
+            name=self.name,
             nodes=found.node[chosen][:, None],
             obstacle=found.obstacle[chosen],
             value=value,
@@ -51,7 +52,7 @@ class ObstacleAvoidance:
 
 
 @dataclass(frozen=True)
-class SquaredObstacleAvoidance:
+class SquaredObstacleAvoidance(CompiledBarrier):
     """The same margin in the paper's form.
 
         h_obs,i,O = (sd |sd| - rho^2) / 2,    sd = sd_O(x_i)
@@ -67,6 +68,7 @@ class SquaredObstacleAvoidance:
         distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
+    name = OBSTACLE
     surroundings: Surroundings
     distance: float
 
@@ -79,7 +81,7 @@ class SquaredObstacleAvoidance:
         for k in range(len(signed)):
             value[k], slope[k] = squared_barrier(signed[k], self.distance)
         return BarrierRows(
-            kind=BarrierKind.OBSTACLE,
+            name=self.name,
             nodes=found.node[chosen][:, None],
             obstacle=found.obstacle[chosen],
             value=value,

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import NO_OBSTACLE, STIFFNESS, BarrierRows, CompiledBarrier
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers.rows import NO_OBSTACLE, BarrierKind, BarrierRows
 
 
 @dataclass(frozen=True)
-class Stiffness:
+class Stiffness(CompiledBarrier):
     """Nodes with one between them go back to their distance at rest.
 
         V_i = (|x_i - x_{i-2}|^2 - delta_i^2)^2 / 2,    i = 2 ... n
@@ -29,6 +29,7 @@ class Stiffness:
         rest_distance: delta_i, shape (n - 1,), in the unit of the positions.
     """
 
+    name = STIFFNESS
     rest_distance: NDArray[np.float64]
 
     def rows(self, positions: Points) -> BarrierRows:
@@ -40,7 +41,7 @@ class Stiffness:
         first = np.arange(count)
         distance = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
         return BarrierRows(
-            kind=BarrierKind.STIFFNESS,
+            name=self.name,
             nodes=np.column_stack([first, first + 2]),
             obstacle=np.full(count, NO_OBSTACLE),
             value=value,

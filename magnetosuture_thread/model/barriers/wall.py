@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import NO_OBSTACLE, WALL, BarrierRows, CompiledBarrier
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import wall_contact
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers.rows import NO_OBSTACLE, BarrierKind, BarrierRows
 
 
 @dataclass(frozen=True)
-class WallAvoidance:
+class WallAvoidance(CompiledBarrier):
     """Every node, the needle's tail among them, keeps its distance from the wall of the dish.
 
         h_wall,i = R - rho - |x_i|,    i = 0 ... n
@@ -34,6 +34,7 @@ class WallAvoidance:
         reach: greatest distance at which a node has a row.
     """
 
+    name = WALL
     radius: float
     distance: float
     reach: float
@@ -45,7 +46,7 @@ class WallAvoidance:
         nodes, value, gradient = np.empty((count, 1), np.intp), np.empty(count), np.zeros((count, 1, dimension))
         found = _write(positions, self.radius, self.distance, self.reach, nodes, value, gradient)
         value = value[:found]
-        return BarrierRows(BarrierKind.WALL, nodes[:found], np.full(found, NO_OBSTACLE), value, gradient[:found], value)
+        return BarrierRows(self.name, nodes[:found], np.full(found, NO_OBSTACLE), value, gradient[:found], value)
 
 
 @compiled

@@ -51,17 +51,18 @@ def assemble(
     heading: Points,
     interval: float,
     last_interval: float,
+    elsewhere: float,
 ) -> tuple[int, float]:
     """Write the program about a predicted end point; where that came from a solve and is exact, do not.
 
     Returns the number of contacts, -1 if there is no room for them, and how far off the barriers the point
-    is: the stretch or the depth over what is allowed, 1 or less if it is exact.
+    is: the stretch, the depth, or what barriers from elsewhere are, over what is allowed; 1 or less if it is exact.
     """
     segments = len(about) - 1
     mechanics.chord_lengths(about, heading, rod.glued, memory.chords)
     stretch = _segment_rows(memory, about, start, known, interval)
     contacts, depth = contact_rows(memory, segments, surroundings, about, start, known, interval, rod.unit, rod.radius)
-    off = max(stretch / STRETCH_REACHED, depth / DEPTH_REACHED)
+    off = max(stretch / STRETCH_REACHED, depth / DEPTH_REACHED, elsewhere)
     if contacts >= 0 and (solves == 0 or off > 1.0):
         _objective(rod, memory, about, start, before, last, heading, interval, last_interval)
     return contacts, off if solves > 0 else np.inf

@@ -104,6 +104,7 @@ def go_on(
     tolerance: float,
     most_solves: int,
     solves: int,
+    elsewhere: float,
 ) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
     """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
 
@@ -124,6 +125,7 @@ def go_on(
         tolerance: the largest residual with which a solution is accepted.
         most_solves: of a step.
         solves: how many this step has had; with none it sets out.
+        elsewhere: how far off the rows are that this code does not know, see `assemble`.
 
     Returns:
         `ENDED`, `NO_ROOM` for all contacts in the memory, or `UNSOLVED`, and then the program is there for
@@ -147,6 +149,7 @@ def go_on(
             heading,
             interval,
             last_interval,
+            elsewhere,
         )
         if contacts < 0:
             return NO_ROOM, contacts, solves, off, status, worst

@@ -26,7 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Vector, compiled_residuals
+from magnetosuture_thread.model.program import (
+    SPAN,
+    ChainProgram,
+    Residuals,
+    Solution,
+    Vector,
+    WideRows,
+    compiled_residuals,
+)
 from magnetosuture_thread.model.solvers.band import Axes, assemble, factorise, substitute
 
 STIFFEST = 1e7  # w_max over the scale of P: the least compliance that is exact at once
@@ -68,8 +76,17 @@ class BandedSolver:
     def __init__(self, tolerance: float = 1e-8, iterations: int = 60) -> None:
         self._workspace = Workspace(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
 
-    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
-        """Solve one program, started from a guess; see `Solver`."""
+    def solve(
+        self,
+        program: ChainProgram,
+        velocities: NDArray[np.float64],
+        multipliers: Vector,
+        wide: WideRows | None = None,
+    ) -> Solution:
+        """Solve one program, started from a guess; see `Solver`. Wide rows do not fit into the band."""
+        if wide is not None:
+            infinite = Residuals(np.inf, np.inf, np.inf)
+            return Solution(velocities, multipliers, self.name, "cannot take rows beyond its band", 0, infinite)
         nodes, dimension = program.linear.shape
         workspace = self.workspace(nodes, dimension, len(program.first))
         u, found, axes = velocities.copy(), multipliers.copy(), (0, 1, 2)[:dimension]
