@@ -27,7 +27,7 @@ BAND = 2e-6  # m; by which the barriers keep farther away than the certificate, 
 MAX_SPEED = 10.0  # m/s; a faster command is shortened first, as rounding grows with its size
 STUCK = 1e-3  # of the speed commanded; a needle that is left less rests
 CHECKS = 8  # instants of a hold at which an added barrier is checked
-LEAST_SHARE = 1e-3  # of a velocity; what an added barrier leaves less of is none
+BISECTIONS = 10  # of the share that an added barrier leaves of a velocity
 ROUNDING = 1e-12  # by which an added barrier may decrease
 WALL_NAME = "wall"
 SPEED, ACCELERATION, FRICTION = "speed", "acceleration", "friction"
@@ -314,8 +314,13 @@ class NeedleSafetyFilter:
         """
         share, what = 1.0, ""
         for barrier in self._barriers:
-            while share > 0.0 and not self._holds(barrier, share * velocity, tail, heading):
-                share, what = (0.5 * share if share > LEAST_SHARE else 0.0), barrier.name
+            if self._holds(barrier, share * velocity, tail, heading):
+                continue
+            low, high = 0.0, share
+            for _ in range(BISECTIONS):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if self._holds(barrier, middle * velocity, tail, heading) else (low, middle)
+            share, what = low, barrier.name
         return share, what
 
     def _holds(self, barrier: Barrier, velocity: Vector, tail: Vector, heading: Vector) -> bool:
