@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MagnetosutureError as error:
         return _fail(str(error), FAILED)
     except ModuleNotFoundError as error:
-        return _fail(f"{error}; the live graph needs ROS 2 Jazzy: see README, or pip install '.[ros]'", FAILED)
+        return _fail(f"{error}; the live graph needs ROS 2 Jazzy: see the README, or pip install '.[ros]'", FAILED)
     except OSError as error:
         return _fail(str(error), FAILED)
     except KeyboardInterrupt:

@@ -7,7 +7,8 @@ A number cannot be identified where
 - half of its 95 % interval is wider than `Parameter.widest`: a factor of 1.5 for what is positive;
 - its effect is too small to build on: a change that counts, a factor of two for what is positive, moves the predicted
   thread by less than `FLOOR` of its length that no other number makes up for. That is what the whole chain of
-  camera, tracker and model is wrong by (0.05 to 0.2 %, README), so such an estimate may come from the chain itself;
+  camera, tracker and model is wrong by (0.05 to 0.2 %, docs/results.md), so such an estimate may come from the chain
+  itself;
 - it is the stiffness, and acts within a small part of the thread only. Behind a needle of speed V bending and drag
   are in balance over the length
 
