@@ -8,7 +8,7 @@ from magnetosuture_thread import Disc, NeedlePose, Scene, ThreadPredictor
 
 SOLVERS = ["banded", "osqp"] + (["clarabel"] if find_spec("qpsolvers") and find_spec("clarabel") else [])
 
-scene = Scene.create(0.05, post=Disc((-0.006, 0.003), 0.002))
+scene = Scene.create(dish_diameter=0.05, shapes={"post": Disc((-0.006, 0.003), 0.002)})
 threads = {}
 for solver in SOLVERS:
     predictor = ThreadPredictor.create("silk_6_0", length=0.019, segments=25, scene=scene, solver=solver)

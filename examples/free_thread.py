@@ -6,7 +6,7 @@ from magnetosuture_thread import NeedlePose, Scene, ThreadPredictor
 
 RADIUS, SPEED, RATE = 0.008, 0.005, 30.0  # m, m/s, Hz
 
-predictor = ThreadPredictor.create("polyamide_7_0", length=0.012, segments=25, scene=Scene.create(0.026))
+predictor = ThreadPredictor.create("polyamide_7_0", length=0.012, segments=25, scene=Scene.create(dish_diameter=0.026))
 predictor.start(NeedlePose(0.0, np.array([0.0, -RADIUS]), np.array([1.0, 0.0])))  # straight behind the needle
 angle, step = 0.0, 0
 while angle < 0.5 * np.pi:

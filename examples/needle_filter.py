@@ -19,7 +19,7 @@ class UpperHalf(Barrier):
         return Gradient(np.arange(len(positions))[:, None], np.tile([[[0.0, 1.0]]], (len(positions), 1, 1)))
 
 
-scene = Scene.create(0.035, post=Disc((0.0, -0.0005), 0.002))
+scene = Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, -0.0005), 0.002)})
 needle = NeedleSafetyFilter(scene, barriers=[UpperHalf()], needle_length=0.0025)
 tail, heading, command = np.array([-0.008, 0.0]), np.array([1.0, 0.0]), np.array([0.004, -0.0005])
 active, clearance = set(), np.inf

@@ -6,7 +6,7 @@ from magnetosuture_thread import Disc, NeedlePose, Scene, ThreadPredictor
 
 POST, RATE = Disc((0.0, 0.0), 0.0025), 30.0  # centre and radius [m], Hz
 
-scene = Scene.create(0.035, post=POST)
+scene = Scene.create(dish_diameter=0.035, shapes={"post": POST})
 predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=40, scene=scene)
 tail = np.array([-0.001, 0.0034])
 predictor.start(NeedlePose(0.0, tail, np.array([1.0, 0.0])))

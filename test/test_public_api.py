@@ -26,7 +26,7 @@ def test_nothing_is_imported_before_it_is_used():
 
 
 def test_a_thread_is_predicted_around_a_post_in_a_few_lines():
-    scene = Scene.create(0.035, post=Disc((-0.006, 0.003), 0.0025))
+    scene = Scene.create(dish_diameter=0.035, shapes={"post": Disc((-0.006, 0.003), 0.0025)})
     predictor = ThreadPredictor.create("polyamide_7_0", length=0.012, segments=25, scene=scene)
     east = np.array([1.0, 0.0])
     predictor.start(NeedlePose(0.0, np.zeros(2), east))

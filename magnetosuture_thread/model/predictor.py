@@ -43,6 +43,13 @@ class NeedlePose:
     tail: Points
     heading: Points
 
+    def __post_init__(self) -> None:
+        """Take sequences of numbers as arrays."""
+        for name in ("tail", "heading"):
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray):
+                object.__setattr__(self, name, np.array(value, dtype=np.float64))
+
 
 @dataclass(frozen=True)
 class Prediction:

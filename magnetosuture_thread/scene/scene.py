@@ -167,10 +167,10 @@ class Scene:
                 raise refusal(shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres")
 
     @classmethod
-    def create(cls, dish_diameter: float = 0.035, **shapes: Disc | Polygon) -> Scene:
+    def create(cls, *, dish_diameter: float = 0.035, shapes: Mapping[str, Disc | Polygon] | None = None) -> Scene:
         """Return a scene with named shapes, all of them tissue.
 
-        >>> Scene.create(0.035, post=Disc((0.0, 0.0), 0.0025)).names
+        >>> Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, 0.0), 0.0025)}).names
         ('post',)
 
         Args:
@@ -180,7 +180,8 @@ class Scene:
         Raises:
             ConfigurationError: a shape cannot be used.
         """
-        return cls(Dish(dish_diameter), tuple(SceneShape(name, KINDS[0], shape) for name, shape in shapes.items()))
+        named = (shapes or {}).items()
+        return cls(Dish(dish_diameter), tuple(SceneShape(name, KINDS[0], geometry) for name, geometry in named))
 
     @cached_property
     def version(self) -> str:

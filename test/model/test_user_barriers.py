@@ -119,7 +119,7 @@ def test_barrier_gradient_matches_finite_differences(barrier: Barrier):
 
 
 def test_several_barriers_hold_together_beside_the_wall_and_a_post():
-    scene = Scene.create(0.045, post=Disc((-0.004, -0.004), 0.002))
+    scene = Scene.create(dish_diameter=0.045, shapes={"post": Disc((-0.004, -0.004), 0.002)})
     barriers = [TipKeepIn(), MovingDisc()]
     held = predicted(*barriers, scene=scene)
     assert all(prediction.converged for prediction in held)

@@ -50,7 +50,9 @@ class TurnedAway(Barrier):
 
 def needle(*barriers: Barrier, length: float = LENGTH, scene: Scene | None = None) -> NeedleSafetyFilter:
     """Return a filter in an empty dish of 35 mm."""
-    return NeedleSafetyFilter(scene or Scene.create(0.035), barriers, hold_time=HOLD, needle_length=length)
+    return NeedleSafetyFilter(
+        scene or Scene.create(dish_diameter=0.035), barriers, hold_time=HOLD, needle_length=length
+    )
 
 
 def driven(safety: NeedleSafetyFilter, seed: int, periods: int = 300) -> tuple[float, set[str]]:
@@ -124,7 +126,7 @@ def test_the_share_that_the_bridge_asks_for_knows_added_barriers():
 
 
 def test_shapes_wall_and_added_barriers_are_named_apart():
-    scene = Scene.create(0.035, post=Disc((0.0, -0.003), 0.001))
+    scene = Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, -0.003), 0.001)})
     safety = needle(HalfPlane(0.0), scene=scene)
     heading = np.array([1.0, 0.0])
     assert safety.filter(np.array([0.0, 0.01]), np.array([0.0, -1e-7]), heading).active == ("half_plane",)
