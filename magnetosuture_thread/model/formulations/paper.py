@@ -39,11 +39,11 @@ from magnetosuture_thread.model.barriers import (
     ObstacleAvoidance,
     Stiffness,
     WallAvoidance,
+    distance_barrier,
+    moved_inside,
+    squared_barrier,
+    stiffness_function,
 )
-from magnetosuture_thread.model.barriers.connectivity import distance_barrier
-from magnetosuture_thread.model.barriers.obstacle import squared_barrier
-from magnetosuture_thread.model.barriers.stiffness import stiffness_function
-from magnetosuture_thread.model.barriers.wall import moved_inside
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
 from magnetosuture_thread.model.formulations.step import (
     DEPTH_REACHED,

@@ -38,8 +38,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
-from magnetosuture_thread.model.formulations.rod_program import Rod
-from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, go_on, take
+from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, Rod, go_on, take
 from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState, warmed
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
