@@ -1,1 +1,71 @@
-"""Suture thread prediction for the MagnetoSuture robot."""
+"""Prediction of a suture thread behind a magnetically steered needle, and safety filter of that needle.
+
+    from magnetosuture_thread import Disc, NeedlePose, Scene, ThreadPredictor
+
+What this module offers is imported when it is first used, so that a command that needs none of it starts quickly.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.barrier import Barrier, Gradient
+    from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
+    from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
+    from magnetosuture_thread.model.margins import BarrierMargins, Margins
+    from magnetosuture_thread.model.medium import Medium
+    from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+    from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+    from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
+    from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+
+_HOME = {
+    "barrier": ("Barrier", "Gradient"),
+    "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
+    "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Surroundings"),
+    "model.margins": ("BarrierMargins", "Margins"),
+    "model.medium": ("Medium",),
+    "model.predictor": ("NeedlePose", "Prediction", "ThreadPredictor"),
+    "model.thread": ("MATERIALS", "Attachment", "Material", "Thread"),
+    "safety": ("FilteredCommand", "NeedleSafetyFilter"),
+    "scene": ("Dish", "Scene", "SceneShape", "read_scene"),
+}
+_MODULES = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [
+    "MATERIALS",
+    "Attachment",
+    "Barrier",
+    "BarrierMargins",
+    "ConfigurationError",
+    "Disc",
+    "Dish",
+    "FilteredCommand",
+    "Gradient",
+    "InvalidInputError",
+    "MagnetosutureError",
+    "Margins",
+    "Material",
+    "Medium",
+    "Mesh",
+    "NeedlePose",
+    "NeedleSafetyFilter",
+    "Polygon",
+    "Prediction",
+    "Scene",
+    "SceneShape",
+    "SolverError",
+    "Surroundings",
+    "Thread",
+    "ThreadPredictor",
+    "read_scene",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what the package offers when it is first asked for."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value

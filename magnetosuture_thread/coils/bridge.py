@@ -240,6 +240,7 @@ class Bridge:
             max_speed=self._settings.speed_without_prediction if unpredicted else math.inf,
             previous=self._velocity,
             elapsed=elapsed,
+            time=now,
         )
         active += filtered.active
         if filtered.reason:

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
+from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
 from magnetosuture_thread.coils.field import CoilProperties, coils_around, make_coils
@@ -82,6 +83,7 @@ class CoilBridgeSettings(Configuration):
         minimum=2.5e-5,
         maximum=0.05,
     )
+    barriers: tuple[str, ...] = quantity((), "barriers of your own for the needle, each as module:class; see Barrier")
     approach_rate: float = quantity(
         10.0,
         "share of its clearance by which the needle may approach, each second",
@@ -227,10 +229,11 @@ class CoilBridgeSettings(Configuration):
         """Return what keeps the needle clear of the wall and of the shapes of a scene.
 
         Raises:
-            ConfigurationError: the needle has no room in it.
+            ConfigurationError: the needle has no room in it, or a barrier cannot be used.
         """
         return NeedleSafetyFilter(
             scene,
+            load_barriers(self.barriers, f"{self.GROUP}.barriers"),
             keep_out=self.keep_out,
             approach_rate=self.approach_rate,
             hold_time=self.hold_time,

@@ -13,7 +13,8 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from magnetosuture_thread.evaluation.metrics import KINDS, Percentiles
+from magnetosuture_thread.barrier import BUILT_IN
+from magnetosuture_thread.evaluation.metrics import Percentiles
 from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures
 from magnetosuture_thread.evaluation.report.headlines import AGAINST, micrometres, milliseconds, number
 
@@ -49,8 +50,10 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
         "residual_max": figures.residual,
         "contact_frames": figures.contact_frames,
     }
-    for kind in KINDS:
-        row[f"least_{kind}_m"] = figures.minimum[kind].clearance if kind in figures.minimum else None
+    for barrier in BUILT_IN:
+        row[f"least_{barrier}_m"] = figures.minimum[barrier].clearance if barrier in figures.minimum else None
+    added = [f"{name}: {margin.clearance:.3e}" for name, margin in figures.minimum.items() if name not in BUILT_IN]
+    row["least_added_m"] = "; ".join(added) or None
     row |= _percentiles("step", figures.step_time) | _percentiles("tracker", figures.processing)
     for stage in STAGES:
         row |= _percentiles(f"latency_{stage.replace(' ', '_')}", figures.live.latency.get(stage))

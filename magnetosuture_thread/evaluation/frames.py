@@ -57,7 +57,7 @@ class FrameResult:
         strain: greatest absolute strain of a segment.
         residual: of the solves.
         step_time: of the model [s].
-        margins: `Margins` or a message of the same fields; None if they prove nothing.
+        margins: None if they prove nothing.
         in_contact: whether the thread touches an obstacle or the wall.
         seen: the thread's measured centreline, shape (m, 2) [m].
         truth: its ground truth, if the bag holds it, shape (m, 2) [m].
@@ -75,7 +75,7 @@ class FrameResult:
     strain: float = math.nan
     residual: float = math.nan
     step_time: float = math.nan
-    margins: Any = None
+    margins: Margins | None = None
     in_contact: bool = False
     seen: Points = field(default_factory=_none)
     truth: Points = field(default_factory=_none)
@@ -115,7 +115,7 @@ class FrameResult:
             prediction.residual,
             step_time,
             margins,
-            margins is not None and bool(margins.touching),
+            margins is not None and bool(margins.in_contact),
             observation.seen,
             observation.truth,
             observation.tail,

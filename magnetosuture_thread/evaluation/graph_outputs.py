@@ -105,7 +105,8 @@ class GraphCollector:
 
     def _take_margins(self, frame: FrameResult, message: Any) -> None:
         if message.valid:
-            frame.margins, frame.in_contact = message, bool(len(message.contact_nodes))
+            frame.margins = margins_of(message)
+            frame.in_contact = bool(frame.margins.in_contact)
 
 
 def nanoseconds(stamp: Any) -> int:

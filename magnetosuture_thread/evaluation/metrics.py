@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation
-from magnetosuture_thread.evaluation.series import ErrorMap, TimeSeries, WorstFrame, WorstFrames
+from magnetosuture_thread.evaluation.series import MARGIN, ErrorMap, TimeSeries, WorstFrame, WorstFrames
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers.rows import BarrierKind
-from magnetosuture_thread.model.margins import TOUCHABLE
+from magnetosuture_thread.barrier import BUILT_IN
+from magnetosuture_thread.model.margins import SOLID
 
 Array = NDArray[np.float64]
 
-KINDS = tuple(kind.name.lower() for kind in BarrierKind)  # by the number in the message BarrierMargin
-SOLID_KINDS = tuple(KINDS[kind] for kind in TOUCHABLE)
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
 END_TOLERANCE = 1e-3  # of the length; the chords of a curve are always a little short, and its free end counts
@@ -146,13 +144,13 @@ def prediction_error_percent(vertices: Points, curve: Points, length: float) -> 
 
 @dataclass(frozen=True)
 class MinimumMargin:
-    """The minimum margin of one kind of barrier, and where it was.
+    """The minimum margin of one barrier, and where it was.
 
     Attributes:
-        kind: of barrier.
+        kind: name of the barrier.
         clearance: as a distance [m].
         node: index.
-        obstacle: index, -1 where the kind has none.
+        obstacle: index, -1 where there is none.
         time: since the bag's start [s].
     """
 
@@ -189,7 +187,7 @@ class RunMetrics:
         self.targets = tuple(target for target in TARGETS if target in targets)
         errors = [f"error_{target}" for target in self.targets]
         of_bag = [f"recorded_{name}" for name in errors] if recorded else []
-        margins = [f"margin_{kind}" for kind in KINDS]
+        margins = [f"{MARGIN}{barrier}" for barrier in BUILT_IN]
         self._series = TimeSeries([*errors, *of_bag, *margins, "strain", "residual", "step_time", "seen_share"])
         self.observed = TimeSeries(["processing"])
         self.tracked = self.contact_frames = 0
@@ -197,7 +195,7 @@ class RunMetrics:
         self.reasons: Counter[str] = Counter()
         self._found = True
         self._length, self._start = length, start
-        self._minimum: dict[int, MinimumMargin] = {}
+        self._minimum: dict[str, MinimumMargin] = {}
         self._maps = {target: ErrorMap(length) for target in self.targets}
         self._worst = {target: WorstFrames() for target in self.targets}
         self._fresh: list[FrameResult] = []
@@ -220,11 +218,11 @@ class RunMetrics:
     def add(self, frame: FrameResult) -> None:
         """Take what was predicted of a frame; its errors are set when they are worked out."""
         if frame.margins is not None:
-            for least in frame.margins.least:
-                held = self._minimum.get(least.kind)
-                if held is None or least.clearance < held.clearance:
-                    place = int(least.node), int(least.obstacle), self._time(frame.stamp)
-                    self._minimum[least.kind] = MinimumMargin(KINDS[least.kind], float(least.clearance), *place)
+            for row in frame.margins.minima:
+                held = self._minimum.get(row.barrier)
+                if held is None or row.clearance[0] < held.clearance:
+                    place = int(row.node[0]), int(row.obstacle[0]), self._time(frame.stamp)
+                    self._minimum[row.barrier] = MinimumMargin(row.barrier, float(row.clearance[0]), *place)
             self.contact_frames += frame.in_contact
         if self._fresh and len(frame.vertices) != len(self._fresh[0].vertices):  # the model's segments have changed
             self.compare()
@@ -240,8 +238,9 @@ class RunMetrics:
 
     @property
     def minimum_margins(self) -> dict[str, MinimumMargin]:
-        """The minimum margin of each kind of barrier that was there."""
-        return {KINDS[kind]: self._minimum[kind] for kind in sorted(self._minimum)}
+        """The minimum margin of each barrier that was there, the built-in ones first."""
+        names = [name for name in BUILT_IN if name in self._minimum]
+        return {name: self._minimum[name] for name in [*names, *sorted(self._minimum.keys() - set(names))]}
 
     @property
     def target(self) -> str:
@@ -301,7 +300,7 @@ class RunMetrics:
             self._compare_with(target, frames, vertices, rows)
         for frame, row in zip(frames, rows, strict=True):
             if frame.margins is not None:
-                row |= {f"margin_{KINDS[least.kind]}": least.clearance for least in frame.margins.least}
+                row |= {f"{MARGIN}{least.barrier}": float(least.clearance[0]) for least in frame.margins.minima}
             row["seen_share"] = frame.seen_share
             self._series.add(self._time(frame.stamp), row)
 

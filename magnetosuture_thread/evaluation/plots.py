@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.evaluation.metrics import SOLID_KINDS
+from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.evaluation.series import TimeSeries
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
@@ -207,7 +207,7 @@ def _draw_error(axes: Axes, series: TimeSeries) -> None:
 
 
 def _draw_clearance(axes: Axes, series: TimeSeries) -> None:
-    clearance = 1e3 * np.fmin.reduce([series.column(f"margin_{kind}") for kind in SOLID_KINDS])
+    clearance = 1e3 * np.fmin.reduce([series.column(f"margin_{kind}") for kind in SOLID])
     axes.set_title("least distance of a node from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
     if not np.isfinite(clearance).any():
         axes.text(0.5, 0.5, "no obstacle near the thread", transform=axes.transAxes, ha="center", color=FAINT)

@@ -21,6 +21,7 @@ MAP_GAP = 3.0  # the same, of the error map
 MAP_COLUMNS = 300
 WORST_FRAMES = 5
 MIN_DISTANCE = 1.0  # s; between two of the worst frames
+MARGIN = "margin_"  # columns of margins, by the barrier's name
 BIN = 0.5  # s; of each bin the worst frame is kept
 
 
@@ -46,13 +47,15 @@ class TimeSeries:
 
         Args:
             time: since the bag's start [s].
-            values: by column.
+            values: by column; a column of a user's barrier (`MARGIN`) begins when it first has a value.
 
         Raises:
             KeyError: there is no such column.
         """
-        if unknown := values.keys() - self._columns.keys():
-            raise KeyError(f"no such columns: {', '.join(sorted(unknown))}")
+        for name in values.keys() - self._columns.keys():
+            if not name.startswith(MARGIN):
+                raise KeyError(f"no such column: {name}")
+            self._columns[name] = array("d", [float("nan")] * len(self._times))
         self._times.append(time)
         for name, column in self._columns.items():
             column.append(values.get(name, float("nan")))

@@ -30,8 +30,8 @@ from magnetosuture_thread.model.friction import Friction, FrictionState, frictio
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import Prediction
 
-_UNKNOWN, _FREE, _TOUCHING = 0, 1, 2  # as in SafetyMargins.msg
-_KIND, _NODE, _OBSTACLE = (np.dtype(code) for code in ("u1", "<u4", "<i4"))
+_UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
+_BARRIER, _NODE, _OBSTACLE = (np.dtype(code) for code in ("u1", "<u4", "<i4"))
 _PLACES = [6 * row + column for row in IN_PLANE for column in IN_PLANE]
 _POSE = form(*HEADER, *"d" * 7, *"d" * 36)
 _PATH = form(*HEADER, "I")
@@ -116,7 +116,7 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
 
 
 def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_version: str = "") -> bytes:
-    """Return a SafetyMargins: every barrier, the least of each kind, and what touches; or why there are none.
+    """Return a SafetyMargins: every barrier, the minimum of each, and what is in contact; or why there are none.
 
     Args:
         time: of the pose, seconds and nanoseconds.
@@ -128,38 +128,39 @@ def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_
     if margins is None:
         words = text(reason)
         return BEGIN + _no_margins_form(scene[0], words[0]).pack(
-            *time, *DISH, *scene, False, *words, *[0] * 6, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
+            *time, *DISH, *scene, False, *words, *[0] * 7, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
         )
-    count = len(margins.kind)
-    friction = margins.friction
-    layout = _margins_form(scene[0], count, len(margins.least), len(margins.touching), len(friction.nodes))
+    names = [text(name) for name in margins]
+    minima = [(text(row.barrier), row) for row in margins.minima]
+    counts = [len(barrier) for barrier in margins.barriers]
+    count, friction = sum(counts), margins.friction
+    touching, squeezed = len(margins.in_contact), len(friction.nodes)
+    layout = _margins_form(
+        scene[0], tuple(size for size, _ in names), count, tuple(name[0] for name, _ in minima), touching, squeezed
+    )
+    columns = [np.repeat(np.arange(len(names)), counts).astype(_BARRIER).tobytes()]
+    for attribute, kind in (("node", _NODE), ("obstacle", _OBSTACLE), ("value", REAL), ("clearance", REAL)):
+        columns.append(b"".join(numbers(getattr(barrier, attribute), kind) for barrier in margins.barriers))
     return BEGIN + layout.pack(
         *time,
         *DISH,
         *scene,
         True,
         *EMPTY,
-        count,
-        numbers(margins.kind, _KIND),
-        count,
-        numbers(margins.node, _NODE),
-        count,
-        numbers(margins.obstacle, _OBSTACLE),
-        count,
-        numbers(margins.value, REAL),
-        count,
-        numbers(margins.clearance, REAL),
-        len(margins.least),
+        len(names),
+        *[part for name in names for part in name],
+        *[part for column in columns for part in (count, column)],
+        len(minima),
         *[
-            number
-            for least in margins.least
-            for number in (least.kind, least.node, least.obstacle, least.value, least.clearance)
+            part
+            for name, row in minima
+            for part in (*name, row.node[0], row.obstacle[0], row.value[0], row.clearance[0])
         ],
-        _TOUCHING if margins.touching else _FREE,
-        len(margins.touching),
-        *margins.touching,
+        _IN_CONTACT if touching else _FREE,
+        touching,
+        *margins.in_contact,
         friction.state,
-        len(friction.nodes),
+        squeezed,
         *friction.nodes,
         friction.slowdown,
     )
@@ -176,17 +177,29 @@ def _prediction_form(
 
 
 @lru_cache(KEPT)
-def _margins_form(scene: int, barriers: int, least: int, touching: int, squeezed: int) -> struct.Struct:
-    """Return the format of a SafetyMargins with so many barriers, least ones, nodes that touch, and under friction."""
-    arrays = [code for kind in "BIidd" for code in array_codes(barriers, kind)]
+def _margins_form(
+    scene: int, names: tuple[int, ...], rows: int, minima: tuple[int, ...], touching: int, squeezed: int
+) -> struct.Struct:
+    """Return the format of a SafetyMargins.
+
+    Args:
+        scene: bytes of the scene's version.
+        names: bytes of each barrier's name.
+        rows: of all barriers.
+        minima: bytes of the name of each barrier that has rows.
+        touching: nodes that touch something.
+        squeezed: nodes under friction.
+    """
     return form(
         *HEADER,
         *text_codes(scene),
         "?",
         *text_codes(EMPTY[0]),
-        *arrays,
         "I",
-        *"BIidd" * least,
+        *[code for size in names for code in text_codes(size)],
+        *[code for kind in "BIidd" for code in array_codes(rows, kind)],
+        "I",
+        *[code for size in minima for code in (*text_codes(size), "I", "i", "d", "d")],
         *_nodes(touching),
         *_nodes(squeezed),
         "d",
@@ -196,7 +209,7 @@ def _margins_form(scene: int, barriers: int, least: int, touching: int, squeezed
 @lru_cache(KEPT)
 def _no_margins_form(scene: int, reason: int) -> struct.Struct:
     """Return the format of a SafetyMargins without any, but a reason of this length."""
-    return form(*HEADER, *text_codes(scene), "?", *text_codes(reason), *"IIIIII", *_nodes(0), *_nodes(0), "d")
+    return form(*HEADER, *text_codes(scene), "?", *text_codes(reason), *"IIIIIII", *_nodes(0), *_nodes(0), "d")
 
 
 def _nodes(count: int) -> tuple[str, ...]:

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import as_told, heading_of
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_POSE, SEEN_THREAD
+from magnetosuture_thread.interface import DISH_FRAME, MARGINS, NEEDLE_POSE, SEEN_THREAD
 from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish
+from magnetosuture_thread.model.friction import Friction, FrictionState
+from magnetosuture_thread.model.margins import BarrierMargins, Margins
 from magnetosuture_thread.model.predictor import NeedlePose
 
 _POSE = struct.Struct("<7d")  # position and quaternion
@@ -90,6 +92,33 @@ def pose_covariance(message: Any) -> NDArray[np.float64] | None:
         diagonal = np.diag(covariance).tolist()
         raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", diagonal, "finite variances of at least 0")
     return np.asarray(covariance)
+
+
+def margins_of(message: Any) -> Margins:
+    """Return the margins of a SafetyMargins that is valid.
+
+    Raises:
+        InvalidInputError: its parallel arrays differ in length, or a row is of no barrier.
+    """
+    row, names = np.asarray(message.barrier, dtype=np.intp), list(message.barrier_names)
+    columns = [
+        np.asarray(values, dtype)
+        for values, dtype in (
+            (message.node, np.uint32),
+            (message.obstacle, np.int32),
+            (message.value, np.float64),
+            (message.clearance, np.float64),
+        )
+    ]
+    if any(len(column) != len(row) for column in columns) or (len(row) and row.max() >= len(names)):
+        found = f"{[len(row), *map(len, columns)]} rows of {len(names)} barriers"
+        raise InvalidInputError(MARGINS.name, found, "parallel arrays, each row of a barrier that is named")
+    if message.friction_state not in set(FrictionState):
+        raise InvalidInputError(f"{MARGINS.name}.friction_state", message.friction_state, "a state of SafetyMargins")
+    margins = [BarrierMargins(name, *(column[row == k] for column in columns)) for k, name in enumerate(names)]
+    squeezed = tuple(int(node) for node in message.friction_nodes)
+    friction = Friction(FrictionState(message.friction_state), squeezed, message.slowdown)
+    return Margins(tuple(margins), tuple(int(node) for node in message.contact_nodes), friction, message.scene_version)
 
 
 def planar_pose(pose: Any) -> tuple[float, float, float]:

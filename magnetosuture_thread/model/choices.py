@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from magnetosuture_thread.barrier import Barrier, check_barriers
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.model.formulations import Formulation, PaperFormulation, PaperOptions, RodFormulation
 from magnetosuture_thread.model.program import Solver
-from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver
+from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver, QpsolversSolver
 from magnetosuture_thread.model.thread import Thread
 
 FORMULATIONS = (RodFormulation.name, PaperFormulation.name)
 SOLVERS = (BandedSolver.name, OsqpSolver.name)
+"""Those that need no other package; besides, any that qpsolvers knows."""
 
 
 def make_solver(name: str, tolerance: float) -> Solver:
-    """Return a solver by name; `banded` falls back on a cold start and on OSQP, OSQP on a cold start alone."""
+    """Return a solver by name; `banded` falls back on a cold start and on OSQP, OSQP on a cold start alone.
+
+    Any other name is that of a solver of the package qpsolvers, where that is installed.
+
+    Raises:
+        ConfigurationError: there is no solver of this name.
+    """
+    if name not in SOLVERS:
+        return FallbackSolver((QpsolversSolver(name),), tolerance)
     solvers: dict[str, tuple[Solver, ...]] = {
         BandedSolver.name: (BandedSolver(), OsqpSolver()),
         OsqpSolver.name: (OsqpSolver(),),
@@ -28,8 +41,16 @@ def make_formulation(
     solver: Solver,
     tolerance: float,
     paper: PaperOptions | None = None,
+    barriers: Sequence[Barrier] = (),
 ) -> Formulation:
-    """Return a formulation by name; the options are those of `paper`."""
+    """Return a formulation by name; the options are those of `paper`.
+
+    Raises:
+        ConfigurationError: there is no formulation of this name, or barriers cannot be told apart.
+    """
+    check_barriers(tuple(barriers))
     if name == PaperFormulation.name:
-        return PaperFormulation(thread, surroundings, solver, tolerance, paper)
-    return RodFormulation(thread, surroundings, solver, tolerance)
+        return PaperFormulation(thread, surroundings, solver, tolerance, paper, barriers)
+    if name != RodFormulation.name:
+        raise ConfigurationError("formulation", name, f"one of {', '.join(FORMULATIONS)}")
+    return RodFormulation(thread, surroundings, solver, tolerance, barriers)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import OBSTACLE
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers import BarrierRows
-from magnetosuture_thread.model.barriers.rows import BarrierKind
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.model.margins import BarrierMargins
 
 
 class FrictionState(IntEnum):
@@ -82,17 +86,15 @@ class FrictionLaw:
     beta: float
     resting_speed: float
 
-    def judge(self, barriers: list[BarrierRows], speeds: NDArray[np.float64]) -> Friction:
+    def judge(self, margins: Mapping[str, BarrierMargins], speeds: NDArray[np.float64]) -> Friction:
         """Return the friction of a thread.
 
         Args:
-            barriers: the rows of each kind, in SI units.
+            margins: of all barriers, by name; only those of the obstacles count.
             speeds: of each node, shape (n + 1,) [m/s].
         """
-        close = np.zeros(len(speeds), dtype=np.int64)
-        for rows in barriers:
-            if rows.kind == BarrierKind.OBSTACLE:
-                np.add.at(close, rows.nodes[rows.clearance < self.threshold, -1], 1)
+        obstacle = margins[OBSTACLE]
+        close = np.bincount(obstacle.node[obstacle.clearance < self.threshold], minlength=len(speeds))
         close[0] = 0  # the needle: what holds it back is no friction of the thread
         index = np.flatnonzero(close >= 2)
         if not len(index):

@@ -1,130 +1,144 @@
-"""The margins of a prediction as one table: every barrier, the least of each kind, and what touches."""
+"""The margins of a prediction: the value of every barrier, and what follows from them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.model.barriers import BarrierRows
-from magnetosuture_thread.model.barriers.rows import BarrierKind
+from magnetosuture_thread.barrier import OBSTACLE, WALL, BarrierRows
 from magnetosuture_thread.model.friction import UNKNOWN, Friction
 
-TOUCHABLE = (BarrierKind.OBSTACLE, BarrierKind.WALL)
-"""Kinds of barriers that are of a solid thing."""
+SOLID = (OBSTACLE, WALL)
+"""Barriers of what a thread can touch."""
 
 
-@dataclass(frozen=True)
-class LeastBarrier:
-    """The barrier with the least margin of its kind.
-
-    Attributes:
-        kind: number of the kind.
-        node: index.
-        obstacle: index, -1 where the kind has none.
-        value: h.
-        clearance: the same as a distance [m].
-    """
-
-    kind: int
-    node: int
-    obstacle: int
-    value: float
-    clearance: float
-
-
-@dataclass(frozen=True)
-class Margins:
-    """Every barrier of a prediction; the arrays have an entry for each.
+@dataclass(frozen=True, eq=False)
+class BarrierMargins:
+    """The margins of one barrier, an entry for each of its rows.
 
     Attributes:
-        kind: number of the kind, uint8.
-        node: index, uint32.
-        obstacle: index, int32; -1 where the kind has none.
-        value: h, safe at >= 0; [m] for an obstacle and the wall, [m^4] for stiffness, else [m^2].
-        clearance: the same margin as a distance [m].
-        least: of each kind present.
-        touching: nodes that touch an obstacle or the wall, rising.
-        friction: between obstacles.
-        scene_version: of the scene that they are of; empty where the model knows none.
+        barrier: its name.
+        node: index of the node, shape (m,); 0 is the needle's tail.
+        obstacle: index of the scene's shape, -1 where there is none, shape (m,).
+        value: h, safe at >= 0, shape (m,); [m] for an obstacle and the wall, [m^4] for stiffness, [m^2] for
+            connectivity and compression, else the barrier's own unit.
+        clearance: the same margin as a distance, shape (m,) [m].
     """
 
-    kind: NDArray[np.uint8]
+    barrier: str
     node: NDArray[np.uint32]
     obstacle: NDArray[np.int32]
     value: NDArray[np.float64]
     clearance: NDArray[np.float64]
-    least: tuple[LeastBarrier, ...]
-    touching: tuple[int, ...]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.value)
+
+    @property
+    def minimum(self) -> float:
+        """Least h of all rows; inf where the barrier has none, as no shape is near."""
+        return float(self.value.min(initial=math.inf))
+
+    @property
+    def minimum_clearance(self) -> float:
+        """Least margin as a distance [m]; inf where the barrier has no rows."""
+        return float(self.clearance.min(initial=math.inf))
+
+    @property
+    def closest(self) -> int:
+        """The row with the least clearance.
+
+        Raises:
+            ValueError: the barrier has no rows.
+        """
+        return int(self.clearance.argmin())
+
+
+@dataclass(frozen=True, eq=False)
+class Margins(Mapping[str, BarrierMargins]):
+    """The margins of all barriers at one instant, by the barriers' names.
+
+    Attributes:
+        barriers: one entry for each barrier, in the order of the formulation, then the user's.
+        in_contact: nodes that touch a shape or the wall, rising.
+        friction: between shapes.
+        scene_version: of the scene that they are of; empty where the model knows none.
+    """
+
+    barriers: tuple[BarrierMargins, ...]
+    in_contact: tuple[int, ...] = ()
     friction: Friction = UNKNOWN
     scene_version: str = ""
 
+    def __getitem__(self, barrier: str) -> BarrierMargins:
+        """Return the margins of a barrier by its name."""
+        for margins in self.barriers:
+            if margins.barrier == barrier:
+                return margins
+        raise KeyError(barrier)
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the barriers' names."""
+        return (margins.barrier for margins in self.barriers)
+
+    def __len__(self) -> int:
+        """Return the number of barriers."""
+        return len(self.barriers)
+
+    @property
+    def minima(self) -> tuple[BarrierMargins, ...]:
+        """The row of least clearance of each barrier that has rows, each as margins of one row."""
+        return tuple(_row(margins, margins.closest) for margins in self.barriers if len(margins))
+
+    def with_friction(self, friction: Friction) -> Margins:
+        """Return the same margins with the thread's friction."""
+        return replace(self, friction=friction)
+
     @classmethod
-    def of(
-        cls,
-        barriers: Sequence[BarrierRows],
-        contact_tolerance: float,
-        friction: Friction = UNKNOWN,
-        scene_version: str = "",
-    ) -> Margins:
-        """Put the barriers of all kinds together.
+    def of(cls, barriers: Sequence[BarrierRows], contact_tolerance: float, scene_version: str = "") -> Margins:
+        """Return the margins of barriers at the same positions.
 
         Args:
-            barriers: the rows of each kind, in SI units.
-            contact_tolerance: a node this close to an obstacle or the wall touches it [m].
-            friction: between obstacles.
+            barriers: the rows of each, in SI units.
+            contact_tolerance: a node this close to a shape or the wall touches it [m].
             scene_version: of the scene.
         """
-        count = sum(len(rows.value) for rows in barriers)
-        whole = cls(
-            np.empty(count, np.uint8),
-            np.empty(count, np.uint32),
-            np.empty(count, np.int32),
-            np.empty(count),
-            np.empty(count),
-            tuple(_least(rows) for rows in barriers if len(rows.value)),
-            _touching(barriers, contact_tolerance),
-            friction,
-            scene_version,
+        margins = tuple(
+            BarrierMargins(
+                rows.name,
+                rows.nodes[:, -1].astype(np.uint32),
+                rows.obstacle.astype(np.int32),
+                rows.value,
+                rows.clearance,
+            )
+            for rows in barriers
         )
-        begin = 0
-        for rows in barriers:
-            part = slice(begin, begin + len(rows.value))
-            whole.kind[part], whole.node[part], whole.obstacle[part] = rows.kind, rows.nodes[:, -1], rows.obstacle
-            whole.value[part], whole.clearance[part] = rows.value, rows.clearance
-            begin = part.stop
-        return whole
+        near = [m.node[m.clearance <= contact_tolerance] for m in margins if m.barrier in SOLID]
+        touching = sorted({node for nodes in near for node in nodes.tolist()})
+        return cls(margins, tuple(touching), scene_version=scene_version)
 
 
-def _least(rows: BarrierRows) -> LeastBarrier:
-    at = int(rows.clearance.argmin())
-    return LeastBarrier(
-        int(rows.kind),
-        int(rows.nodes[at, -1]),
-        int(rows.obstacle[at]),
-        float(rows.value[at]),
-        float(rows.clearance[at]),
+def _row(margins: BarrierMargins, row: int) -> BarrierMargins:
+    part = slice(row, row + 1)
+    return BarrierMargins(
+        margins.barrier, margins.node[part], margins.obstacle[part], margins.value[part], margins.clearance[part]
     )
 
 
-def _touching(barriers: Sequence[BarrierRows], tolerance: float) -> tuple[int, ...]:
-    """Return the nodes that are this close to an obstacle or the wall, rising."""
-    near = [rows for rows in barriers if rows.kind in TOUCHABLE and len(rows.value)]
-    return tuple(sorted({node for rows in near for node in rows.nodes[rows.clearance <= tolerance, -1].tolist()}))
-
-
-def node_clearance(margins: Any, count: int) -> NDArray[np.float64]:
-    """Return the minimum clearance of an obstacle or the wall for each of `count` nodes [m]; inf where none is near.
+def node_clearance(margins: Margins, count: int) -> NDArray[np.float64]:
+    """Return the minimum clearance of a shape or the wall for each of `count` nodes [m]; inf where none is near.
 
     Args:
-        margins: `Margins`, or a message SafetyMargins.
+        margins: of a prediction.
         count: of nodes, more than the greatest index in the margins.
     """
     clearance = np.full(count, np.inf)
-    near = np.isin(np.asarray(margins.kind, dtype=np.uint8), TOUCHABLE)
-    nodes = np.asarray(margins.node, dtype=np.intp)
-    np.minimum.at(clearance, nodes[near], np.asarray(margins.clearance)[near])
+    for name in SOLID:
+        if name in margins:
+            np.minimum.at(clearance, margins[name].node, margins[name].clearance)
     return clearance

@@ -6,18 +6,23 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.barriers import BarrierRows
-from magnetosuture_thread.model.formulations import Drive, Formulation, StepSolution, ThreadState
+from magnetosuture_thread.model.choices import make_formulation, make_solver
+from magnetosuture_thread.model.formulations import Drive, Formulation, PaperOptions, StepSolution, ThreadState
+from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
 from magnetosuture_thread.model.succession import gone_on
-from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.scene import Scene
 
 FARTHEST = 10.0  # m; nothing that a dish could hold is farther away
 STARTED = "started"  # status of a prediction that no step led to
@@ -38,6 +43,13 @@ class NeedlePose:
     tail: Points
     heading: Points
 
+    def __post_init__(self) -> None:
+        """Take sequences of numbers as arrays."""
+        for name in ("tail", "heading"):
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray):
+                object.__setattr__(self, name, np.array(value, dtype=np.float64))
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -56,7 +68,7 @@ class Prediction:
         residual: the largest scaled residual of the solves.
         converged: whether every step ended where the barriers themselves hold, not only their linearisations;
             if not, the margins are those of a thread that is not where the equations say.
-        judge: works out the margins.
+        judge: computes the margins.
     """
 
     stamp: float
@@ -70,49 +82,123 @@ class Prediction:
     status: str
     residual: float
     converged: bool
-    judge: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
+    judge: Callable[[], Margins] = field(repr=False, compare=False)
 
     @cached_property
-    def margins(self) -> list[BarrierRows]:
-        """Every barrier, a `BarrierRows` for each kind, in SI units; worked out when it is first asked for."""
+    def margins(self) -> Margins:
+        """The margins of every barrier by its name, in SI units; computed when they are first asked for."""
         return self.judge()
 
 
 class ThreadPredictor:
     """Predicts a thread from the needle's poses.
 
+        predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, scene=scene)
+        predictor.start(pose)
+        prediction = predictor.step(next_pose)
+        prediction.margins["obstacle"].minimum
+
     Args:
-        formulation: steps the thread.
         thread: the thread.
+        scene: dish and shapes; in space `Surroundings` of three dimensions; None for neither wall nor shapes.
+        barriers: what is enforced besides the formulation's own barriers, see `Barrier`.
+        formulation: `rod`, the accurate one, or `paper`, as printed; or one that is made already, which then knows
+            scene and barriers itself.
+        solver: `banded`, `osqp`, or the name of a solver that the package qpsolvers knows.
+        paper: the options of the formulation `paper`.
+        margin_range: margins are computed of nodes that are closer to a shape or the wall than this [m].
+        contact_tolerance: a node this close to a shape or the wall touches it [m].
+        residual_tolerance: the largest scaled residual with which a solution is accepted.
         longest_step: intervals are divided into steps of at most this [s].
         most_substeps: but into at most so many; then the steps get longer.
         held: nodes that stay where they are at the start, as where tissue holds the thread.
-        wall_radius: inner radius of the dish, in the plane, within which a thread starts; inf without one [m].
-        scene_version: of the scene that the formulation knows; empty where it knows none.
+
+    Attributes:
+        thread: the thread.
+
+    Raises:
+        ConfigurationError: a name is unknown, a barrier or a shape cannot be used.
+        InvalidInputError: a held node is none of the thread's.
     """
 
     def __init__(
         self,
-        formulation: Formulation,
         thread: Thread,
+        scene: Scene | Surroundings | None = None,
+        barriers: Sequence[Barrier] = (),
         *,
+        formulation: str | Formulation = "rod",
+        solver: str = "banded",
+        paper: PaperOptions | None = None,
+        margin_range: float = 5e-3,
+        contact_tolerance: float = 2e-6,
+        residual_tolerance: float = 1e-6,
         longest_step: float = 0.02,
         most_substeps: int = 200,
         held: Sequence[int] = (),
-        wall_radius: float = math.inf,
-        scene_version: str = "",
     ) -> None:
         for node in held:
             _check_node("held node", node, thread)
+        surroundings = scene if isinstance(scene, Surroundings) else surroundings_of(scene, margin_range)
+        if isinstance(formulation, str):
+            chosen = make_solver(solver, residual_tolerance)
+            formulation = make_formulation(
+                formulation, thread, surroundings, chosen, residual_tolerance, paper, barriers
+            )
         self.thread = thread
-        self._formulation = formulation
+        self._formulation, self._contact_tolerance = formulation, contact_tolerance
         self._longest_step = longest_step
         self._most_substeps = most_substeps
         self._held = tuple(sorted(set(held)))
-        self._room_radius = wall_radius - 0.5 * thread.diameter
-        self._scene_version = scene_version
+        self._room_radius = surroundings.wall_radius - 0.5 * thread.diameter
+        self._scene_version = scene.version if isinstance(scene, Scene) else ""
         self._pose: NeedlePose | None = None
         self._state: ThreadState | None = None
+
+    @classmethod
+    def create(
+        cls,
+        material: str,
+        *,
+        length: float,
+        segments: int,
+        scene: Scene | Surroundings | None = None,
+        barriers: Sequence[Barrier] = (),
+        attachment: str = "pinned",
+        viscosity: float = 1.0,
+        **options: Any,
+    ) -> ThreadPredictor:
+        """Return a predictor of a thread of a known material that floats in a viscous liquid.
+
+        Args:
+            material: name, one of `MATERIALS`.
+            length: of the thread [m].
+            segments: n.
+            scene: see the class, as are the following.
+            barriers: what is enforced besides.
+            attachment: how the thread is fixed to the needle, a value of `Attachment`.
+            viscosity: of the liquid [Pa s].
+            options: further arguments of the class, by name.
+
+        Raises:
+            ConfigurationError: a name is unknown, a number is not positive, or see the class.
+        """
+        if material not in MATERIALS:
+            raise ConfigurationError("material", material, f"one of {', '.join(MATERIALS)}")
+        fixings = [kind.value for kind in Attachment]
+        if attachment not in fixings:
+            raise ConfigurationError("attachment", attachment, f"one of {', '.join(fixings)}")
+        for name, value, least in (("length", length, 0.0), ("viscosity", viscosity, 0.0), ("segments", segments, 2)):
+            if not (math.isfinite(value) and value > least):
+                raise ConfigurationError(name, value, f"a finite number above {least:g}")
+        thread = Thread.of(
+            MATERIALS[material],
+            length=length,
+            segments=segments,
+            attachment=Attachment(attachment),
+            viscosity=viscosity,
+        )
+        return cls(thread, scene, barriers, **options)
 
     @property
     def started(self) -> bool:
@@ -125,7 +211,7 @@ class ThreadPredictor:
         east = np.eye(dimension)[0]
         path = -self.thread.segment_length * np.arange(self.thread.segments + 1)[:, None] * east
         begun = self.start_at(NeedlePose(0.0, np.zeros(dimension), east), path)
-        assert begun.margins  # which are worked out by kernels of their own
+        assert begun.margins  # which are computed by kernels of their own
         with suppress(SolverError):  # an obstacle that lies here says nothing of a thread that lies elsewhere
             for count in (1, 2):
                 self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
@@ -136,19 +222,22 @@ class ThreadPredictor:
         """Forget the thread's shape; the next call must be `start`."""
         self._pose = self._state = None
 
-    def start(self, pose: NeedlePose, centreline: Points) -> Prediction:
-        """Take the thread's shape from a centreline, seen or assumed, from tail to end.
+    def start(self, pose: NeedlePose, centreline: Points | None = None) -> Prediction:
+        """Take the thread's shape from a centreline, measured or assumed, from tail to end.
 
         Args:
             pose: the needle at the same instant.
             centreline: polyline, shape (m, d), m >= 2 [m]; if it is shorter than the thread, the
-                thread goes on straight, and where the wall is in its way, along the wall.
+                thread goes on straight, and where the wall is in its way, along the wall. None is a thread that
+                lies straight behind the needle.
 
         Raises:
             InvalidInputError: the pose or the centreline is not finite, or the centreline is shorter
                 than a segment or begins farther than one from the tail.
         """
         check_pose(pose)
+        if centreline is None:
+            centreline = np.array([pose.tail, pose.tail - 2.0 * self.thread.segment_length * pose.heading])
         if len(centreline) < 2 or not np.all(np.abs(centreline) <= FARTHEST):
             raise InvalidInputError(
                 "centreline", f"{len(centreline)} points", f"at least 2 finite points, at most {FARTHEST:g} m from 0"
@@ -230,7 +319,9 @@ class ThreadPredictor:
             part = index / substeps
             heading = _between(last.heading, pose.heading, part)
             done = self._formulation.step(
-                state, Drive(nodes, begin + part * (end - begin), heading), interval / substeps
+                state,
+                Drive(nodes, begin + part * (end - begin), heading, last.stamp + part * interval),
+                interval / substeps,
             )
             state, residuals = done.state, residuals.or_worse(done.residuals)
             converged = converged and done.converged
@@ -248,23 +339,37 @@ class ThreadPredictor:
         converged: bool,
     ) -> Prediction:
         assert self._state is not None
-        positions = self._state.positions
+        positions, formulation = self._state.positions, self._formulation
+        formulation.added.set_time(pose.stamp)
+        added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
+
+        def judge() -> Margins:
+            rows = [*formulation.margins(positions, pose.heading), *added]
+            return Margins.of(rows, self._contact_tolerance, self._scene_version)
+
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
         return Prediction(
             stamp=pose.stamp,
-            formulation=self._formulation.name,
+            formulation=formulation.name,
             scene_version=self._scene_version,
             vertices=positions,
-            stretch=lengths / self._formulation.rest_lengths(positions, pose.heading) - 1.0,
+            stretch=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,
             substeps=substeps,
             solver=step.solver if step else "none",
             status=step.status if step else STARTED,
             residual=residuals.largest,
             converged=converged,
-            judge=partial(self._formulation.margins, positions, pose.heading),
+            judge=judge,
         )
+
+
+def surroundings_of(scene: Scene | None, reach: float) -> Surroundings:
+    """Return a scene's obstacles and wall for the barriers, which see as far as a reach [m]; none of no scene."""
+    if scene is None:
+        return Surroundings((), reach)
+    return Surroundings(scene.obstacles, reach, wall_radius=scene.dish.radius)
 
 
 def _check_node(field: str, node: int, thread: Thread) -> None:

@@ -11,6 +11,7 @@ three apart: with d coordinates a node, all is one band of half-width 3 d.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -51,6 +52,30 @@ class ChainProgram(NamedTuple):
     lower: Vector
     upper: Vector
     compliance: Vector
+
+
+class WideRows(NamedTuple):
+    """Rows of a program that depend on nodes farther apart than `SPAN`, so that no band holds them.
+
+        lower_r <= a_r' u + s_r,    s_r as of the other rows
+
+    Attributes:
+        nodes: the nodes of each row, padded with any node of gradient 0, shape (w, k).
+        gradient: a_r at these nodes, shape (w, k, d).
+        lower: shape (w,).
+        compliance: c_r >= 0, shape (w,).
+    """
+
+    nodes: NDArray[np.int64]
+    gradient: NDArray[np.float64]
+    lower: Vector
+    compliance: Vector
+
+    def force(self, multipliers: Vector, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return sum_r a_r lambda_r, shape (m, d)."""
+        force = np.zeros(shape)
+        np.add.at(force, self.nodes, self.gradient * multipliers[:, None, None])
+        return force
 
 
 class Residuals(NamedTuple):
@@ -101,25 +126,48 @@ class Solver(Protocol):
 
     name: str
 
-    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
+    def solve(
+        self,
+        program: ChainProgram,
+        velocities: NDArray[np.float64],
+        multipliers: Vector,
+        wide: WideRows | None = None,
+    ) -> Solution:
         """Return the solution with its residuals, whatever it is: the caller judges it.
 
         Args:
             program: the program.
             velocities: a guess, shape (m, d).
-            multipliers: a guess, shape (r,).
+            multipliers: a guess, shape (r,), or (r + w,) with the wide rows last.
+            wide: further rows, which only a general solver takes.
         """
         ...
 
 
-def residuals_of(program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Residuals:
+def residuals_of(
+    program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector, wide: WideRows | None = None
+) -> Residuals:
     """Return how far a solution is from optimal.
 
     A row is divided by max(1, its own largest term), so that a far obstacle does not make light of the
     others; the balance of forces by max(1, its largest force); the complementarity by
     max(1, the largest multiplier).
     """
-    return Residuals(*compiled_residuals(program, velocities, multipliers))
+    if wide is None:
+        return Residuals(*compiled_residuals(program, velocities, multipliers))
+    chain = len(program.first)
+    pushes = multipliers[chain:]
+    force = wide.force(pushes, program.linear.shape)
+    found = Residuals(
+        *compiled_residuals(program._replace(linear=program.linear - force), velocities, multipliers[:chain])
+    )
+    image = np.einsum("rkd,rkd->r", wide.gradient, velocities[wide.nodes]) + wide.compliance * pushes
+    scale = np.maximum(1.0, np.maximum(np.abs(image), np.abs(wide.lower)))
+    short = (wide.lower - image) / scale
+    gap = np.minimum(np.where(pushes > 0.0, np.abs(short), 1.0), 1.0)  # a pull has no bound to pull at
+    largest = max(1.0, float(np.abs(multipliers).max(initial=0.0)))
+    further = (float(short.max(initial=0.0)), 0.0, float((np.abs(pushes) * gap).max(initial=0.0)) / largest)
+    return found.or_worse(Residuals(*(value if math.isfinite(value) else math.inf for value in further)))
 
 
 @compiled
@@ -203,17 +251,19 @@ class QuadraticProgram:
     unknown: NDArray[np.intp]
 
 
-def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
+def as_quadratic_program(program: ChainProgram, wide: WideRows | None = None) -> QuadraticProgram:
     """Write a chain's program with sparse matrices, its known nodes taken out and its slacks as variables.
+
+    Wide rows follow those of the chain.
 
     A slack is scaled by the root of its weight, s = sqrt(c) s', so that its own entry in P is 1: with the
     weights themselves, 1 beside 1e5, a first-order method does not converge.
     """
     nodes, dimension = program.linear.shape
     coordinates = np.arange(nodes * dimension).reshape(nodes, dimension)
-    upper = np.triu_indices(dimension)
-    rows, columns = [coordinates[:, upper[0]].ravel()], [coordinates[:, upper[1]].ravel()]
-    entries = [program.blocks[:, upper[0], upper[1]].ravel()]
+    triangle = np.triu_indices(dimension)
+    rows, columns = [coordinates[:, triangle[0]].ravel()], [coordinates[:, triangle[1]].ravel()]
+    entries = [program.blocks[:, triangle[0], triangle[1]].ravel()]
     for apart in range(1, SPAN + 1):
         rows.append(coordinates[:-apart].ravel())
         columns.append(coordinates[apart:].ravel())
@@ -221,18 +271,26 @@ def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
     hessian = _matrix(entries, rows, columns, (nodes * dimension, nodes * dimension))
     touched = coordinates[program.first[:, None] + np.arange(SPAN)].reshape(len(program.first), SPAN * dimension)
     row = np.repeat(np.arange(len(program.first)), SPAN * dimension)
-    image = _matrix([program.gradient.ravel()], [row], [touched.ravel()], (len(program.first), nodes * dimension))
+    entries, rows, columns, count = [program.gradient.ravel()], [row], [touched.ravel()], len(program.first)
+    lower, upper, compliance = program.lower, program.upper, program.compliance
+    if wide is not None:
+        entries.append(wide.gradient.ravel())
+        rows.append(np.repeat(np.arange(count, count + len(wide.lower)), wide.nodes.shape[1] * dimension))
+        columns.append(coordinates[wide.nodes].ravel())
+        count += len(wide.lower)
+        lower = np.concatenate([lower, wide.lower])
+        upper = np.concatenate([upper, np.full(len(wide.lower), np.inf)])
+        compliance = np.concatenate([compliance, wide.compliance])
+    image = _matrix(entries, rows, columns, (count, nodes * dimension))
     unknown = np.flatnonzero(np.repeat(~program.known, dimension))
-    soft = np.flatnonzero(program.compliance > 0.0)
-    slack = sp.csc_matrix(
-        (np.sqrt(program.compliance[soft]), (soft, np.arange(len(soft)))), shape=(len(program.first), len(soft))
-    )
+    soft = np.flatnonzero(compliance > 0.0)
+    slack = sp.csc_matrix((np.sqrt(compliance[soft]), (soft, np.arange(len(soft)))), shape=(count, len(soft)))
     return QuadraticProgram(
         P=sp.csc_matrix(sp.block_diag([hessian[unknown][:, unknown], sp.eye(len(soft))])),
         q=np.concatenate([program.linear.ravel()[unknown], np.zeros(len(soft))]),
         A=sp.csc_matrix(sp.hstack([image[:, unknown], slack])),
-        lower=program.lower,
-        upper=program.upper,
+        lower=lower,
+        upper=upper,
         unknown=unknown,
     )
 

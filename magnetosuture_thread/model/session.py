@@ -28,21 +28,6 @@ _OBSTACLES = (Disc((0.0, 0.0), 1e-3), Polygon(((0.0, 0.0), (1e-3, 0.0), (0.0, 1e
 
 
 @dataclass(frozen=True)
-class Proof:
-    """What the margins of a prediction take besides it.
-
-    Attributes:
-        law: of friction.
-        contact_tolerance: a node this close to an obstacle touches it [m].
-        speeds: of each node, shape (n + 1,) [m/s].
-    """
-
-    law: FrictionLaw
-    contact_tolerance: float
-    speeds: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
 class Outcome:
     """What came of one needle pose.
 
@@ -51,22 +36,24 @@ class Outcome:
         prediction: of the thread; None where there is none.
         problem: why there is none; None while the thread is waited for.
         scene_version: of the scene in force; empty where there is none.
-        proof: for its margins; None where there is no prediction.
+        law: of friction.
+        speeds: of each node, shape (n + 1,) [m/s]; empty where there is no prediction.
     """
 
     stamp: int
     prediction: Prediction | None = None
     problem: InvalidInputError | SolverError | None = None
     scene_version: str = ""
-    proof: Proof | None = field(default=None, repr=False, compare=False)
+    law: FrictionLaw | None = field(default=None, repr=False, compare=False)
+    speeds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
 
     @cached_property
     def margins(self) -> Margins | None:
-        """All margins, worked out when first asked for; None where they prove nothing, as the step did not converge."""
-        if self.prediction is None or self.proof is None or not self.prediction.converged:
+        """All margins, with the friction; None where they prove nothing, as the step did not converge."""
+        if self.prediction is None or self.law is None or not self.prediction.converged:
             return None
-        friction = self.proof.law.judge(self.prediction.margins, self.proof.speeds)
-        return Margins.of(self.prediction.margins, self.proof.contact_tolerance, friction, self.scene_version)
+        margins = self.prediction.margins
+        return margins.with_friction(self.law.judge(margins, self.speeds))
 
     @property
     def waiting(self) -> bool:
@@ -189,9 +176,9 @@ class ThreadSession:
         except (InvalidInputError, SolverError) as error:
             return Outcome(stamp, problem=error, scene_version=self.scene_version)
         self._last = stamp
-        settings, speeds = self.settings, self._motion.take(prediction.vertices, prediction.interval)
-        proof = Proof(settings.friction_law(), settings.contact_tolerance, speeds)
-        return Outcome(stamp, prediction, scene_version=self.scene_version, proof=proof)
+        speeds = self._motion.take(prediction.vertices, prediction.interval)
+        law = self.settings.friction_law()
+        return Outcome(stamp, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":

@@ -8,10 +8,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.configuration import Configuration, described, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
-from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.friction import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.medium import Medium
@@ -33,6 +34,7 @@ OF_MEDIUM = {
 FIXED = {  # why a node cannot change it
     "formulation": "what is compiled when it starts",
     "solver": "what is compiled when it starts",
+    "barriers": "what is imported when it starts",
     "scene": "what it starts with; the topic scene changes it",
 }
 SHARPEST_TURN = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
@@ -48,7 +50,10 @@ class ThreadModelSettings(Configuration):
     formulation: str = quantity(
         "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS
     )
-    solver: str = quantity("banded", "what solves a step's program", choices=SOLVERS)
+    solver: str = quantity(
+        "banded", "what solves a step's program: banded, osqp, or a solver that the package qpsolvers knows"
+    )
+    barriers: tuple[str, ...] = quantity((), "barriers of your own, each as module:class; see Barrier")
     material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
     diameter: float = quantity(0.0, "of the thread; 0 takes the material's", unit="m", minimum=0.0, maximum=0.01)
     elastic_modulus: float = quantity(
@@ -185,6 +190,11 @@ class ThreadModelSettings(Configuration):
         ):
             if len(pair) not in (0, 2):
                 raise ConfigurationError(f"{self.GROUP}.{name}", list(pair), f"two numbers, {words}, or none")
+        if self.solver not in SOLVERS:
+            try:
+                make_solver(self.solver, self.residual_tolerance)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"{self.GROUP}.solver", self.solver, error.expectation) from None
         if self.formulation == "paper" and self.medium != "liquid":
             raise ConfigurationError(
                 f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
@@ -248,20 +258,20 @@ class ThreadModelSettings(Configuration):
             ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
         check_scene(self, scene)
-        thread, surroundings = self.thread(), surroundings_of(scene, self.margin_range)
-        tolerance = self.residual_tolerance
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
         paper = replace(PaperOptions.tuned(weight), damping=self.paper_damping)
-        formulation = make_formulation(
-            self.formulation, thread, surroundings, make_solver(self.solver, tolerance), tolerance, paper
-        )
         predictor = ThreadPredictor(
-            formulation,
-            thread,
+            self.thread(),
+            scene,
+            load_barriers(self.barriers, f"{self.GROUP}.barriers"),
+            formulation=self.formulation,
+            solver=self.solver,
+            paper=paper,
+            margin_range=self.margin_range,
+            contact_tolerance=self.contact_tolerance,
+            residual_tolerance=self.residual_tolerance,
             longest_step=self.longest_step,
             held=self.held_nodes,
-            wall_radius=surroundings.wall_radius,
-            scene_version=scene.version if scene else "",
         )
         predictor.warm_up()
         return predictor
@@ -273,13 +283,6 @@ class ThreadModelSettings(Configuration):
     def node_motion(self) -> NodeMotion:
         """Return what follows the nodes' velocities."""
         return NodeMotion(self.friction_averaging)
-
-
-def surroundings_of(scene: Scene | None, reach: float) -> Surroundings:
-    """Return a scene's obstacles and wall for the barriers, which see as far as a reach [m]; none of no scene."""
-    if scene is None:
-        return Surroundings((), reach)
-    return Surroundings(scene.obstacles, reach, wall_radius=scene.dish.radius)
 
 
 def check_scene(settings: ThreadModelSettings, scene: Scene | None) -> None:

@@ -21,7 +21,6 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.orientation import angle_of
 from magnetosuture_thread.messages.reading import needle_pose
 from magnetosuture_thread.messages.scene import scene_of
-from magnetosuture_thread.model.barriers import BarrierKind
 from magnetosuture_thread.model.margins import node_clearance
 from magnetosuture_thread.scene import Scene, SceneShape
 
@@ -44,7 +43,6 @@ FRICTION = {
     SafetyMargins.FRICTION_PULLED: "pulled",
     SafetyMargins.FRICTION_RESTING: "resting",
 }
-KINDS = {int(kind): kind.name.lower() for kind in BarrierKind}
 LEVELS = {
     DiagnosticStatus.OK: "ok",
     DiagnosticStatus.WARN: "warn",
@@ -98,7 +96,7 @@ def margins(message: SafetyMargins) -> dict[str, Any]:
         "valid": message.valid,
         "reason": message.reason,
         "clearance": clearances(message) if message.valid else [],
-        "least": {KINDS.get(least.kind, str(least.kind)): least.clearance for least in message.least},
+        "least": {least.barrier: least.clearance for least in message.minimum},
         "contact": list(message.contact_nodes),
         "friction": {
             "state": FRICTION.get(message.friction_state, "unknown"),
@@ -110,7 +108,7 @@ def margins(message: SafetyMargins) -> dict[str, Any]:
 
 def clearances(message: SafetyMargins) -> list[float | None]:
     """Return each node's least clearance of the wall and any shape [m]; None where none is near."""
-    least = node_clearance(message, max(message.node, default=-1) + 1)
+    least = node_clearance(margins_of(message), max(message.node, default=-1) + 1)
     return [value if value < np.inf else None for value in least.tolist()]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,27 @@ PASSES = 4  # of the projection, each with what the motion of the one before ben
 STUCK = 1e-9  # of the velocity commanded; less is none
 ACTIVE = 1e-6  # of the speed; a barrier that leaves less room than this is active
 SURE = 1.0 - 1e-9  # of the certified time, against rounding
+
+
+class AddedRows(NamedTuple):
+    """Rows of the barriers that a user has added, on the velocity of the tip.
+
+        rows_j . v >= -rate_j max(margin_j, 0)
+
+    Attributes:
+        rows: shape (k, 2).
+        margin: h over the size of its gradient, shape (k,) [m].
+        rate: share of the margin by which it may decrease, shape (k,) [1/s].
+        barrier: index among the names of constraints, shape (k,).
+    """
+
+    rows: Points
+    margin: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    barrier: NDArray[np.int64]
+
+
+NO_ROWS = AddedRows(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0, np.int64))
 
 
 @compiled
@@ -165,6 +187,34 @@ def _projected(
 
 
 @compiled
+def _all_hold(
+    vx: float, vy: float, rows: Points, least: NDArray[np.float64], depth: NDArray[np.float64], count: int
+) -> bool:
+    """Return whether no row forbids a velocity, and none has to be left."""
+    free = True
+    for k in range(count):
+        free = free and depth[k] <= 0.0 and rows[k, 0] * vx + rows[k, 1] * vy >= least[k]
+    return free
+
+
+@compiled
+def _put(
+    added: AddedRows,
+    begin: int,
+    rows: Points,
+    least: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    who: NDArray[np.int64],
+) -> None:
+    """Write the rows of added barriers behind the others."""
+    for j in range(len(added.margin)):
+        k = begin + j
+        rows[k, 0], rows[k, 1] = added.rows[j, 0], added.rows[j, 1]
+        least[k], depth[k] = -added.rate[j] * max(added.margin[j], 0.0), -added.margin[j]
+        who[k, 0], who[k, 1] = 0, added.barrier[j]
+
+
+@compiled
 def _tangent(
     x: float, y: float, what: int, scene: PackedScene, keep: float, keep_wall: float
 ) -> tuple[float, float, float]:
@@ -204,6 +254,7 @@ def nearest_clear(
     scene: PackedScene,
     distances: NDArray[np.float64],
     outward: NDArray[np.float64],
+    added: AddedRows,
     touched: NDArray[np.bool_],
 ) -> tuple[float, float]:
     """Return the velocity nearest to (vx, vy) that the barriers let through and that is certified for the hold.
@@ -231,7 +282,8 @@ def nearest_clear(
         scene: packed.
         distances: see `measure`.
         outward: see `measure`.
-        touched: set for each shape, then the wall, whose barrier changed the velocity.
+        added: rows of the barriers that a user has added.
+        touched: set for each shape, then each added barrier, then the wall, that changed the velocity.
     """
     speed = math.hypot(vx, vy)
     time, what, where = safe_time(
@@ -242,7 +294,7 @@ def nearest_clear(
         swiftest = max(swiftest, math.hypot(turning[i, 0], turning[i, 1]))
     reach = math.hypot(1.0, swiftest) * speed / rate
     margin, gradient, bend = np.empty(MAX_ROWS), np.empty((MAX_ROWS, 2)), np.empty(MAX_ROWS)
-    who = np.empty((MAX_ROWS + PASSES, 2), np.int64)
+    who = np.empty((MAX_ROWS + len(added.margin) + PASSES, 2), np.int64)
     count = find_rows(
         points,
         ends_only,
@@ -257,28 +309,28 @@ def nearest_clear(
         bend,
         who,
     )
-    room = count + PASSES
+    fixed = count + len(added.margin)
+    room = fixed + PASSES
     rows, least, depth = np.empty((room, 2)), np.empty(room), np.empty(room)
-    free = time >= hold
     for k in range(count):
         i = who[k, 0]
         along = gradient[k, 0] * chord_x + gradient[k, 1] * chord_y
         aside = gradient[k, 0] * turning[i, 0] + gradient[k, 1] * turning[i, 1]
         rows[k, 0], rows[k, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
         least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
-        free = free and depth[k] <= 0.0 and rows[k, 0] * vx + rows[k, 1] * vy >= least[k]
-    if free:
+    _put(added, count, rows, least, depth, who)
+    if time >= hold and _all_hold(vx, vy, rows, least, depth, fixed):
         return vx, vy
     given, bounds, work = np.empty((2 * room, 2)), np.empty(2 * room), np.empty((2 * room, 3))
     bounded = least.copy()
     best, bx, by = speed * speed, 0.0, 0.0  # zero, that always is allowed
-    ux, uy, total = vx, vy, count
+    ux, uy, total = vx, vy, fixed
     for attempt in range(PASSES):
         holds, x, y = _projected(vx, vy, rows, bounded, depth, total, True, given, bounds, work)
         if not holds:
             holds, x, y = _projected(vx, vy, rows, bounded, depth, total, False, given, bounds, work)
         if not holds and attempt > 0:
-            holds, x, y = _projected(vx, vy, rows, least, depth, count, False, given, bounds, work)
+            holds, x, y = _projected(vx, vy, rows, least, depth, fixed, False, given, bounds, work)
         if not holds:
             break
         time, ended, where = safe_time(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import Barrier, check_barriers
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.arc import needle_points
-from magnetosuture_thread.safety.barriers import SURE, measure, nearest_clear
+from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, AddedRows, measure, nearest_clear
 from magnetosuture_thread.safety.certificate import NOTHING, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 from magnetosuture_thread.safety.limits import approached, shortened
@@ -24,6 +26,9 @@ MAX_POINTS = 129
 BAND = 2e-6  # m; by which the barriers keep farther away than the certificate, so that a needle can slide there
 MAX_SPEED = 10.0  # m/s; a faster command is shortened first, as rounding grows with its size
 STUCK = 1e-3  # of the speed commanded; a needle that is left less rests
+CHECKS = 8  # instants of a hold at which an added barrier is checked
+BISECTIONS = 10  # of the share that an added barrier leaves of a velocity
+ROUNDING = 1e-12  # by which an added barrier may decrease
 WALL_NAME = "wall"
 SPEED, ACCELERATION, FRICTION = "speed", "acceleration", "friction"
 
@@ -83,11 +88,17 @@ class NeedleSafetyFilter:
     Source: A. D. Ames et al., Control Barrier Functions: Theory and Applications, 2019, section II. Deviation:
     max(h, 0) for h, so that a measured pose beyond the bound leaves zero feasible; the certificate.
 
+    Barriers that a user adds are enforced by rows of the same program, on the points of the needle from tail to tip.
+    They are then checked at `CHECKS` instants of the hold, and the velocity is scaled down until they hold there.
+    Between these instants they are not certified.
+
     Args:
         scene: dish and shapes.
+        barriers: what is enforced besides wall and shapes, see `Barrier`; their positions are the needle's points.
         keep_out: least distance of the needle's axis from wall and shapes; half of its width is within [m].
         approach_rate: share of that distance by which the needle may approach [1/s].
-        hold_time: for which a velocity may go on without anybody looking [s].
+        hold_time: for which a velocity may go on without anybody looking: until the coil drivers switch off by
+            themselves, and a period of the loop [s].
         max_speed: of the tip [m/s].
         max_acceleration: greatest change of the velocity before the barriers [m/s^2].
         needle_length: along the needle's body; 0 for a point [m].
@@ -100,10 +111,11 @@ class NeedleSafetyFilter:
     def __init__(
         self,
         scene: Scene,
+        barriers: Sequence[Barrier] = (),
         *,
-        keep_out: float,
-        approach_rate: float,
-        hold_time: float,
+        keep_out: float = 5e-4,
+        approach_rate: float = 10.0,
+        hold_time: float = 0.205,
         max_speed: float = math.inf,
         max_acceleration: float = math.inf,
         needle_length: float = 0.0,
@@ -133,7 +145,9 @@ class NeedleSafetyFilter:
         self._keep = math.sqrt(keep_out**2 + 0.25 * spacing**2 * (1.0 + bend * keep_out))
         self._keep_wall = keep_out + 0.125 * bend * spacing**2
         self._packed = pack_scene(scene)
-        self._names = (*scene.names, WALL_NAME)  # so that -1 is the wall
+        check_barriers(tuple(barriers))
+        self._barriers, self._time = tuple(barriers), 0.0
+        self._names = (*scene.names, *[barrier.name for barrier in barriers], WALL_NAME)  # so that -1 is the wall
         self._touched = np.zeros(len(self._names), np.bool_)
         self._pose: _Pose | None = None
         # Compiled now, not in the first step.
@@ -151,6 +165,7 @@ class NeedleSafetyFilter:
         max_speed: float = math.inf,
         previous: Vector | None = None,
         elapsed: float = math.inf,
+        time: float = 0.0,
     ) -> FilteredCommand:
         """Return what is left of a commanded velocity: slowed, limited, and kept clear for the whole hold.
 
@@ -162,12 +177,14 @@ class NeedleSafetyFilter:
             max_speed: a limit that holds now, besides the filter's own [m/s].
             previous: velocity that the change is limited from, shape (2,) [m/s]; not limited if None.
             elapsed: since then [s].
+            time: now, for barriers that move [s].
 
         Raises:
             InvalidInputError: something is not finite, or the slowdown is not within 0 and 1.
         """
         if not 0.0 <= slowdown <= 1.0:
             raise InvalidInputError("slowdown", slowdown, "a factor from 0 to 1")
+        self._time = time
         speed = _speed(commanded)
         if speed == 0.0:
             return FilteredCommand(commanded, np.zeros(2), slowdown)
@@ -220,11 +237,18 @@ class NeedleSafetyFilter:
             self._packed,
             pose.distances,
             pose.outward,
+            self._added_rows(pose) if self._barriers else NO_ROWS,
             self._touched,
         )
-        if x == velocity[0] and y == velocity[1]:
+        clear = velocity if x == velocity[0] and y == velocity[1] else np.array([x, y])
+        if self._barriers:
+            share, name = self._checked_share(clear, tail, heading)
+            if share < 1.0:
+                clear = share * clear
+                self._touched[self._names.index(name)] = True
+        if clear is velocity:
             return velocity, []
-        return np.array([x, y]), [self._names[k] for k in np.flatnonzero(self._touched)]
+        return clear, [self._names[k] for k in np.flatnonzero(self._touched)]
 
     def safe_share(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[float, str]:
         """Return the share of a velocity that keeps clear while it is held for the whole hold time: the guarantee.
@@ -260,7 +284,64 @@ class NeedleSafetyFilter:
             pose.distances,
             pose.outward,
         )
-        return (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
+        found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
+        if not self._barriers:
+            return found
+        return min(found, self._checked_share(velocity, tail, heading), key=lambda share: share[0])
+
+    def _added_rows(self, pose: _Pose) -> AddedRows:
+        """Return the rows of the added barriers on the tip's velocity, each over the size of its gradient."""
+        along = np.array(pose.chord)
+        left = np.array([-along[1], along[0]])
+        found: list[AddedRows] = []
+        for index, barrier in enumerate(self._barriers, start=len(self.scene.names)):
+            barrier.set_time(self._time)
+            rows = barrier.rows(pose.points)
+            slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
+            gradient = rows.gradient / np.where(slope > 0.0, slope, 1.0)[:, None, None]
+            drive = np.einsum("rkd,d->r", gradient, along)
+            turn = np.einsum("rkd,rkd->r", gradient, pose.turning[rows.nodes])
+            margin = rows.value / np.where(slope > 0.0, slope, 1.0)
+            rate = np.full(len(margin), min(barrier.gain, self._rate))
+            on_tip = drive[:, None] * along + turn[:, None] * left
+            found.append(AddedRows(on_tip, margin, rate, np.full(len(margin), index, np.int64)))
+        return AddedRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+    def _checked_share(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[float, str]:
+        """Return the share of a velocity with which every added barrier holds at every check, and the one it is for.
+
+        A barrier that is below 0 already may not get lower.
+        """
+        share, what = 1.0, ""
+        for barrier in self._barriers:
+            if self._holds(barrier, share * velocity, tail, heading):
+                continue
+            low, high = 0.0, share
+            for _ in range(BISECTIONS):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if self._holds(barrier, middle * velocity, tail, heading) else (low, middle)
+            share, what = low, barrier.name
+        return share, what
+
+    def _holds(self, barrier: Barrier, velocity: Vector, tail: Vector, heading: Vector) -> bool:
+        """Return whether a barrier stays at 0 or above, or gets no lower, at the checks of a hold."""
+        along, across = self.kinematics.body_velocity(heading, velocity)
+        barrier.set_time(self._time)
+        least = np.minimum(barrier.value(self._at(tail, heading).points), 0.0) - ROUNDING
+        for check in range(1, CHECKS + 1):
+            part = check / CHECKS * self.hold_time
+            barrier.set_time(self._time + part)
+            points = self._points_at(*self.kinematics.moved(tail, heading, along, across, part))
+            value = barrier.value(points)
+            # Where the number of rows changes with time, every one of them has to be safe.
+            if not (value >= (least if value.shape == least.shape else -ROUNDING)).all():
+                return False
+        return True
+
+    def _points_at(self, tail: Vector, heading: Vector) -> Vector:
+        """Return the points that stand for the needle, from tail to tip, shape (m, 2) [m]."""
+        c, s = float(heading[0]), float(heading[1])
+        return np.asarray(self._points @ np.array([[c, s], [-s, c]]) + tail)
 
     def clearance(self, tail: Vector, heading: Vector) -> float:
         """Return the signed least distance of the points of the needle's axis from the wall and all shapes [m].

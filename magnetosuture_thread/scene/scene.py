@@ -166,6 +166,23 @@ class Scene:
             if not far:
                 raise refusal(shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres")
 
+    @classmethod
+    def create(cls, *, dish_diameter: float = 0.035, shapes: Mapping[str, Disc | Polygon] | None = None) -> Scene:
+        """Return a scene with named shapes, all of them tissue.
+
+        >>> Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, 0.0), 0.0025)}).names
+        ('post',)
+
+        Args:
+            dish_diameter: inner diameter of the dish [m].
+            shapes: by name.
+
+        Raises:
+            ConfigurationError: a shape cannot be used.
+        """
+        named = (shapes or {}).items()
+        return cls(Dish(dish_diameter), tuple(SceneShape(name, KINDS[0], geometry) for name, geometry in named))
+
     @cached_property
     def version(self) -> str:
         """Hash of the content: equal for scenes with the same dish, names, kinds and geometry, bit for bit."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
-from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, ObstacleAvoidance, WallAvoidance
-from magnetosuture_thread.model.barriers.rows import BarrierKind
+from magnetosuture_thread.model.barriers import Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.friction import (
     UNKNOWN,
     Friction,
@@ -16,15 +16,16 @@ from magnetosuture_thread.model.friction import (
     NodeMotion,
     friction_colour,
 )
+from magnetosuture_thread.model.margins import Margins
 
 LAW = FrictionLaw(threshold=1e-3, beta=0.9, resting_speed=2e-4)
 NODES = np.column_stack([np.arange(0.0, -8e-3, -1e-3), np.zeros(8)])  # 0 is the needle
 
 
-def barriers(*discs: tuple[float, float, float]) -> list[BarrierRows]:
-    """Return the barriers of the nodes among discs x, y, radius."""
+def barriers(*discs: tuple[float, float, float], others: tuple[BarrierRows, ...] = ()) -> Margins:
+    """Return the margins of the nodes among discs x, y, radius."""
     around = Surroundings([Disc((x, y), radius) for x, y, radius in discs], 5e-3)
-    return [Connectivity(1e-3).rows(NODES), ObstacleAvoidance(around, 0.0).rows(NODES)]
+    return Margins.of([Connectivity(1e-3).rows(NODES), ObstacleAvoidance(around, 0.0).rows(NODES), *others], 0.0)
 
 
 # Two discs 0.9 mm above and below the nodes 3 and 4, and no other node.
@@ -52,8 +53,8 @@ def test_who_moves_elsewhere_pulls_nothing():
 
 def test_the_threshold_is_of_the_clearance():
     """At 0.96 mm from the discs; the threshold is not within."""
-    avoided = barriers(*GATE)[1]
-    near = float(avoided.clearance[avoided.nodes[:, -1] == 3].max())
+    avoided = barriers(*GATE)["obstacle"]
+    near = float(avoided.clearance[avoided.node == 3].max())
     assert near == pytest.approx(np.hypot(0.5e-3, 1.9e-3) - 1e-3)
     for threshold, count in ((0.999 * near, 0), (1.001 * near, 2)):
         assert len(FrictionLaw(threshold, 0.9, 0.0).judge(barriers(*GATE), np.ones(8)).nodes) == count
@@ -62,9 +63,9 @@ def test_the_threshold_is_of_the_clearance():
 def test_a_node_at_the_threshold_itself_is_free():
     """Two rows of one node with the same clearance, as no roundings can be told apart in a scene."""
     node, near = np.array([[3], [3]]), np.full(2, 5e-4)
-    rows = BarrierRows(BarrierKind.OBSTACLE, node, np.array([0, 1]), near, np.zeros((2, 1, 2)), near)
-    assert FrictionLaw(5e-4, 0.9, 0.0).judge([rows], np.ones(8)).state is FrictionState.FREE
-    assert FrictionLaw(np.nextafter(5e-4, 1.0), 0.9, 0.0).judge([rows], np.ones(8)).nodes == (3,)
+    margins = Margins.of([BarrierRows("obstacle", node, np.array([0, 1]), near, np.zeros((2, 1, 2)), near)], 0.0)
+    assert FrictionLaw(5e-4, 0.9, 0.0).judge(margins, np.ones(8)).state is FrictionState.FREE
+    assert FrictionLaw(np.nextafter(5e-4, 1.0), 0.9, 0.0).judge(margins, np.ones(8)).nodes == (3,)
 
 
 def test_the_needle_itself_is_no_friction_of_the_thread():
@@ -76,7 +77,7 @@ def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it(
     close = WallAvoidance(7.5e-3, 0.0, 5e-3).rows(NODES)
     assert (close.clearance < 1e-3).any()
     disc = (-7e-3, 1.5e-3, 1e-3)
-    assert LAW.judge([*barriers(disc), close], np.full(8, 1e-3)) == Friction(FrictionState.FREE, (), 1.0)
+    assert LAW.judge(barriers(disc, others=(close,)), np.full(8, 1e-3)) == Friction(FrictionState.FREE, (), 1.0)
 
 
 def test_speeds_are_averaged():

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
-from magnetosuture_thread.model.choices import make_formulation, make_solver
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 
@@ -25,8 +24,7 @@ def new(
     obstacles: tuple[Disc | Polygon, ...] = (), held: tuple[int, ...] = (), formulation: str = "rod"
 ) -> ThreadPredictor:
     """Return a predictor that has not started."""
-    chosen = make_formulation(formulation, THREAD, Surroundings(obstacles, 5e-3), make_solver("banded", 1e-6), 1e-6)
-    return ThreadPredictor(chosen, THREAD, held=held)
+    return ThreadPredictor(THREAD, Surroundings(obstacles, 5e-3), formulation=formulation, held=held)
 
 
 def started(obstacles: tuple[Disc | Polygon, ...] = (), held: tuple[int, ...] = ()) -> ThreadPredictor:
@@ -248,8 +246,8 @@ def test_any_motion_keeps_the_promises(
         assert prediction.converged
         assert np.abs(prediction.stretch).max() < 5e-3
         assert prediction.residual < 1e-6
-        rows = prediction.margins[2]
-        assert rows.clearance[rows.nodes[:, 0] > 0].min(initial=1.0) > -1e-6
+        obstacle = prediction.margins["obstacle"]
+        assert obstacle.clearance[obstacle.node > 0].min(initial=1.0) > -1e-6
 
 
 @settings(max_examples=40, deadline=None)
@@ -269,9 +267,7 @@ def test_any_thread_at_any_times_stays_whole(
     thread = Thread.of(
         MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=attachment, rest_curvature=curvature
     )
-    surroundings = Surroundings((), 5e-3, dimension)
-    chosen = make_formulation("rod", thread, surroundings, make_solver("banded", 1e-6), 1e-6)
-    predictor = ThreadPredictor(chosen, thread, held=held)
+    predictor = ThreadPredictor(thread, Surroundings((), 5e-3, dimension), held=held)
     east = np.eye(dimension)[0]
     where, time = np.zeros(dimension), 0.0
     # Not quite straight: what is, in theory, can be pushed together and does not know to which side to bend.

@@ -14,7 +14,6 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, S
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import settings as model_settings
-from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction
 from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
@@ -201,7 +200,7 @@ def test_two_sessions_say_the_same_to_the_last_bit(values: dict[str, Any]):
     one, other = (on_a_curve(straight(scene, **values), 0, 60) for _ in range(2))
     for first, second in zip(one, other, strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
-        for rows, others in zip(first.margins, second.margins, strict=True):
+        for rows, others in zip(first.margins.barriers, second.margins.barriers, strict=True):
             np.testing.assert_array_equal(rows.value, others.value)
 
 
@@ -305,7 +304,7 @@ def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
     assert formulation == "paper" or away > 0.0099  # in which a thread that is pushed shrinks instead
     margins = outcomes[-1].margins
     assert margins is not None
-    assert formulation == "paper" or margins.touching
+    assert formulation == "paper" or margins.in_contact
 
 
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
@@ -398,11 +397,11 @@ def test_settings_that_cannot_be_used_leave_those_before_in_force(values: dict[s
         on_a_curve(session, 0, 20)
     before = one.settings
 
-    def refuse(*_: Any) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
         raise ConfigurationError("scene.shape_0", 1.0, "something else")
 
     with monkeypatch.context() as patch:
-        patch.setattr(model_settings, "make_formulation", refuse)
+        patch.setattr(model_settings, "ThreadPredictor", refuse)
         with pytest.raises(ConfigurationError):
             one.change(one.settings, scene_with(Disc((0.0, 0.01), 0.002)))
     assert one.settings is before
@@ -462,12 +461,11 @@ def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, 
         if prediction is None or not prediction.converged:
             continue
         proven += 1
-        margins = Margins.of(prediction.margins, settings.contact_tolerance)
-        free = margins.kind == 2
+        margins = prediction.margins["obstacle"]
         if isinstance(obstacle, Disc):
             distance = obstacle.signed_distance(prediction.vertices)[0] - 30e-6
-            np.testing.assert_allclose(margins.clearance[free], distance[margins.node[free]], atol=1e-12)
-        assert margins.clearance[free].min(initial=0.0) > -1e-7
+            np.testing.assert_allclose(margins.clearance, distance[margins.node], atol=1e-12)
+        assert margins.clearance.min(initial=0.0) > -1e-7
     assert (proven > 0) == (isinstance(obstacle, Polygon) or obstacle == Disc((-0.01, 1e-4), 0.001))
 
 

@@ -13,10 +13,10 @@ from numba.core.registry import CPUDispatcher
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model import settings
+from magnetosuture_thread.model import predictor
 from magnetosuture_thread.model.choices import make_formulation
 from magnetosuture_thread.model.formulations import PaperOptions
-from magnetosuture_thread.model.margins import TOUCHABLE
+from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.model.settings import ThreadModelSettings, check_scene
 from magnetosuture_thread.scene import Scene
@@ -137,10 +137,10 @@ def test_the_papers_options_come_from_the_settings(monkeypatch, values: dict[str
     given = []
 
     def spied(*arguments: Any) -> Any:
-        given.append(arguments[-1])
+        given.append(arguments[-2])
         return make_formulation(*arguments)
 
-    monkeypatch.setattr(settings, "make_formulation", spied)
+    monkeypatch.setattr(predictor, "make_formulation", spied)
     made(formulation="paper", **values).predictor(None)
     assert (given[0].damping, given[0].stiffness_weight) == (damping, weight)
     assert given[0] == replace(PaperOptions.tuned(weight), damping=damping)
@@ -192,8 +192,6 @@ def test_no_kernel_is_compiled_once_the_predictor_is_made(formulation: str):
     touched = False
     for k in range(1, 200):
         prediction = predictor.step(NeedlePose(k / 60.0, tail + k * np.array([0.0, 6e-5]), east))
-        touched = touched or bool(
-            any((rows.kind in TOUCHABLE) and (rows.clearance < 1e-5).any() for rows in prediction.margins)
-        )
+        touched = touched or bool(any((prediction.margins[name].clearance < 1e-5).any() for name in SOLID))
     assert touched
     assert kernels() == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,13 @@ BLOCK = SceneShape("block", "wall", Polygon(((-0.01, 0.0), (0.01, 0.0), (0.01, 0
 
 def needle_filter(*shapes: SceneShape, length: float = LENGTH, **values: float) -> NeedleSafetyFilter:
     """Return a filter in a dish of 35 mm."""
-    given = {"keep_out": KEEP, "approach_rate": 10.0, "hold_time": HOLD, "needle_length": length, **values}
+    given: dict[str, Any] = {
+        "keep_out": KEEP,
+        "approach_rate": 10.0,
+        "hold_time": HOLD,
+        "needle_length": length,
+        **values,
+    }
     return NeedleSafetyFilter(Scene(Dish(0.035), shapes), **given)
 
 

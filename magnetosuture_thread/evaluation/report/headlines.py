@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from magnetosuture_thread.evaluation.metrics import SOLID_KINDS, MinimumMargin, Percentiles
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles
 from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures
 
 GOOD, MIDDLING, BAD, NONE = "good", "middling", "bad", "none"
@@ -77,7 +77,7 @@ def _margins(about: BagDetails, figures: BagFigures) -> list[Headline]:
         return [Headline("least margin", "none", "no prediction converged", NONE, "not known")]
     worst = min(figures.minimum.values(), key=lambda least: least.clearance - _allowed(about, least))
     holds = [_holds(about, least) for least in figures.minimum.values()]
-    solid = [figures.minimum[kind] for kind in SOLID_KINDS if kind in figures.minimum]
+    solid = [figures.minimum[kind] for kind in SOLID if kind in figures.minimum]
     if all(holds) and solid:
         worst = min(solid, key=lambda least: least.clearance)
     touching = f"; touches in {_frames_of(figures.contact_frames)}" if figures.contact_frames else ""
@@ -93,7 +93,7 @@ def _margins(about: BagDetails, figures: BagFigures) -> list[Headline]:
 
 def _allowed(about: BagDetails, least: MinimumMargin) -> float:
     """Return what a margin may be at the least, within the solvers' tolerance [m]."""
-    return -TOUCH if least.kind in SOLID_KINDS else -EXACT * about.length / max(about.segments, 1)
+    return -TOUCH if least.kind in SOLID else -EXACT * about.length / max(about.segments, 1)
 
 
 def _holds(about: BagDetails, least: MinimumMargin) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.evaluation.metrics import KINDS, SOLID_KINDS, RunMetrics
+from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report.headlines import AGAINST
 from magnetosuture_thread.evaluation.series import Column, WorstFrame, thinned, with_gaps
 
@@ -66,11 +66,17 @@ def _bands(lost: Sequence[Sequence[float]]) -> list[list[float]]:
 def _columns(metrics: RunMetrics) -> dict[str, Column]:
     """Return the columns in the units of the plots: %, mm, µm, ms."""
     table = metrics.series
-    scales = {"strain": 100.0, "step_time": 1e3, **{f"margin_{kind}": 1e3 for kind in SOLID_KINDS}}
-    scales |= {f"margin_{kind}": 1e6 for kind in KINDS if kind not in SOLID_KINDS}
+    scales = {"strain": 100.0, "step_time": 1e3, **{f"{MARGIN}{name}": 1e3 for name in SOLID}}
+    scales |= dict.fromkeys(_other_margins(table), 1e6)
     columns = {name: scales.get(name, 1.0) * table.column(name) for name in table.names}
     columns["strain"] = np.maximum(columns["strain"], MIN_STRAIN)
     return columns
+
+
+def _other_margins(table: TimeSeries) -> list[str]:
+    """Return the columns of the margins that are not distances from something solid."""
+    solid = {f"{MARGIN}{name}" for name in SOLID}
+    return [name for name in table.names if name.startswith(MARGIN) and name not in solid]
 
 
 def _prepared(times: Column, columns: Mapping[str, Column], limit: int) -> tuple[Column, dict[str, Column]]:
@@ -102,14 +108,13 @@ def _plots(
         "y": "distance [mm]",
         "series": _series(
             predicted,
-            [(f"margin_{kind}", kind, colour, "") for kind, colour in zip(SOLID_KINDS, ("good", "kind5"), strict=True)],
+            [(f"{MARGIN}{name}", name, colour, "") for name, colour in zip(SOLID, ("good", "kind5"), strict=True)],
         ),
         "zero": True,
     }
     kinds = [
-        (f"margin_{kind}", kind.replace("_", " "), f"kind{k}", "")
-        for k, kind in enumerate(KINDS)
-        if kind not in SOLID_KINDS
+        (column, column.removeprefix(MARGIN).replace("_", " "), f"kind{k % COLOURS}", "")
+        for k, column in enumerate(_other_margins(metrics.series))
     ]
     yield {"id": "lengths", "y": "margin [µm]", "series": _series(predicted, kinds), "zero": True}
     yield {

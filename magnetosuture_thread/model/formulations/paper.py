@@ -22,27 +22,29 @@ in a node's way along it, is moved in to it along its normal; the dish is convex
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import Barrier, BarrierRows
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import WALL, Surroundings, SurroundingsData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import (
-    BarrierRows,
     Connectivity,
     EnhancedConnectivity,
     ObstacleAvoidance,
     Stiffness,
     WallAvoidance,
+    distance_barrier,
+    moved_inside,
+    squared_barrier,
+    stiffness_function,
 )
-from magnetosuture_thread.model.barriers.connectivity import distance_barrier
-from magnetosuture_thread.model.barriers.obstacle import squared_barrier
-from magnetosuture_thread.model.barriers.stiffness import stiffness_function
-from magnetosuture_thread.model.barriers.wall import moved_inside
+from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
 from magnetosuture_thread.model.formulations.step import (
     DEPTH_REACHED,
     ROW_REACH,
@@ -95,6 +97,7 @@ class PaperFormulation:
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
         options: what the paper sets or leaves open.
+        barriers: what a user adds to the built-in ones; their rows are linearised once, as all of this formulation.
     """
 
     name = "paper"
@@ -106,11 +109,13 @@ class PaperFormulation:
         solver: Solver,
         tolerance: float,
         options: PaperOptions | None = None,
+        barriers: Sequence[Barrier] = (),
     ) -> None:
         nodes, dimension = thread.segments + 1, surroundings.dimension
         self.dimension = dimension
         self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
         self._options = options or PaperOptions()
+        self.added = AddedBarriers(barriers, thread.segment_length)
         reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
         self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
         self._room_radius = (wall_radius - 0.5 * thread.diameter) / thread.segment_length
@@ -146,12 +151,18 @@ class PaperFormulation:
                 break
             self._memory = self._memory.with_room()
         count = self._rows + contacts
-        solution = self._solver.solve(self._memory.program(count, known), velocities, self._memory.multipliers[:count])
+        program, wide, guess = self._memory.program(count, known), None, self._memory.multipliers[:count]
+        if self.added:
+            self.added.begin(state.positions, drive.time, interval)
+            added = self.added.linearised(start, moved, known, interval)
+            program, wide = added.joined(program)
+            guess = np.concatenate([guess, np.zeros(len(added.lower))])
+        solution = self._solver.solve(program, velocities, guess, wide)
         if not solution.residuals.largest <= self._tolerance:
             self._memory.forget()
             raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
-        self._memory.multipliers[:count] = solution.multipliers
-        remember_push(self._memory.node, solution.multipliers[self._rows :], self._memory.push)
+        self._memory.multipliers[:count] = solution.multipliers[:count]
+        remember_push(self._memory.node, solution.multipliers[self._rows : count], self._memory.push)
         end = moved + interval * solution.velocities
         moved_inside(end, known, self._room_radius)
         after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
@@ -179,7 +190,7 @@ class PaperFormulation:
         return np.full(self._thread.segments, self._thread.segment_length)
 
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return every barrier; see `Formulation`. There is none of compression in this formulation.
+        """Return the built-in barriers; see `Formulation`. There is none of compression in this formulation.
 
         Connectivity may give way, as the paper's has slack; what is left of it is what the margins say.
         """

@@ -27,15 +27,18 @@ a compliance of 1e-7 instead of slacks, and where the barriers are linearised is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from magnetosuture_thread.barrier import Barrier, BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
-from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance, WallAvoidance
-from magnetosuture_thread.model.formulations.rod_program import Rod
-from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, go_on, take
+from magnetosuture_thread.model.barriers import Compression, Connectivity, ObstacleAvoidance, WallAvoidance
+from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
+from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, Rod, go_on, take
 from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState, warmed
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
@@ -53,6 +56,7 @@ class RodFormulation:
         surroundings: obstacles and wall [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
+        barriers: what a user adds to the built-in ones.
 
     Raises:
         ConfigurationError: gravity has not one value for each dimension.
@@ -60,7 +64,14 @@ class RodFormulation:
 
     name = "rod"
 
-    def __init__(self, thread: Thread, surroundings: Surroundings, solver: Solver, tolerance: float) -> None:
+    def __init__(
+        self,
+        thread: Thread,
+        surroundings: Surroundings,
+        solver: Solver,
+        tolerance: float,
+        barriers: Sequence[Barrier] = (),
+    ) -> None:
         nodes, dimension = thread.segments + 1, surroundings.dimension
         self.dimension = dimension
         self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
@@ -85,7 +96,10 @@ class RodFormulation:
             mechanics.end_corrected_weights(thread.segments),
             mechanics.bending_bands(thread.segments, glued),
         )
+        self.added = AddedBarriers(barriers, thread.segment_length)
         self._axes, (self._banded, self._at_once) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
+        if self.added:  # compiled code knows nothing of their rows, and leaves every solve to `step`
+            self._banded = BandedSolver(iterations=0)
         self._motion = Motion.of(nodes, dimension)
         self._give(Memory.of(nodes, dimension, thread.segments, 2 * nodes))
 
@@ -99,6 +113,9 @@ class RodFormulation:
         velocities = np.ascontiguousarray(state.velocities, np.float64)
         motion, (nodes, ends) = self._motion, drive.arrays()
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
+        added: LinearRows | None = None
+        if self.added:
+            self.added.begin(positions, drive.time, interval)
         while True:
             code, contacts, solves, off, word, residuals = go_on(
                 self._axes,
@@ -117,6 +134,7 @@ class RodFormulation:
                 self._at_once,
                 MOST_SOLVES,
                 solves,
+                added.off if added is not None else 0.0,
             )
             worst, status = worst.or_worse(Residuals(*residuals)), status if status != SOLVED else STATUS[word]
             if code == ENDED:
@@ -125,12 +143,18 @@ class RodFormulation:
                 self._give(self._memory.with_room())
                 continue
             count = segments + contacts
-            program = self._memory.program(count, motion.known)
-            solution = self._solver.solve(program, motion.velocities, self._memory.multipliers[:count])
+            program, wide, guess = self._memory.program(count, motion.known), None, self._memory.multipliers[:count]
+            if self.added:
+                added = added or self.added.linearised(motion.about, motion.start, motion.known, interval)
+                program, wide = added.joined(program)
+                guess = np.concatenate([guess, np.zeros(len(added.lower))])
+            solution = self._solver.solve(program, motion.velocities, guess, wide)
             if not solution.residuals.largest <= self._tolerance:
                 self._memory.forget()
                 raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
-            take(self._memory, motion, solution.velocities, solution.multipliers, interval)
+            take(self._memory, motion, solution.velocities, solution.multipliers[:count], interval)
+            if self.added:
+                added = self.added.linearised(motion.about, motion.start, motion.known, interval)
             worst, solves = worst.or_worse(solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
@@ -159,7 +183,7 @@ class RodFormulation:
         return chords * self._thread.segment_length
 
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return every barrier; see `Formulation`."""
+        """Return the built-in barriers; see `Formulation`."""
         radius = 0.5 * self._thread.diameter
         return [
             Connectivity(self._thread.segment_length).rows(positions),

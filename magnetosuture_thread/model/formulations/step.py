@@ -8,10 +8,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import SurroundingsData, find_near
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.barriers import BarrierRows
+from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
 
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
@@ -47,11 +48,13 @@ class Drive:
         nodes: their indices, k of them; node 0 is the needle's tail.
         positions: where they are at the end of the step, shape (k, d) [m].
         heading: unit vector along the needle at the end of the step, shape (d,).
+        time: at the end of the step [s].
     """
 
     nodes: tuple[int, ...]
     positions: Points
     heading: Points
+    time: float = 0.0
 
     def arrays(self) -> tuple[NDArray[np.int64], Points]:
         """Return the nodes and where they are at the end, for compiled code."""
@@ -82,10 +85,17 @@ class StepSolution:
 
 
 class Formulation(Protocol):
-    """A way of writing one step of the thread as a quadratic program."""
+    """A way of writing one step of the thread as a quadratic program.
+
+    Attributes:
+        name: of the formulation.
+        dimension: 2 or 3.
+        added: the barriers that a user has added.
+    """
 
     name: str
     dimension: int
+    added: AddedBarriers
 
     def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
         """Move the driven nodes and let the thread follow for one interval [s].
@@ -104,7 +114,7 @@ class Formulation(Protocol):
         ...
 
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return every barrier at positions of shape (n + 1, d) [m], in SI units."""
+        """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
         ...
 
 

@@ -3,5 +3,6 @@
 from magnetosuture_thread.model.solvers.banded import BandedSolver
 from magnetosuture_thread.model.solvers.fallback import FallbackSolver
 from magnetosuture_thread.model.solvers.osqp import OsqpSolver
+from magnetosuture_thread.model.solvers.qpsolvers import QpsolversSolver
 
-__all__ = ["BandedSolver", "FallbackSolver", "OsqpSolver"]
+__all__ = ["BandedSolver", "FallbackSolver", "OsqpSolver", "QpsolversSolver"]

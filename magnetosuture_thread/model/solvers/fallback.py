@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector
+from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector, WideRows
+from magnetosuture_thread.model.solvers.banded import BandedSolver
 
 
 class FallbackSolver:
@@ -29,15 +30,22 @@ class FallbackSolver:
         self.first = self._solvers[0]
         self.name = self.first.name
 
-    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
-        """Return the first solution that passes, else the best; see `Solver`."""
-        solution = self.first.solve(program, velocities, multipliers)
+    def solve(
+        self,
+        program: ChainProgram,
+        velocities: NDArray[np.float64],
+        multipliers: Vector,
+        wide: WideRows | None = None,
+    ) -> Solution:
+        """Return the first solution that passes, else the best; see `Solver`. Wide rows are left to the others."""
+        solvers = [s for s in self._solvers if wide is None or not isinstance(s, BandedSolver)]
+        solution = solvers[0].solve(program, velocities, multipliers, wide)
         if solution.residuals.largest <= self.tolerance:
             return solution
         tried, best = [f"{solution.solver}: {solution.status}"], solution
-        still, free = np.zeros_like(program.linear), np.zeros(len(program.first))
-        for solver in self._solvers:
-            solution = solver.solve(program, still, free)
+        still, free = np.zeros_like(program.linear), np.zeros_like(multipliers)
+        for solver in solvers:
+            solution = solver.solve(program, still, free, wide)
             if solution.residuals.largest < best.residuals.largest:
                 best = solution
             if solution.residuals.largest <= self.tolerance:

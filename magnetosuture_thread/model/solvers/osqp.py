@@ -14,6 +14,7 @@ from magnetosuture_thread.model.program import (
     QuadraticProgram,
     Solution,
     Vector,
+    WideRows,
     as_quadratic_program,
     residuals_of,
 )
@@ -40,13 +41,19 @@ class OsqpSolver:
         self._solver: Any = None
         self._loaded: QuadraticProgram | None = None
 
-    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
+    def solve(
+        self,
+        program: ChainProgram,
+        velocities: NDArray[np.float64],
+        multipliers: Vector,
+        wide: WideRows | None = None,
+    ) -> Solution:
         """Solve one program; the first of a pattern pays for the set-up.
 
         The guess is not used: OSQP starts from its own last solution, slacks included.
         """
-        general = as_quadratic_program(program)
-        return self.read(program, general, self.run(general))
+        general = as_quadratic_program(program, wide)
+        return self.read(program, general, self.run(general), wide)
 
     def run(self, general: QuadraticProgram) -> Any:
         """Return what OSQP finds for a program in general form, or the error by which it refuses it."""
@@ -60,9 +67,11 @@ class OsqpSolver:
             self._loaded = None  # or the next program would start from what is no solution, even from NaN
         return found
 
-    def read(self, program: ChainProgram, general: QuadraticProgram, found: Any) -> Solution:
+    def read(
+        self, program: ChainProgram, general: QuadraticProgram, found: Any, wide: WideRows | None = None
+    ) -> Solution:
         """Return what was found as a solution of the chain's program."""
-        u, multipliers = np.full(program.linear.shape, np.nan), np.full(len(program.first), np.nan)
+        u, multipliers = np.full(program.linear.shape, np.nan), np.full(len(general.lower), np.nan)
         status, iterations = f"refused: {found}", 0
         if not isinstance(found, osqp.OSQPException):
             status, iterations = str(found.info.status), int(found.info.iter)
@@ -70,7 +79,7 @@ class OsqpSolver:
             flat[general.unknown] = found.x[: len(general.unknown)]
             u = flat.reshape(program.linear.shape)
             multipliers = -np.asarray(found.y, dtype=np.float64)  # OSQP's sign is the other one
-        return Solution(u, multipliers, self.name, status, iterations, residuals_of(program, u, multipliers))
+        return Solution(u, multipliers, self.name, status, iterations, residuals_of(program, u, multipliers, wide))
 
     def _load(self, program: QuadraticProgram) -> None:
         if self._loaded is not None and _alike(self._loaded, program):

@@ -128,8 +128,7 @@ class HerniaRun:
         took = np.array([step.took for step in steps])
         radius = 0.5 * self.settings.thread().diameter
         nearest = min(
-            (least.clearance for step in self.instants for least in step.margins.least if least.obstacle >= 0),
-            default=math.inf,
+            (step.margins["obstacle"].minimum for step in self.instants), default=math.inf
         )
         counts = [len(step.margins.friction.nodes) for step in steps]
         return HerniaSummary(

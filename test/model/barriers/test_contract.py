@@ -7,11 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from magnetosuture_thread.barrier import NO_OBSTACLE, Barrier
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle, Polygon, Surroundings
 from magnetosuture_thread.model.barriers import (
-    NO_OBSTACLE,
-    Barrier,
-    BarrierKind,
     Compression,
     Connectivity,
     EnhancedConnectivity,
@@ -60,7 +58,7 @@ def test_shapes_agree(dimension: int, index: int):
     assert rows.gradient.shape == (count, touched, dimension)
     assert rows.nodes.min() == 0
     assert rows.nodes.max() == len(positions) - 1
-    has_obstacles = rows.kind is BarrierKind.OBSTACLE
+    has_obstacles = rows.name == "obstacle"
     assert has_obstacles == bool((rows.obstacle != NO_OBSTACLE).all())
 
 

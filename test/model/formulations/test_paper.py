@@ -9,9 +9,9 @@ import pytest
 
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
-from magnetosuture_thread.model.barriers import BarrierKind, Connectivity, EnhancedConnectivity, Stiffness
+from magnetosuture_thread.model.barriers import Connectivity, EnhancedConnectivity, Stiffness
 from magnetosuture_thread.model.formulations import PaperFormulation, PaperOptions, ThreadState
-from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector
+from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector, WideRows
 from magnetosuture_thread.model.solvers import BandedSolver
 from test.model.formulations.scenes import (
     DT,
@@ -36,11 +36,13 @@ class Listening:
         self.programs: list[ChainProgram] = []
         self._solver = BandedSolver()
 
-    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+    def solve(
+        self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector, wide: WideRows | None = None
+    ) -> Solution:
         """Solve a program."""
         copied = copy.deepcopy(program)
         self.programs.append(copied)
-        return self._solver.solve(program, velocities, multipliers)
+        return self._solver.solve(program, velocities, multipliers, wide)
 
 
 def test_the_program_is_the_printed_one():
@@ -128,7 +130,7 @@ def test_no_node_enters_an_obstacle_and_one_inside_is_pushed_out(obstacle: Disc 
 
     def least(positions: np.ndarray) -> float:
         rows = formulation.margins(positions, east())[-2]
-        assert rows.kind is BarrierKind.OBSTACLE
+        assert rows.name == "obstacle"
         return float(rows.clearance[rows.nodes[:, 0] > 0].min(initial=np.inf))
 
     touched = False
@@ -169,9 +171,11 @@ def test_a_step_that_ends_deep_in_an_obstacle_says_so():
 class Lying(Listening):
     """Says that it solved what it did not."""
 
-    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+    def solve(
+        self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector, wide: WideRows | None = None
+    ) -> Solution:
         """Return a solution with a bad residual."""
-        return super().solve(program, velocities, multipliers)._replace(residuals=Residuals(1.0, 0.0, 0.0))
+        return super().solve(program, velocities, multipliers, wide)._replace(residuals=Residuals(1.0, 0.0, 0.0))
 
 
 def test_a_solution_is_refused_by_its_residual():

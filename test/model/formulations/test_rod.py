@@ -13,7 +13,7 @@ from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroun
 from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, StepSolution, ThreadState
 from magnetosuture_thread.model.formulations.rod_step import Motion, set_out
 from magnetosuture_thread.model.formulations.step import Memory
-from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector
+from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, WideRows
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.thread import Attachment, Thread
 from test.model.formulations.scenes import (
@@ -360,9 +360,11 @@ class LyingSolver:
 
     name = "liar"
 
-    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+    def solve(
+        self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector, wide: WideRows | None = None
+    ) -> Solution:
         """Return the truth, a little off, and its honest residual."""
-        solution = BandedSolver().solve(program, velocities, multipliers)
+        solution = BandedSolver().solve(program, velocities, multipliers, wide)
         return solution._replace(solver=self.name, residuals=Residuals(0.0, 2e-5, 0.0))
 
 
@@ -380,9 +382,11 @@ class Hidden:
         self._solver, self.name = solver, name or solver.name
         self._renames = bool(name)
 
-    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+    def solve(
+        self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector, wide: WideRows | None = None
+    ) -> Solution:
         """Solve one program; see `Solver`."""
-        solution = self._solver.solve(program, velocities, multipliers)
+        solution = self._solver.solve(program, velocities, multipliers, wide)
         return solution._replace(solver=self.name) if self._renames else solution
 
 

@@ -9,8 +9,6 @@ import pytest
 
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
-from magnetosuture_thread.model.barriers import BarrierKind
-from magnetosuture_thread.model.choices import make_formulation, make_solver
 from magnetosuture_thread.model.formulations import StepSolution
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
@@ -40,7 +38,7 @@ def test_a_thread_pushed_sideways_into_the_wall_slides_along_it(name: str, attac
     assert -2e-5 < outside(thread, steps) < OUTSIDE
     assert all(done.converged for done in steps)
     wall = formulation.margins(steps[-1].state.positions, east())[-1]
-    assert wall.kind is BarrierKind.WALL
+    assert wall.name == "wall"
     assert wall.clearance[wall.nodes[:, 0] > 0].min() > -OUTSIDE
 
 
@@ -118,10 +116,7 @@ def test_polyamide_along_the_rim_is_where_the_rig_has_it(attachment: Attachment)
     errors: dict[float, list[float]] = {RADIUS: [], math.inf: []}
     predictors = {}
     for wall in errors:
-        formulation = make_formulation(
-            "rod", thread, Surroundings((), 5e-3, 2, wall), make_solver("banded", TOLERANCE), TOLERANCE
-        )
-        predictors[wall] = ThreadPredictor(formulation, thread)
+        predictors[wall] = ThreadPredictor(thread, Surroundings((), 5e-3, 2, wall), residual_tolerance=TOLERANCE)
     furthest = 0.0
     for frame in range(int(6.0 * rate)):
         tail, heading = rim_way(frame / rate, speed, 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
+from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, WideRows, residuals_of
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver
 from test.model.test_program import one_node, random_program
 
@@ -111,7 +111,9 @@ class Named:
         self.name, self._status, self._residual = name, status, residual
         self.guesses: list[float] = []
 
-    def solve(self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector) -> Solution:
+    def solve(
+        self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector, wide: WideRows | None = None
+    ) -> Solution:
         """Return a solution with the residual."""
         self.guesses.append(float(np.abs(velocities).max()))
         residuals = Residuals(self._residual, 0.0, 0.0)

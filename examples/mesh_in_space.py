@@ -1,0 +1,26 @@
+"""A thread in three dimensions that sinks in air onto a pyramid, given as a closed triangle mesh."""
+
+import numpy as np
+
+from magnetosuture_thread import Attachment, Medium, Mesh, NeedlePose, Surroundings, Thread, ThreadPredictor
+
+corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 1]]) * 0.01 - [0.0, 0.0, 0.02]
+faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])  # outward by the right hand
+thread = Thread(
+    material="cord",
+    length=0.03,
+    segments=30,
+    diameter=5e-4,
+    bending_stiffness=1e-10,
+    medium=Medium.air(mass_per_length=2e-4, gravity=(0.0, 0.0, -9.81), drag=2e-3),
+    attachment=Attachment.PINNED,
+)
+predictor = ThreadPredictor(thread, Surroundings([Mesh(corners, faces)], reach=0.01, dimension=3), longest_step=2e-3)
+east, tail = np.array([1.0, 0.0, 0.0]), np.array([0.015, 0.0, 0.0])
+predictor.start(NeedlePose(0.0, tail, east))
+for step in range(1, 151):
+    prediction = predictor.step(NeedlePose(step / 100.0, tail, east))
+
+print(f"{len(prediction.margins.in_contact)} nodes lie on the mesh")
+print(f"least clearance: {1e6 * prediction.margins['obstacle'].minimum:.4f} um")
+print(f"lowest node: {1e3 * prediction.vertices[:, 2].min():.2f} mm")

@@ -1,0 +1,388 @@
+"""The built-in control barrier functions of the thread, and the compiled functions that write their rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.barrier import (
+    COMPRESSION,
+    CONNECTIVITY,
+    ENHANCED_CONNECTIVITY,
+    NO_OBSTACLE,
+    OBSTACLE,
+    STIFFNESS,
+    WALL,
+    BarrierRows,
+    CompiledBarrier,
+)
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
+from magnetosuture_thread.geometry.obstacles import Surroundings, wall_contact
+from magnetosuture_thread.geometry.polyline import Points
+
+
+@dataclass(frozen=True)
+class Connectivity(CompiledBarrier):
+    """No segment is longer than its rest length.
+
+        h_con,i = (D^2 - |x_i - x_{i-1}|^2) / 2,    i = 1 ... n
+
+    The first row holds the thread to the needle, x_0. Unit of h: that of the positions, squared.
+
+    Source: [Forghani2025], connectivity functions h_con,i and h_con,1. Deviation: none.
+
+    Attributes:
+        segment_length: D, in the unit of the positions.
+    """
+
+    name = CONNECTIVITY
+    segment_length: float
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return the n rows at positions of shape (n + 1, d)."""
+        return _distance_rows(positions, 1, self.segment_length, self.name, 1.0)
+
+
+@dataclass(frozen=True)
+class EnhancedConnectivity(CompiledBarrier):
+    """No two nodes with one between them are farther apart than two rest lengths.
+
+        h_enh,i = ((2 D)^2 - |x_i - x_{i-2}|^2) / 2,    i = 2 ... n
+
+    The first row links the thread's second node to the needle, x_0. Unit of h: that of the positions,
+    squared.
+
+    Source: [Forghani2025], enhanced connectivity functions. Deviation: printed with the same Delta as the
+    connectivity; taken at its word that would fold the thread, so it is read as 2 Delta. The paper counts
+    its constraints as 3 n - 2 and as 3 n - 1; here are n - 1 of this kind.
+
+    Attributes:
+        segment_length: D, in the unit of the positions.
+    """
+
+    name = ENHANCED_CONNECTIVITY
+    segment_length: float
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return the n - 1 rows at positions of shape (n + 1, d)."""
+        return _distance_rows(positions, 2, 2.0 * self.segment_length, self.name, 1.0)
+
+
+@dataclass(frozen=True)
+class Compression(CompiledBarrier):
+    """No segment is shorter than its rest length.
+
+        h_cmp,i = (|x_i - x_{i-1}|^2 - D_i^2) / 2,    i = 1 ... n
+
+    Together with the connectivity it makes the thread inextensible. Unit of h: that of the positions,
+    squared.
+
+    Source: none. Deviation: the paper leaves it out, so that nodes may coincide in a loop; without it
+    the thread bunches up where it is pushed.
+
+    Attributes:
+        segment_length: D_i, of all segments or of each, shape (n,), in the unit of the positions.
+    """
+
+    name = COMPRESSION
+    segment_length: float | NDArray[np.float64]
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return the n rows at positions of shape (n + 1, d)."""
+        return _distance_rows(positions, 1, self.segment_length, self.name, -1.0)
+
+
+@compiled
+def distance_barrier(
+    positions: Points,
+    apart: int,
+    longest: NDArray[np.float64],
+    value: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> None:
+    """Write h_i = (longest_i^2 - |x_{i + apart} - x_i|^2) / 2 and its gradient at the nodes i ... i + 2.
+
+    Args:
+        positions: all nodes, shape (m, d).
+        apart: 1 or 2.
+        longest: greatest distance, shape (m - apart,).
+        value: written, shape (m - apart,).
+        gradient: written, at the three nodes from min(i, m - 3) on, shape (m - apart, 3, d).
+    """
+    nodes, dimension = positions.shape
+    for i in range(nodes - apart):
+        shift = i - min(i, nodes - 3)
+        square = 0.0
+        for a in range(dimension):
+            gradient[i, 0, a] = gradient[i, 1, a] = gradient[i, 2, a] = 0.0
+            difference = positions[i + apart, a] - positions[i, a]
+            gradient[i, shift, a] = difference
+            gradient[i, shift + apart, a] = -difference
+            square += difference * difference
+        value[i] = 0.5 * (longest[i] ** 2 - square)
+
+
+@compiled
+def _write_distance_rows(
+    positions: Points,
+    apart: int,
+    longest: NDArray[np.float64],
+    sign: float,
+    nodes: NDArray[np.intp],
+    value: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    clearance: NDArray[np.float64],
+) -> None:
+    """Write the rows of `_distance_rows`, with their gradient at the two nodes that they touch."""
+    count, dimension = len(positions) - apart, positions.shape[1]
+    spread = np.empty((count, 3, dimension))
+    distance_barrier(positions, apart, longest, value, spread)
+    for i in range(count):
+        nodes[i, 0], nodes[i, 1] = i, i + apart
+        shift, square = i - min(i, len(positions) - 3), 0.0
+        for a in range(dimension):
+            gradient[i, 0, a] = sign * spread[i, shift, a]
+            gradient[i, 1, a] = sign * spread[i, shift + apart, a]
+            square += spread[i, shift, a] * spread[i, shift, a]
+        value[i] *= sign
+        clearance[i] = sign * (longest[i] - np.sqrt(square))
+
+
+def _distance_rows(
+    positions: Points, apart: int, longest: float | NDArray[np.float64], name: str, sign: float
+) -> BarrierRows:
+    positions = np.ascontiguousarray(positions)
+    count, dimension = len(positions) - apart, positions.shape[1]
+    bound, nodes = np.empty(count), np.empty((count, 2), dtype=np.intp)
+    value, gradient, clearance = np.empty(count), np.empty((count, 2, dimension)), np.empty(count)
+    bound[:] = longest
+    _write_distance_rows(positions, apart, bound, sign, nodes, value, gradient, clearance)
+    return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), value, gradient, clearance)
+
+
+@dataclass(frozen=True)
+class ObstacleAvoidance(CompiledBarrier):
+    """Every node, the needle's tail among them, keeps its distance from every obstacle that is near.
+
+        h_obs,i,O = sd_O(x_i) - rho,    i = 0 ... n,  O = 1 ... M
+
+    with the signed distance sd_O, negative inside. Unit of h: that of the positions. A pair of node and
+    obstacle that is farther apart than the surroundings' reach has no row.
+
+    Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: the paper
+    has (|x_i - p_O|^2 - rho^2) / 2 with the closest point p_O, see `SquaredObstacleAvoidance`. Outside of
+    the obstacle both have the same safe set; but the paper's gradient vanishes on the surface and points
+    inwards below it, so that a node which once got inside is kept there. The signed distance has a unit
+    gradient everywhere.
+
+    Attributes:
+        surroundings: the obstacles, in the unit of the positions.
+        distance: rho, least distance of a node from a surface; the thread's radius.
+    """
+
+    name = OBSTACLE
+    surroundings: Surroundings
+    distance: float
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
+        found = self.surroundings.near(positions)
+        chosen = found.nearest & (found.obstacle != DISH_WALL)
+        value = found.distance[chosen] - self.distance
+        return BarrierRows(
+            name=self.name,
+            nodes=found.node[chosen][:, None],
+            obstacle=found.obstacle[chosen],
+            value=value,
+            gradient=found.outward[chosen][:, None, :],
+            clearance=value,
+        )
+
+
+@dataclass(frozen=True)
+class SquaredObstacleAvoidance(CompiledBarrier):
+    """The same margin in the paper's form.
+
+        h_obs,i,O = (sd |sd| - rho^2) / 2,    sd = sd_O(x_i)
+
+    Unit of h: that of the positions, squared.
+
+    Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: |x - p|^2
+    is signed, negative inside, so that the gradient |sd| n points out of the obstacle on both sides. It
+    vanishes on the surface: the formulation `paper` takes `ObstacleAvoidance` for nodes that are too near.
+
+    Attributes:
+        surroundings: the obstacles, in the unit of the positions.
+        distance: rho, least distance of a node from a surface; the thread's radius.
+    """
+
+    name = OBSTACLE
+    surroundings: Surroundings
+    distance: float
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
+        found = self.surroundings.near(positions)
+        chosen = found.nearest & (found.obstacle != DISH_WALL)
+        signed = found.distance[chosen]
+        value, slope = np.empty(len(signed)), np.empty(len(signed))
+        for k in range(len(signed)):
+            value[k], slope[k] = squared_barrier(signed[k], self.distance)
+        return BarrierRows(
+            name=self.name,
+            nodes=found.node[chosen][:, None],
+            obstacle=found.obstacle[chosen],
+            value=value,
+            gradient=(slope[:, None] * found.outward[chosen])[:, None, :],
+            clearance=signed - self.distance,
+        )
+
+
+@compiled
+def squared_barrier(signed: float, distance: float) -> tuple[float, float]:
+    """Return h = (sd |sd| - rho^2) / 2 and its slope by sd, |sd|."""
+    return 0.5 * (signed * abs(signed) - distance * distance), abs(signed)
+
+
+@dataclass(frozen=True)
+class WallAvoidance(CompiledBarrier):
+    """Every node, the needle's tail among them, keeps its distance from the wall of the dish.
+
+        h_wall,i = R - rho - |x_i|,    i = 0 ... n
+
+    about the origin; in space |x_i| is the distance from the axis z. Unit of h: that of the positions. A node
+    farther from the wall than the reach has no row.
+
+    Its safe set is a disc, so convex, and h is concave: the half plane  h(y) + grad h(y)' (x - y) >= 0  about any
+    point y holds the whole disc, and what else it holds lies outside of the circle by  |x - y|^2 / (2 R)  at most.
+    So no row ever forbids what the wall allows, but a step has to take care of what one row leaves.
+
+    Source: none. Deviation: the paper has no wall; its dish is larger than its thread is long.
+
+    Attributes:
+        radius: R of the dish, in the unit of the positions; inf for none.
+        distance: rho, least distance of a node from the wall; the thread's radius.
+        reach: greatest distance at which a node has a row.
+    """
+
+    name = WALL
+    radius: float
+    distance: float
+    reach: float
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return a row for each near node, at positions of shape (n + 1, d)."""
+        positions = np.ascontiguousarray(positions)
+        count, dimension = positions.shape
+        nodes, value, gradient = np.empty((count, 1), np.intp), np.empty(count), np.zeros((count, 1, dimension))
+        found = _write_wall_rows(positions, self.radius, self.distance, self.reach, nodes, value, gradient)
+        value = value[:found]
+        return BarrierRows(self.name, nodes[:found], np.full(found, NO_OBSTACLE), value, gradient[:found], value)
+
+
+@compiled
+def _write_wall_rows(
+    positions: Points,
+    radius: float,
+    distance: float,
+    reach: float,
+    nodes: NDArray[np.intp],
+    value: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> int:
+    """Write the rows of `WallAvoidance.rows`; return their number."""
+    count = 0
+    for i in range(len(positions)):
+        away, x, y = wall_contact(positions[i, 0], positions[i, 1], radius)
+        if away <= reach and away < np.inf:
+            nodes[count, 0], value[count] = i, away - distance
+            gradient[count, 0, 0], gradient[count, 0, 1] = x, y
+            count += 1
+    return count
+
+
+@compiled
+def moved_inside(positions: Points, known: NDArray[np.bool_], radius: float) -> float:
+    """Move each free node that is outside of a circle about the origin onto it, radially; return the longest way.
+
+    The nearest point of a convex set: no two nodes that are both moved, or inside, get farther apart by it.
+
+    Args:
+        positions: written, shape (n + 1, d).
+        known: nodes that stay where they are, shape (n + 1,).
+        radius: of the circle, in space of a cylinder along z; in the unit of the positions.
+    """
+    longest = 0.0
+    for i in range(len(positions)):
+        away, x, y = wall_contact(positions[i, 0], positions[i, 1], radius)
+        if away < 0.0 and not known[i]:
+            positions[i, 0], positions[i, 1] = -radius * x, -radius * y
+            longest = max(longest, -away)
+    return longest
+
+
+@dataclass(frozen=True)
+class Stiffness(CompiledBarrier):
+    """Nodes with one between them go back to their distance at rest.
+
+        V_i = (|x_i - x_{i-2}|^2 - delta_i^2)^2 / 2,    i = 2 ... n
+
+    The rows hold h = -V, which grows where V falls: dh/dt >= -gamma h is dV/dt <= -gamma V. So h is never
+    above 0, and the least margin of this kind says how far the thread is from its rest shape. Unit of h:
+    that of the positions, to the fourth.
+
+    Source: [Forghani2025], stiffness functions V_i and V_1. Deviation: r(t) in V_1 is the needle's
+    position x_0.
+
+    Attributes:
+        rest_distance: delta_i, shape (n - 1,), in the unit of the positions.
+    """
+
+    name = STIFFNESS
+    rest_distance: NDArray[np.float64]
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return the n - 1 rows at positions of shape (n + 1, d)."""
+        positions = np.ascontiguousarray(positions)
+        count = len(positions) - 2
+        value, gradient = np.empty(count), np.empty((count, 3, positions.shape[1]))
+        stiffness_function(positions, self.rest_distance, value, gradient)
+        first = np.arange(count)
+        distance = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
+        return BarrierRows(
+            name=self.name,
+            nodes=np.column_stack([first, first + 2]),
+            obstacle=np.full(count, NO_OBSTACLE),
+            value=value,
+            gradient=gradient[:, ::2],
+            clearance=-np.abs(distance - self.rest_distance),
+        )
+
+
+@compiled
+def stiffness_function(
+    positions: Points, rest: NDArray[np.float64], value: NDArray[np.float64], gradient: NDArray[np.float64]
+) -> None:
+    """Write h_i = -V_i and its gradient at the nodes i ... i + 2.
+
+    Args:
+        positions: all nodes, shape (m, d).
+        rest: delta_i, shape (m - 2,).
+        value: written, shape (m - 2,).
+        gradient: written, shape (m - 2, 3, d).
+    """
+    nodes, dimension = positions.shape
+    for i in range(nodes - 2):
+        square = 0.0
+        for a in range(dimension):
+            square += (positions[i + 2, a] - positions[i, a]) ** 2
+        misfit = square - rest[i] ** 2
+        value[i] = -0.5 * misfit * misfit
+        for a in range(dimension):
+            slope = -2.0 * misfit * (positions[i + 2, a] - positions[i, a])
+            gradient[i, 0, a] = -slope
+            gradient[i, 1, a] = 0.0
+            gradient[i, 2, a] = slope

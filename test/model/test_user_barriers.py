@@ -1,0 +1,285 @@
+"""Barriers that a user adds: rows of the same program, with margins beside the built-in ones."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import (
+    Barrier,
+    ConfigurationError,
+    Disc,
+    Gradient,
+    InvalidInputError,
+    NeedlePose,
+    Prediction,
+    Scene,
+    ThreadPredictor,
+)
+from magnetosuture_thread.barrier import load_barriers
+from test.examples import FOLDER, load_example
+
+TipKeepIn = load_example("barriers/tip_keep_in").TipKeepIn
+CurvatureBound = load_example("barriers/curvature_bound").CurvatureBound
+MovingDisc = load_example("barriers/moving_disc").MovingDisc
+EAST = np.array([1.0, 0.0])
+HOLDS = 1.1e-7  # m; what a barrier may be short of
+
+
+class EndsApart(Barrier):
+    """The ends of the thread keep a distance: one row over the first and the last node."""
+
+    name = "ends_apart"
+
+    def __init__(self, least: float = 0.0175) -> None:
+        self.least = least
+
+    def value(self, positions: np.ndarray) -> np.ndarray:
+        """Return the one row."""
+        return np.array([np.linalg.norm(positions[-1] - positions[0]) - self.least])
+
+    def gradient(self, positions: np.ndarray) -> Gradient:
+        """Return its gradient."""
+        along = (positions[-1] - positions[0]) / np.linalg.norm(positions[-1] - positions[0])
+        return Gradient(np.array([[0, len(positions) - 1]]), np.array([[-along, along]]))
+
+
+def around(step: int) -> NeedlePose:
+    """Return a needle that drives a circle of 4 mm at 6 mm/s."""
+    angle = 0.025 * step
+    return NeedlePose(
+        step / 60.0,
+        0.004 * np.array([math.sin(angle), 1.0 - math.cos(angle)]),
+        np.array([math.cos(angle), math.sin(angle)]),
+    )
+
+
+def predicted(
+    *barriers: Barrier, way: Callable[[int], NeedlePose] = around, steps: int = 150, **options: Any
+) -> list[Prediction]:
+    """Return the predictions of a thread that starts straight behind its needle."""
+    predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, barriers=barriers, **options)
+    predictor.start(way(0))
+    return [predictor.step(way(step)) for step in range(1, steps + 1)]
+
+
+def least(barrier: Barrier, predictions: list[Prediction]) -> float:
+    """Return the least clearance of a barrier over predictions that may not have known it [m]."""
+    found = []
+    for prediction in predictions:
+        barrier.set_time(prediction.stamp)
+        found.append(float(barrier.clearance(prediction.vertices).min()))
+    return min(found)
+
+
+WAYS = [
+    (TipKeepIn(), around),
+    (CurvatureBound(20.0), around),
+    (MovingDisc(), around),
+    (EndsApart(0.0185), around),
+]
+
+
+@pytest.mark.parametrize("solver", ["banded", "osqp"])
+@pytest.mark.parametrize(("barrier", "way"), WAYS, ids=lambda value: getattr(value, "name", ""))
+def test_a_barrier_holds_that_the_thread_would_leave(barrier: Barrier, way: Callable[[int], NeedlePose], solver: str):
+    assert least(barrier, predicted(way=way)) < -5e-6
+    held = predicted(barrier, way=way, solver=solver)
+    assert all(prediction.converged for prediction in held)
+    assert least(barrier, held) > -HOLDS
+    # And its margins are there, of the same rows.
+    for prediction in held[::10]:
+        barrier.set_time(prediction.stamp)
+        np.testing.assert_array_equal(prediction.margins[barrier.name].value, barrier.value(prediction.vertices))
+    assert max(np.abs(prediction.stretch).max() for prediction in held) < 5e-3
+
+
+@pytest.mark.parametrize("barrier", [barrier for barrier, _ in WAYS], ids=lambda barrier: barrier.name)
+def test_barrier_gradient_matches_finite_differences(barrier: Barrier):
+    random = np.random.default_rng(5)
+    positions = np.cumsum(random.uniform(-1e-3, 1e-3, (26, 2)), axis=0)
+    barrier.set_time(0.5)
+    nodes, values = barrier.gradient(positions)
+    full = np.zeros((len(nodes), *positions.shape))
+    for column in range(nodes.shape[1]):
+        full[np.arange(len(nodes)), nodes[:, column]] += values[:, column]
+    for node in range(len(positions)):
+        for axis in range(2):
+            step = np.zeros_like(positions)
+            step[node, axis] = 1e-7
+            slope = (barrier.value(positions + step) - barrier.value(positions - step)) / 2e-7
+            np.testing.assert_allclose(full[:, node, axis], slope, atol=1e-6 * max(1e-3, float(np.abs(full).max())))
+
+
+def test_several_barriers_hold_together_beside_the_wall_and_a_post():
+    scene = Scene.create(dish_diameter=0.045, shapes={"post": Disc((-0.004, -0.004), 0.002)})
+    barriers = [TipKeepIn(), MovingDisc()]
+    held = predicted(*barriers, scene=scene)
+    assert all(prediction.converged for prediction in held)
+    for barrier in barriers:
+        assert least(barrier, held) > -HOLDS
+    assert min(prediction.margins["obstacle"].minimum for prediction in held) > -HOLDS
+    assert list(held[-1].margins) == ["connectivity", "compression", "obstacle", "wall", "tip_keep_in", "moving_disc"]
+
+
+def test_the_banded_and_a_general_solver_find_the_same_thread():
+    barrier, way = WAYS[0]
+    banded, general = (predicted(barrier, way=way, solver=solver)[-1].vertices for solver in ("banded", "osqp"))
+    np.testing.assert_allclose(banded, general, atol=1e-8)
+
+
+def test_a_solver_of_qpsolvers_is_found_by_its_name():
+    pytest.importorskip("qpsolvers")
+    pytest.importorskip("clarabel")
+    barrier, way = WAYS[3]
+    found = predicted(barrier, way=way, solver="clarabel")
+    assert {prediction.solver for prediction in found} == {"clarabel"}
+    assert least(barrier, found) > -HOLDS
+    np.testing.assert_allclose(found[-1].vertices, predicted(barrier, way=way)[-1].vertices, atol=1e-6)
+
+
+def test_a_gain_slows_how_fast_the_margin_falls():
+    """h(next) >= (1 - gain dt) h(last), as far as the rows are linear, which these are."""
+
+    class Slow(TipKeepIn):  # type: ignore[misc, valid-type]
+        gain = 3.0
+
+    given = ((-0.03, -0.001), (0.01, -0.001), (0.01, 0.0008), (-0.03, 0.0008))
+    barrier = Slow(given)
+    found = [prediction.margins["tip_keep_in"].value for prediction in predicted(barrier)]
+    for before, after in pairwise(found):
+        assert (after >= (1.0 - 3.0 / 60.0) * before - HOLDS).all()
+    fast = [prediction.margins["tip_keep_in"].value for prediction in predicted(TipKeepIn(given))]
+    assert any((after < (1.0 - 3.0 / 60.0) * before - 1e-6).any() for before, after in pairwise(fast))
+
+
+def test_a_slack_lets_a_barrier_give_way():
+    class Soft(TipKeepIn):  # type: ignore[misc, valid-type]
+        slack_weight = 1e-3
+
+    barrier, way = WAYS[0]
+    soft = Soft()
+    found = predicted(soft, way=way)
+    assert all(prediction.converged for prediction in found)
+    assert least(barrier, found) < -5e-5
+
+
+def test_a_hard_barrier_that_cannot_hold_gives_no_margin_as_proven():
+    """The ends cannot be farther apart than the thread is long."""
+    found = predicted(EndsApart(0.025), steps=3)
+    assert not any(prediction.converged for prediction in found)
+
+
+def test_the_papers_formulation_takes_them_too():
+    barrier = TipKeepIn(((-0.022, -0.001), (-0.0188, -0.001), (-0.0188, 0.001), (-0.022, 0.001)))
+    held = predicted(barrier, formulation="paper")
+    # The gains are the paper's: one linearisation a step, of rows that are linear here.
+    assert least(barrier, held) > -HOLDS
+    assert least(barrier, predicted(formulation="paper")) < -5e-5
+    assert held[-1].margins["tip_keep_in"].minimum > -HOLDS
+
+
+class Bad(Barrier):
+    """A barrier of whatever a test gives it."""
+
+    name = "bad"
+
+    def __init__(self, value: Any, nodes: Any, values: Any) -> None:
+        self._value, self._gradient = value, Gradient(nodes, values)
+
+    def value(self, positions: np.ndarray) -> np.ndarray:
+        """Return what was given."""
+        return np.asarray(self._value)
+
+    def gradient(self, positions: np.ndarray) -> Gradient:
+        """Return what was given."""
+        return self._gradient
+
+
+@pytest.mark.parametrize(
+    ("value", "nodes", "values"),
+    [
+        ([1.0, 2.0], np.array([[0]]), np.ones((1, 1, 2))),
+        ([1.0], np.array([[26]]), np.ones((1, 1, 2))),
+        ([1.0], np.array([[-1]]), np.ones((1, 1, 2))),
+        ([1.0], np.array([[1.0]]), np.ones((1, 1, 2))),
+        ([1.0], np.array([1]), np.ones((1, 2))),
+        ([1.0], np.array([[1]]), np.ones((1, 1, 3))),
+        ([math.nan], np.array([[1]]), np.ones((1, 1, 2))),
+        ([1.0], np.array([[1]]), np.full((1, 1, 2), math.inf)),
+        (1.0, np.array([[1]]), np.ones((1, 1, 2))),
+    ],
+)
+def test_rows_that_make_no_sense_are_refused_by_the_barriers_name(value: Any, nodes: Any, values: Any):
+    with pytest.raises(InvalidInputError, match="barrier bad"):
+        predicted(Bad(value, nodes, values), steps=1)
+
+
+def test_barriers_must_be_told_apart():
+    for barriers, words in (
+        ([TipKeepIn(), TipKeepIn()], "a name that no other barrier has"),
+        ([type("Wall", (TipKeepIn,), {"name": "wall"})()], "a name that no other barrier has"),
+        ([type("None", (TipKeepIn,), {"name": ""})()], "printable characters"),
+        ([type("Slow", (TipKeepIn,), {"gain": 0.0})()], "tip_keep_in.gain"),
+        ([type("Soft", (TipKeepIn,), {"slack_weight": math.nan})()], "tip_keep_in.slack_weight"),
+        ([object()], "a subclass of Barrier"),
+    ):
+        with pytest.raises(ConfigurationError, match=words):
+            ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, barriers=barriers)  # type: ignore[arg-type]
+
+
+def test_a_failed_row_leaves_the_thread_where_it_was():
+    class Fragile(MovingDisc):  # type: ignore[misc, valid-type]
+        broken = False
+
+        def value(self, positions: np.ndarray) -> np.ndarray:
+            return np.full(3, math.nan) if self.broken else np.asarray(super().value(positions))
+
+    barrier = Fragile()
+    one, other = (
+        ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, barriers=[each])
+        for each in (barrier, MovingDisc())
+    )
+    for predictor in (one, other):
+        predictor.start(around(0))
+        predictor.step(around(1))
+    barrier.broken = True
+    with pytest.raises(InvalidInputError, match="moving_disc"):
+        one.step(around(2))
+    barrier.broken = False
+    np.testing.assert_array_equal(one.step(around(3)).vertices, other.step(around(3)).vertices)
+
+
+@pytest.fixture
+def my_barriers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Make a module of a user's importable, and return its name."""
+    source = FOLDER / "barriers/tip_keep_in.py"
+    (tmp_path / "my_barriers.py").write_text(source.read_text() + "\nbroken = 3\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "my_barriers", raising=False)
+    return "my_barriers"
+
+
+def test_barriers_are_loaded_by_the_name_of_their_class(my_barriers: str):
+    (barrier,) = load_barriers([f"{my_barriers}:TipKeepIn"])
+    assert barrier.name == "tip_keep_in"
+    assert load_barriers([]) == ()
+    for name, words in (
+        ("nothing", "module:class"),
+        ("my_barriers:Nothing", "AttributeError"),
+        ("my_barriers:broken", "a subclass of magnetosuture_thread.Barrier"),
+        ("my_barriers:np.array", "module:class"),
+        ("no_such_module:Class", "ModuleNotFoundError"),
+        ("os:getcwd", "a subclass of magnetosuture_thread.Barrier"),
+    ):
+        with pytest.raises(ConfigurationError, match=words):
+            load_barriers([name])
+    with pytest.raises(ConfigurationError, match="a name that no other barrier has"):
+        load_barriers([f"{my_barriers}:TipKeepIn"] * 2)

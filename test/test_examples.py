@@ -1,0 +1,41 @@
+"""Every example that the documentation shows runs, from its own folder, and says what it should."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from test.examples import FOLDER
+
+LINES = 40  # of an example at most
+LINES_OF_A_BARRIER = 25  # that a user writes
+SAYS = {
+    "another_solver": "osqp and banded differ by 0.00 nm",
+    "free_thread": "nearest node to the wall: 4.97 mm",
+    "mesh_in_space": "4 nodes lie on the mesh",
+    "needle_filter": "in the end: stopped by post, upper_half",
+    "own_barrier": "moving_disc: at least",
+    "wrap_around_post": "nodes touch post",
+}
+
+
+@pytest.mark.parametrize("name", SAYS)
+def test_an_example_runs(name: str):
+    path = FOLDER / f"{name}.py"
+    assert len(path.read_text().splitlines()) <= LINES
+    done = subprocess.run(
+        [sys.executable, path.name], cwd=FOLDER, timeout=300, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert SAYS[name] in done.stdout
+
+
+@pytest.mark.parametrize("path", sorted((FOLDER / "barriers").glob("*.py")), ids=lambda path: path.stem)
+def test_a_barrier_of_ones_own_is_short(path: Path):
+    lines = path.read_text().splitlines()
+    begin = next(i for i, line in enumerate(lines) if line.startswith("class "))
+    assert len(lines) - begin <= LINES_OF_A_BARRIER
