@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.choices import make_formulation, make_solver
+from magnetosuture_thread.model.factory import make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
@@ -245,7 +245,7 @@ def thread_of(reference: ReferenceTrajectory, path: Path, segments: int | None =
     try:
         given = reference.metadata["material"]
         kind = str(given["kind"])
-        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.GLUED}[reference.metadata["boundary"]]
+        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}[reference.metadata["boundary"]]
         thread = Thread(
             material=kind,
             length=float(given["L_m"]),
