@@ -234,7 +234,7 @@ class Tally:
 
 
 def attack(seed: int, duration: float = EPISODE) -> Tally:
-    """Drive a needle for a while with random parameters in a random scene, all told by the seed."""
+    """PrescribedMotion a needle for a while with random parameters in a random scene, all told by the seed."""
     random = np.random.default_rng(seed)
     found = Tally(episodes=1)
     for _ in range(100):

@@ -15,7 +15,7 @@ thread = Thread(
     medium=Medium.air(mass_per_length=2e-4, gravity=(0.0, 0.0, -9.81), drag=2e-3),
     attachment=Attachment.PINNED,
 )
-predictor = ThreadPredictor(thread, Surroundings([Mesh(corners, faces)], reach=0.01, dimension=3), longest_step=2e-3)
+predictor = ThreadPredictor(thread, Surroundings([Mesh(corners, faces)], reach=0.01, dimension=3), max_step=2e-3)
 east, tail = np.array([1.0, 0.0, 0.0]), np.array([0.015, 0.0, 0.0])
 predictor.start(NeedlePose(0.0, tail, east))
 for step in range(1, 151):

@@ -17,7 +17,7 @@ from benchmarks.solver.cases import Case
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.rod import RodFormulation
-from magnetosuture_thread.model.formulations.step import Drive, StepSolution, ThreadState
+from magnetosuture_thread.model.formulations.step import PrescribedMotion, StepResult, ThreadState
 from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector
 
 REACH = 5e-3  # m; of the margins, which the step does not ask for
@@ -159,10 +159,10 @@ class Walk:
         self._taken = 0
         self.state = ThreadState.at_rest(case.start)
 
-    def step(self) -> StepSolution:
+    def step(self) -> StepResult:
         """Take the next step: barriers, obstacles and solves."""
         i = self._taken
-        drive = Drive((0,), self._case.tails[i, None], self._case.headings[i])
+        drive = PrescribedMotion((0,), self._case.tails[i, None], self._case.headings[i])
         solution = self._formulation.step(self.state, drive, self._case.interval)
         self.state, self._taken = solution.state, i + 1
         return solution
@@ -196,7 +196,7 @@ def run(case: Case, solver: Solver) -> Run:
     return Run(spy.captured, np.array(positions), contact_steps, len(spy.captured))
 
 
-def time_steps(case: Case, solver: Solver, budget: float, passes: int = 1) -> tuple[Timing, list[StepSolution]]:
+def time_steps(case: Case, solver: Solver, budget: float, passes: int = 1) -> tuple[Timing, list[StepResult]]:
     """Time whole steps: barriers, obstacles and solves.
 
     Args:

@@ -18,7 +18,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.model.settings import SHARPEST_TURN, ThreadModelSettings
+from magnetosuture_thread.model.settings import MAX_REST_ANGLE, ThreadModelSettings
 from magnetosuture_thread.model.thread import MATERIALS
 
 ATTACHMENT = "attachment"
@@ -111,7 +111,7 @@ def _stiffness_bounds(settings: Settings) -> tuple[float, float]:
 
 
 def _curvature_bounds(settings: Settings) -> tuple[float, float]:
-    most = min(2000.0, 0.99 * SHARPEST_TURN * settings.segments / settings.thread_length)
+    most = min(2000.0, 0.99 * MAX_REST_ANGLE * settings.segments / settings.thread_length)
     return -most, most
 
 

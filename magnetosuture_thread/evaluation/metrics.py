@@ -10,11 +10,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magnetosuture_thread.barrier import BUILT_IN
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation
 from magnetosuture_thread.evaluation.series import MARGIN, ErrorMap, TimeSeries, WorstFrame, WorstFrames
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.barrier import BUILT_IN
-from magnetosuture_thread.model.margins import SOLID
 
 Array = NDArray[np.float64]
 

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.evaluation.series import TimeSeries
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
+from magnetosuture_thread.model.margins import SOLID
 
 INK, FAINT = "#22303c", "#7b8794"
 SEEN, TRUTH = "#0f6fc6", "#8a6d00"

@@ -16,7 +16,7 @@ from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
 from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory, read_reference
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.choices import make_formulation, make_solver
+from magnetosuture_thread.model.factory import make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
@@ -289,7 +289,7 @@ def reference_thread(
     try:
         given = reference.metadata["material"]
         kind = str(given["kind"])
-        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.GLUED}[reference.metadata["boundary"]]
+        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}[reference.metadata["boundary"]]
         thread = Thread(
             material=kind,
             length=float(given["L_m"]),

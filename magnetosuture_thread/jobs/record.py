@@ -107,7 +107,7 @@ def record(
 def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
     """Refuse a set-up that says another thread, attachment or obstacle than the trajectory has."""
     metadata = reference.metadata
-    attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.GLUED}.get(str(metadata.get("boundary")))
+    attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}.get(str(metadata.get("boundary")))
     length = metadata.get("material", {}).get("L_m")
     for name, given, expected in (
         ("thread_model.thread_length", setup.model.thread_length, length),

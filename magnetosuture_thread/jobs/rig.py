@@ -33,7 +33,7 @@ def score_rig(
     progress: Progress = lambda share: None,
     keep: Callable[[CaseResult], None] = lambda result: None,
 ) -> Evaluation:
-    """Drive the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
+    """PrescribedMotion the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
 
     Of the scores, `max_residual` is in units of the drag across the whole thread at the case's greatest speed, and
     `fallbacks` counts steps that had to be halved.
@@ -80,7 +80,7 @@ def rig_thread(reference: ReferenceTrajectory, path: Path, segments: int) -> Thr
     try:
         given = reference.metadata["material"]
         length, bending, stretching, across, along, diameter = (float(given[name]) for name in names)
-        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.GLUED}[reference.metadata["boundary"]]
+        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}[reference.metadata["boundary"]]
     except NOT_ONE as error:
         raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
     values = (length, bending, stretching, across, along, diameter)

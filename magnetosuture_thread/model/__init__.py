@@ -1,7 +1,7 @@
 """Model: predicts the thread behind the needle."""
 
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
-from magnetosuture_thread.model.choices import make_formulation, make_solver
+from magnetosuture_thread.model.factory import make_formulation, make_solver
 from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread

@@ -19,7 +19,7 @@ from magnetosuture_thread.geometry.polyline import Points
 
 END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
 CURVATURE_CORRECTION = 1.0 / 6.0  # of the energy, by the slope of the curvature
-CLAMP_CORRECTION = 1.5  # the same in the first segment of a glued thread
+CLAMP_CORRECTION = 1.5  # the same in the first segment of a clamped thread
 SHARPEST = 1.0  # rad^2; a sharper turn at a node is a kink between straight segments, and no arc
 
 
@@ -82,25 +82,25 @@ def end_corrected_weights(segments: int) -> NDArray[np.float64]:
     return weights
 
 
-def rest_distances(rest_turns: NDArray[np.float64]) -> NDArray[np.float64]:
+def rest_distances(rest_angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distance of the nodes before and after each inner node at rest, delta_i, shape (n - 1,).
 
     delta_i = 2 cos(theta_i / 2)
 
     Args:
-        rest_turns: theta_i, angle by which the thread at rest turns at each inner node, shape (n - 1,) [rad].
+        rest_angles: theta_i, angle by which the thread at rest turns at each inner node, shape (n - 1,) [rad].
     """
-    return np.asarray(2.0 * np.cos(0.5 * rest_turns))
+    return np.asarray(2.0 * np.cos(0.5 * rest_angles))
 
 
-def bending_bands(segments: int, glued: bool) -> NDArray[np.float64]:
+def bending_bands(segments: int, clamped: bool) -> NDArray[np.float64]:
     """Return the bands of the bending Hessian K, shape (4, n + 1): K[i, i + k] is at [k, i].
 
         E_bend / (EI / D) = 1/2 sum_i w_i |c_i|^2  +  1/2 sum_i (1/6) |c_{i+1} - c_i|^2
-        c_i = x_{i+1} - 2 x_i + x_{i-1} - rest_i,    c_0 = 2 (x_1 - x_0 + heading) if glued, else 0
+        c_i = x_{i+1} - 2 x_i + x_{i-1} - rest_i,    c_0 = 2 (x_1 - x_0 + heading) if clamped, else 0
 
     with w_i = 1, but 1/2 at the clamp, which stands for half a segment; the last difference runs to the
-    free end, where c_n = 0, and the first is weighed by 3/2 if glued. The second sum undoes what second
+    free end, where c_n = 0, and the first is weighed by 3/2 if clamped. The second sum undoes what second
     differences blur: without it the energy is too low by (D^2 / 12) EI times the integral of the squared
     slope of the curvature. A clamped beam under an even load is then right to fourth order in D, and to
     second without.
@@ -109,12 +109,12 @@ def bending_bands(segments: int, glued: bool) -> NDArray[np.float64]:
     which is of fourth order in the bending angle.
     """
     curvatures = sp.diags([1.0, -2.0, 1.0], [-1, 0, 1], shape=(segments, segments + 1)).tolil()
-    curvatures[0, 0], curvatures[0, 1] = (-2.0, 2.0) if glued else (0.0, 0.0)
+    curvatures[0, 0], curvatures[0, 1] = (-2.0, 2.0) if clamped else (0.0, 0.0)
     weights = np.ones(segments)
-    weights[0] = 0.5 if glued else 0.0
+    weights[0] = 0.5 if clamped else 0.0
     slopes = sp.diags([-1.0, 1.0], [0, 1], shape=(segments, segments))
     slope_weights = np.full(segments, CURVATURE_CORRECTION)
-    if glued:
+    if clamped:
         slope_weights[0] *= CLAMP_CORRECTION
     middle = sp.diags(weights) + slopes.T @ sp.diags(slope_weights) @ slopes
     hessian = sp.csr_matrix(curvatures.T @ middle @ curvatures)
@@ -126,15 +126,15 @@ def bending_bands(segments: int, glued: bool) -> NDArray[np.float64]:
 
 @compiled
 def bending_gradient(
-    positions: Points, heading: Points, glued: bool, rest_turns: NDArray[np.float64], work: Points, gradient: Points
+    positions: Points, heading: Points, clamped: bool, rest_angles: NDArray[np.float64], work: Points, gradient: Points
 ) -> None:
     """Write the derivative of E_bend / (EI / D) by every node's position.
 
     Args:
         positions: all nodes, shape (n + 1, d).
-        heading: unit vector along the needle, used if glued, shape (d,).
-        glued: whether the thread is glued to the needle.
-        rest_turns: angle by which the thread at rest turns at each inner node, shape (n - 1,).
+        heading: unit vector along the needle, used if clamped, shape (d,).
+        clamped: whether the thread is clamped to the needle.
+        rest_angles: angle by which the thread at rest turns at each inner node, shape (n - 1,).
         work: any memory, at least shape (2, n + 1, d).
         gradient: written, shape (n + 1, d).
     """
@@ -143,13 +143,13 @@ def bending_gradient(
     deviation, moment = work[0], work[1]
     for i in range(segments):
         for a in range(dimension):
-            deviation[i, a] = _turn(positions, heading, i, a) if glued or i > 0 else 0.0
-        if i > 0 and rest_turns[i - 1] != 0.0:
-            _take_rest(positions, i, rest_turns[i - 1], deviation)
+            deviation[i, a] = _turn(positions, heading, i, a) if clamped or i > 0 else 0.0
+        if i > 0 and rest_angles[i - 1] != 0.0:
+            _take_rest(positions, i, rest_angles[i - 1], deviation)
     for i in range(segments):
-        weight = 1.0 if i > 0 else (0.5 if glued else 0.0)
-        after = CURVATURE_CORRECTION * (CLAMP_CORRECTION if glued and i == 0 else 1.0)
-        before = CURVATURE_CORRECTION * (CLAMP_CORRECTION if glued and i == 1 else 1.0)
+        weight = 1.0 if i > 0 else (0.5 if clamped else 0.0)
+        after = CURVATURE_CORRECTION * (CLAMP_CORRECTION if clamped and i == 0 else 1.0)
+        before = CURVATURE_CORRECTION * (CLAMP_CORRECTION if clamped and i == 1 else 1.0)
         for a in range(dimension):
             following = deviation[i + 1, a] if i + 1 < segments else 0.0
             value = weight * deviation[i, a] - after * (following - deviation[i, a])
@@ -159,7 +159,7 @@ def bending_gradient(
     for a in range(dimension):
         for i in range(nodes):
             gradient[i, a] = 0.0
-        if glued:
+        if clamped:
             gradient[0, a] -= 2.0 * moment[0, a]
             gradient[1, a] += 2.0 * moment[0, a]
         for i in range(1, segments):
@@ -189,7 +189,7 @@ def _take_rest(positions: Points, i: int, turn: float, deviation: Points) -> Non
 
 
 @compiled
-def chord_lengths(positions: Points, heading: Points, glued: bool, chords: NDArray[np.float64]) -> None:
+def chord_lengths(positions: Points, heading: Points, clamped: bool, chords: NDArray[np.float64]) -> None:
     """Write the length of the chord between the ends of each segment, whose arc is 1 long, shape (n,).
 
         chord / arc = 1 - kappa^2 / 24
@@ -204,7 +204,7 @@ def chord_lengths(positions: Points, heading: Points, glued: bool, chords: NDArr
     for i in range(nodes - 1):
         square = 0.0
         for a in range(dimension):
-            if glued or i > 0:
+            if clamped or i > 0:
                 square += _turn(positions, heading, i, a) ** 2
         share = _resolved(square)[0] / 48.0
         chords[i] -= share
@@ -216,7 +216,7 @@ def chord_lengths(positions: Points, heading: Points, glued: bool, chords: NDArr
 def tension_stiffness(
     positions: Points,
     heading: Points,
-    glued: bool,
+    clamped: bool,
     tension: NDArray[np.float64],
     least: float,
     interval: float,
@@ -232,8 +232,8 @@ def tension_stiffness(
 
     Args:
         positions: all nodes, shape (n + 1, d).
-        heading: unit vector along the needle, used if glued, shape (d,).
-        glued: whether the thread is glued to the needle.
+        heading: unit vector along the needle, used if clamped, shape (d,).
+        clamped: whether the thread is clamped to the needle.
         tension: multipliers of the segments, shape (n,) or longer.
         least: bound for a thread that is pushed, negative: never more than bending makes up for.
         interval: dt [s].
@@ -243,7 +243,7 @@ def tension_stiffness(
     """
     blocks, couplings, linear = program
     nodes, dimension = positions.shape
-    for i in range(0 if glued else 1, nodes - 1):
+    for i in range(0 if clamped else 1, nodes - 1):
         pull = max((tension[i] + (tension[i - 1] if i > 0 else 0.0)) / 24.0, least)
         square = 0.0
         for a in range(dimension):
@@ -282,7 +282,7 @@ def _resolved(square: float) -> tuple[float, float]:
 
 @compiled
 def _turn(positions: Points, heading: Points, i: int, a: int) -> float:
-    """Return a coordinate of c_i; c_0 is that of a glued thread."""
+    """Return a coordinate of c_i; c_0 is that of a clamped thread."""
     if i == 0:
         return float(2.0 * (positions[1, a] - positions[0, a] + heading[a]))
     return float(positions[i + 1, a] - 2.0 * positions[i, a] + positions[i - 1, a])

@@ -16,17 +16,17 @@ from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.choices import make_formulation, make_solver
-from magnetosuture_thread.model.formulations import Drive, Formulation, PaperOptions, StepSolution, ThreadState
+from magnetosuture_thread.model.factory import make_formulation, make_solver
+from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
-from magnetosuture_thread.model.succession import gone_on
+from magnetosuture_thread.model.succession import resample_state
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.scene import Scene
 
-FARTHEST = 10.0  # m; nothing that a dish could hold is farther away
+MAX_COORDINATE = 10.0  # m; nothing that a dish could hold is farther away
 STARTED = "started"  # status of a prediction that no step led to
-LONGEST_WAY = 0.5  # segments; of a driven node in a sub-step
+MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
 
 
 @dataclass(frozen=True)
@@ -109,16 +109,16 @@ class ThreadPredictor:
         margin_range: margins are computed of nodes that are closer to a shape or the wall than this [m].
         contact_tolerance: a node this close to a shape or the wall touches it [m].
         residual_tolerance: the largest scaled residual with which a solution is accepted.
-        longest_step: intervals are divided into steps of at most this [s].
-        most_substeps: but into at most so many; then the steps get longer.
-        held: nodes that stay where they are at the start, as where tissue holds the thread.
+        max_step: intervals are divided into steps of at most this [s].
+        max_substeps: but into at most so many; then the steps get longer.
+        fixed_nodes: nodes that stay where they are at the start, as where tissue holds the thread.
 
     Attributes:
         thread: the thread.
 
     Raises:
         ConfigurationError: a name is unknown, a barrier or a shape cannot be used.
-        InvalidInputError: a held node is none of the thread's.
+        InvalidInputError: a fixed node is none of the thread's.
     """
 
     def __init__(
@@ -133,12 +133,12 @@ class ThreadPredictor:
         margin_range: float = 5e-3,
         contact_tolerance: float = 2e-6,
         residual_tolerance: float = 1e-6,
-        longest_step: float = 0.02,
-        most_substeps: int = 200,
-        held: Sequence[int] = (),
+        max_step: float = 0.02,
+        max_substeps: int = 200,
+        fixed_nodes: Sequence[int] = (),
     ) -> None:
-        for node in held:
-            _check_node("held node", node, thread)
+        for node in fixed_nodes:
+            _check_node("fixed node", node, thread)
         surroundings = scene if isinstance(scene, Surroundings) else surroundings_of(scene, margin_range)
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)
@@ -147,9 +147,9 @@ class ThreadPredictor:
             )
         self.thread = thread
         self._formulation, self._contact_tolerance = formulation, contact_tolerance
-        self._longest_step = longest_step
-        self._most_substeps = most_substeps
-        self._held = tuple(sorted(set(held)))
+        self._longest_step = max_step
+        self._most_substeps = max_substeps
+        self._fixed = tuple(sorted(set(fixed_nodes)))
         self._room_radius = surroundings.wall_radius - 0.5 * thread.diameter
         self._scene_version = scene.version if isinstance(scene, Scene) else ""
         self._pose: NeedlePose | None = None
@@ -238,9 +238,11 @@ class ThreadPredictor:
         check_pose(pose)
         if centreline is None:
             centreline = np.array([pose.tail, pose.tail - 2.0 * self.thread.segment_length * pose.heading])
-        if len(centreline) < 2 or not np.all(np.abs(centreline) <= FARTHEST):
+        if len(centreline) < 2 or not np.all(np.abs(centreline) <= MAX_COORDINATE):
             raise InvalidInputError(
-                "centreline", f"{len(centreline)} points", f"at least 2 finite points, at most {FARTHEST:g} m from 0"
+                "centreline",
+                f"{len(centreline)} points",
+                f"at least 2 finite points, at most {MAX_COORDINATE:g} m from 0",
             )
         gap, unit = float(np.linalg.norm(centreline[0] - pose.tail)), self.thread.segment_length
         if gap > unit:
@@ -276,22 +278,22 @@ class ThreadPredictor:
     def follow_on(self, other: ThreadPredictor) -> None:
         """Go on from where another predictor's thread is, and as it moves, if it has started."""
         self._pose = other._pose
-        self._state = gone_on(other._state, other.thread, self.thread) if other._state is not None else None
+        self._state = resample_state(other._state, other.thread, self.thread) if other._state is not None else None
 
-    def step(self, pose: NeedlePose, driven: Mapping[int, Points] | None = None) -> Prediction:
+    def step(self, pose: NeedlePose, prescribed: Mapping[int, Points] | None = None) -> Prediction:
         """Follow the needle to its next pose.
 
         The real interval between the stamps is stepped over, in sub-steps along the straight line
-        between the two poses: so many that neither the time nor the way of a driven node, half a segment,
+        between the two poses: so many that neither the time nor the way of a prescribed node, half a segment,
         is too long for one. Where a solve fails, the thread stays as it was at the last pose.
 
         Args:
             pose: the needle.
-            driven: where other nodes are at the same instant, if their motion is measured: positions of
+            prescribed: where other nodes are at the same instant, if their motion is measured: positions of
                 shape (d,) by index [m].
 
         Raises:
-            InvalidInputError: the pose is not finite, or not later than the last one; or a driven node is
+            InvalidInputError: the pose is not finite, or not later than the last one; or a node of prescribed motion is
                 none of the thread's, or not finite.
             SolverError: a solution's residual is above the tolerance.
         """
@@ -302,17 +304,19 @@ class ThreadPredictor:
         interval = pose.stamp - last.stamp
         if interval <= 0.0:
             raise InvalidInputError("needle pose stamp", f"{pose.stamp:.6f} s", f"later than {last.stamp:.6f} s")
-        ends = {0: pose.tail, **{node: state.positions[node] for node in self._held}}
-        for node, position in (driven or {}).items():
-            _check_node("driven node", node, self.thread)
-            if np.shape(position) != pose.tail.shape or not np.all(np.abs(position) <= FARTHEST):
+        ends = {0: pose.tail, **{node: state.positions[node] for node in self._fixed}}
+        for node, position in (prescribed or {}).items():
+            _check_node("node of prescribed motion", node, self.thread)
+            if np.shape(position) != pose.tail.shape or not np.all(np.abs(position) <= MAX_COORDINATE):
                 where = np.asarray(position).tolist()
-                raise InvalidInputError(f"position of node {node}", where, f"finite, at most {FARTHEST:g} m from 0")
+                raise InvalidInputError(
+                    f"position of node {node}", where, f"finite, at most {MAX_COORDINATE:g} m from 0"
+                )
             ends[node] = position
         nodes = tuple(ends)
         begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
         way = max(map(math.dist, begin.tolist(), end.tolist()))
-        wanted = max(interval / self._longest_step, way / (LONGEST_WAY * self.thread.segment_length), 1.0)
+        wanted = max(interval / self._longest_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
         substeps = min(self._most_substeps, math.ceil(wanted - 1e-9))
         residuals, worst, converged = Residuals(0.0, 0.0, 0.0), None, True
         for index in range(1, substeps + 1):
@@ -320,7 +324,7 @@ class ThreadPredictor:
             heading = _between(last.heading, pose.heading, part)
             done = self._formulation.step(
                 state,
-                Drive(nodes, begin + part * (end - begin), heading, last.stamp + part * interval),
+                PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval),
                 interval / substeps,
             )
             state, residuals = done.state, residuals.or_worse(done.residuals)
@@ -334,7 +338,7 @@ class ThreadPredictor:
         pose: NeedlePose,
         interval: float,
         substeps: int,
-        step: StepSolution | None,
+        step: StepResult | None,
         residuals: Residuals,
         converged: bool,
     ) -> Prediction:
@@ -384,8 +388,10 @@ def check_pose(pose: NeedlePose) -> None:
     if not math.isfinite(pose.stamp):
         raise InvalidInputError("needle pose stamp", pose.stamp, "a finite time [s]")
     tail, heading = np.asarray(pose.tail).tolist(), np.asarray(pose.heading).tolist()
-    if not all(abs(value) <= FARTHEST for value in tail):
-        raise InvalidInputError("needle pose position", tail, f"finite coordinates, at most {FARTHEST:g} m from 0")
+    if not all(abs(value) <= MAX_COORDINATE for value in tail):
+        raise InvalidInputError(
+            "needle pose position", tail, f"finite coordinates, at most {MAX_COORDINATE:g} m from 0"
+        )
     if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
         raise InvalidInputError("needle pose heading", heading, "a unit vector")
 

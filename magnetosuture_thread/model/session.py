@@ -16,19 +16,19 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
 from magnetosuture_thread.geometry.polyline import Points, laid_behind
 from magnetosuture_thread.model.friction import FrictionLaw
 from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.predictor import FARTHEST, NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.scene import Scene
 
-EARLY = 30  # poses that may wait for the centreline of their frame
-REPLAYED = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
+MAX_WAITING_POSES = 30  # poses that may wait for the centreline of their frame
+MAX_LATENESS = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
 WAITING = "waiting for the thread to be seen"
 _OBSTACLES = (Disc((0.0, 0.0), 1e-3), Polygon(((0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3))))  # one of each kind
 
 
 @dataclass(frozen=True)
-class Outcome:
+class PredictionResult:
     """What came of one needle pose.
 
     Attributes:
@@ -85,7 +85,7 @@ class ThreadSession:
         # Obstacles may come later, and no callback shall wait for the compiler of what they need.
         Surroundings(_OBSTACLES, settings.margin_range)
         self._seen: tuple[int, Points] | None = None
-        self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=EARLY)
+        self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
         self._motion = settings.node_motion()
 
@@ -131,9 +131,9 @@ class ThreadSession:
         """Return whether a seen thread of this stamp [ns] would be of use; most are not."""
         if self.settings.initial_shape != "seen":
             return False
-        return not self._predictor.started or self._last is None or stamp < self._last - REPLAYED
+        return not self._predictor.started or self._last is None or stamp < self._last - MAX_LATENESS
 
-    def on_measured_thread(self, stamp: int, centreline: Points) -> Iterator[Outcome]:
+    def on_measured_thread(self, stamp: int, centreline: Points) -> Iterator[PredictionResult]:
         """Take the thread as the camera sees it, to start from.
 
         Args:
@@ -151,14 +151,14 @@ class ThreadSession:
         self._early.clear()
         return (self.on_pose(at, pose) for at, pose in early)
 
-    def on_pose(self, stamp: int, pose: NeedlePose) -> Outcome:
+    def on_pose(self, stamp: int, pose: NeedlePose) -> PredictionResult:
         """Follow the needle to a pose.
 
         Args:
             stamp: of the frame [ns]; `pose.stamp` is the same in seconds.
             pose: as tracked; where the thread is fixed to it, `attachment_offset` says.
         """
-        if self._last is not None and stamp < self._last - REPLAYED:
+        if self._last is not None and stamp < self._last - MAX_LATENESS:
             self._predictor.reset()
             self._last = None
             self._early.clear()
@@ -172,13 +172,13 @@ class ThreadSession:
                 prediction = self._predictor.start(attached, centreline)
             else:
                 self._early.append((stamp, pose))
-                return Outcome(stamp, scene_version=self.scene_version)
+                return PredictionResult(stamp, scene_version=self.scene_version)
         except (InvalidInputError, SolverError) as error:
-            return Outcome(stamp, problem=error, scene_version=self.scene_version)
+            return PredictionResult(stamp, problem=error, scene_version=self.scene_version)
         self._last = stamp
         speeds = self._motion.take(prediction.vertices, prediction.interval)
         law = self.settings.friction_law()
-        return Outcome(stamp, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
+        return PredictionResult(stamp, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":
@@ -187,7 +187,7 @@ class ThreadSession:
         if self._seen is None or self._seen[0] != stamp:
             return None
         centreline = self._seen[1]
-        if attached is pose or len(centreline) < 2 or not np.all(np.abs(centreline) <= FARTHEST):
+        if attached is pose or len(centreline) < 2 or not np.all(np.abs(centreline) <= MAX_COORDINATE):
             return centreline
         # What is between the tail and where the thread is fixed belongs to the needle. How far the seen thread begins
         # from the tail goes on to the predictor, which refuses one that is not this needle's.

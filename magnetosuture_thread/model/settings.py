@@ -12,7 +12,7 @@ from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.configuration import Configuration, described, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_solver
+from magnetosuture_thread.model.factory import FORMULATIONS, SOLVERS, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.friction import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.medium import Medium
@@ -37,7 +37,7 @@ FIXED = {  # why a node cannot change it
     "barriers": "what is imported when it starts",
     "scene": "what it starts with; the topic scene changes it",
 }
-SHARPEST_TURN = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
+MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class ThreadModelSettings(Configuration):
     segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
     attachment: str = quantity(
         Attachment.PINNED.value,
-        "how the thread is fixed to the needle: pinned turns freely, glued leaves along the needle's axis; for rod",
+        "how the thread is fixed to the needle: pinned turns freely, clamped leaves along the needle's axis; for rod",
         choices=tuple(kind.value for kind in Attachment),
     )
     rest_curvature: float = quantity(
@@ -131,7 +131,7 @@ class ThreadModelSettings(Configuration):
         "where the thread starts: as the camera first sees it, or straight behind the needle",
         choices=("seen", "straight"),
     )
-    longest_step: float = quantity(
+    max_step: float = quantity(
         0.02,
         "intervals between poses are divided into steps of at most this; at 60 Hz and faster each is one step",
         unit="s",
@@ -200,8 +200,8 @@ class ThreadModelSettings(Configuration):
                 f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
             )
         turn = abs(self.rest_curvature) * self.thread_length / self.segments
-        if turn > SHARPEST_TURN:
-            sharpest = SHARPEST_TURN * self.segments / self.thread_length
+        if turn > MAX_REST_ANGLE:
+            sharpest = MAX_REST_ANGLE * self.segments / self.thread_length
             words = f"at most {sharpest:.0f} 1/m with {self.segments} segments, which turn by half a radian then"
             raise ConfigurationError(f"{self.GROUP}.rest_curvature", self.rest_curvature, words)
         for about in described(type(self)):
@@ -270,8 +270,8 @@ class ThreadModelSettings(Configuration):
             margin_range=self.margin_range,
             contact_tolerance=self.contact_tolerance,
             residual_tolerance=self.residual_tolerance,
-            longest_step=self.longest_step,
-            held=self.held_nodes,
+            max_step=self.max_step,
+            fixed_nodes=self.held_nodes,
         )
         predictor.warm_up()
         return predictor

@@ -9,7 +9,7 @@ from magnetosuture_thread.model.formulations import ThreadState
 from magnetosuture_thread.model.thread import Thread
 
 
-def gone_on(state: ThreadState, before: Thread, thread: Thread) -> ThreadState:
+def resample_state(state: ThreadState, before: Thread, thread: Thread) -> ThreadState:
     """Return the state of a thread that takes another's place: it lies where that lay and moves as that moved.
 
     A longer one goes on straight at its end. Where segments and length are the same, nothing changes.

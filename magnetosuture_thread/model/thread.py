@@ -47,7 +47,7 @@ class Attachment(Enum):
     """How the thread is fixed to the needle's tail."""
 
     PINNED = "pinned"  # turns freely, as silk through the needle's eye
-    GLUED = "glued"  # leaves along the needle's axis, as the paper's polyamide
+    CLAMPED = "clamped"  # leaves along the needle's axis, as the paper's polyamide
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Thread:
         return self.length / self.segments
 
     @property
-    def rest_turns(self) -> NDArray[np.float64]:
+    def rest_angles(self) -> NDArray[np.float64]:
         """Angle by which the thread at rest turns at each inner node, D kappa_i, shape (n - 1,) [rad]."""
         return self.segment_length * np.broadcast_to(np.asarray(self.rest_curvature, dtype=float), self.segments - 1)
 

@@ -19,7 +19,7 @@ from nav_msgs.msg import Path
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.orientation import angle_of
-from magnetosuture_thread.messages.reading import needle_pose
+from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.model.margins import node_clearance
 from magnetosuture_thread.scene import Scene, SceneShape

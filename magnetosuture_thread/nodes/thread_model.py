@@ -19,7 +19,7 @@ from magnetosuture_thread.messages.packing import packed_margins, packed_markers
 from magnetosuture_thread.model.friction import UNKNOWN
 from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
 from magnetosuture_thread.model.program import SOLVED
-from magnetosuture_thread.model.session import WAITING, Outcome, ThreadSession
+from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
@@ -116,7 +116,7 @@ class ThreadModelNode(Node):
             self._tell(outcome, time.perf_counter() - began)
             began = time.perf_counter()
 
-    def _tell(self, outcome: Outcome, step_time: float) -> None:
+    def _tell(self, outcome: PredictionResult, step_time: float) -> None:
         """Publish what came of a pose."""
         if outcome.prediction is not None:
             self._publish(outcome, outcome.prediction, step_time)
@@ -128,7 +128,7 @@ class ThreadModelNode(Node):
             packed = packed_margins(time_of(outcome.stamp), None, problem, outcome.scene_version)
             self._margins.publish(packed)
 
-    def _publish(self, outcome: Outcome, prediction: Prediction, step_time: float) -> None:
+    def _publish(self, outcome: PredictionResult, prediction: Prediction, step_time: float) -> None:
         when, settings, version = time_of(outcome.stamp), self._session.settings, outcome.scene_version
         # The prediction first: it is waited for, and the margins are only worked out here.
         self._predicted.publish(packed_prediction(when, prediction, settings.material, step_time=step_time))

@@ -16,7 +16,7 @@ from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.interface import CAMERA, COMPRESSED_IMAGE, NEEDLE_POSE
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose
-from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
+from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.changes import changed
 from magnetosuture_thread.offline.sights import Sights
@@ -86,7 +86,7 @@ class Step:
     """
 
     sight: Observation
-    outcome: Outcome
+    outcome: PredictionResult
     margins: Margins | None
     step_time: float
     settings: ThreadModelSettings
@@ -114,7 +114,7 @@ def predictions(given: Iterable[Observation], settings: ThreadModelSettings, sce
 def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Step]:
     waiting: dict[int, Observation] = {}
 
-    def step(sight: Observation, outcome: Outcome, began: float) -> Step:
+    def step(sight: Observation, outcome: PredictionResult, began: float) -> Step:
         taken = time.perf_counter() - began
         if outcome.waiting:
             waiting[outcome.stamp] = sight
@@ -135,7 +135,7 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
         began = time.perf_counter()
         pose = NeedlePose(sight.stamp * 1e-9, sight.tail, sight.heading)
         yield step(sight, session.on_pose(sight.stamp, pose), began)
-        while len(waiting) > 2 * EARLY:
+        while len(waiting) > 2 * MAX_WAITING_POSES:
             del waiting[next(iter(waiting))]
 
 

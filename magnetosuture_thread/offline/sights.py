@@ -18,7 +18,7 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE, SEEN_THREAD, TRUE_THREAD, Channel
 from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
 from magnetosuture_thread.messages.scene import scene_of
-from magnetosuture_thread.model.session import EARLY
+from magnetosuture_thread.model.session import MAX_WAITING_POSES
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -125,7 +125,7 @@ class Sights(Iterator[Observation]):
             else:
                 waiting.append(self._pose(record) if self.source == "poses" else self._frame(record))
             while waiting and (
-                len(waiting) > EARLY
+                len(waiting) > MAX_WAITING_POSES
                 or isinstance(head := waiting[0], Record)
                 or all(head.stamp in known for known in parts.values())
             ):
@@ -168,7 +168,7 @@ class Sights(Iterator[Observation]):
                 self._measured += 1
             self._threads += 1
         known[stamp] = points
-        if len(known) > 2 * EARLY:  # of a frame that never came
+        if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
             del known[next(iter(known))]
 
     def _whole(self, sight: Observation, parts: dict[str, dict[int, Points]]) -> Observation:

@@ -101,7 +101,7 @@ class RigSettings(Configuration):
     thread_length: float = shared("thread_length")
     thread_diameter: float = quantity(60e-6, "of the thread", unit="m", minimum=1e-6, maximum=0.005)
     thread_segments: int = quantity(60, "that the simulated thread is cut into", minimum=8, maximum=400)
-    thread_attachment: str = quantity("pinned", "to the needle", choices=("pinned", "glued"))
+    thread_attachment: str = quantity("pinned", "to the needle", choices=("pinned", "clamped"))
     thread_bending_stiffness: float = quantity(1.2723e-9, "E I of the thread", unit="N m^2", minimum=0.0, maximum=1e-3)
     thread_stretching_stiffness: float = quantity(5.65, "E A of the thread", unit="N", minimum=1e-3, maximum=1e6)
     thread_drag_across: float = quantity(

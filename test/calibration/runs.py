@@ -20,8 +20,8 @@ from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.rig.mechanics.dynamics import Attachment, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 
-SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, longest_step=0.07)  # one step a pose
-SILK = ThreadModelSettings(material="silk_6_0", thread_length=0.15, segments=30, longest_step=0.07)
+SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, max_step=0.07)  # one step a pose
+SILK = ThreadModelSettings(material="silk_6_0", thread_length=0.15, segments=30, max_step=0.07)
 DRAG, LENGTH = 1.0, 0.019  # Pa s, m; of the rig's thread
 RATE = 15.0  # poses a second
 NEEDLE = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
@@ -37,10 +37,10 @@ def path(time: float, scale: float = 6e-3, period: float = 8.0, phase: float = 0
 
 
 @cache
-def rig_run(ratio: float, duration: float = 6.0, phase: float = 0.0, glued: bool = False) -> tuple[Observation, ...]:
+def rig_run(ratio: float, duration: float = 6.0, phase: float = 0.0, clamped: bool = False) -> tuple[Observation, ...]:
     """Return what is seen of a thread with this B = EI / zeta_perp [m^4/s], by the rig's rod, exactly."""
     thread = ThreadProperties(
-        LENGTH, 40, ratio * DRAG, 5.6, DRAG, 0.5 * DRAG, Attachment.GLUED if glued else Attachment.PINNED
+        LENGTH, 40, ratio * DRAG, 5.6, DRAG, 0.5 * DRAG, Attachment.CLAMPED if clamped else Attachment.PINNED
     )
     tail, heading = path(0.0, phase=phase)
     behind = tail - LENGTH * np.linspace(0.0, 1.0, 3)[:, None] * [math.cos(heading), math.sin(heading)]
@@ -89,10 +89,10 @@ def model_run(
 
 
 def rig_passage(
-    ratio: float, noise: float = 0.0, phase: float = 0.0, glued: bool = False, name: str = "run"
+    ratio: float, noise: float = 0.0, phase: float = 0.0, clamped: bool = False, name: str = "run"
 ) -> Passage:
     """Return a run of the rig as a passage."""
-    sights = rig_run(ratio, phase=phase, glued=glued)
+    sights = rig_run(ratio, phase=phase, clamped=clamped)
     return passage_of(name, noisy(sights, noise) if noise else sights, SETTINGS)
 
 

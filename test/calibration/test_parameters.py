@@ -68,7 +68,10 @@ def test_names_of_settings_are_checked():
 def found(**changes: Any) -> Calibration:
     """Return a calibration as a search gives it."""
     settings = replace(
-        with_stiffness_over_drag(SETTINGS, 2e-9), rest_curvature=12.0, attachment="glued", attachment_offset=(1e-4, 0.0)
+        with_stiffness_over_drag(SETTINGS, 2e-9),
+        rest_curvature=12.0,
+        attachment="clamped",
+        attachment_offset=(1e-4, 0.0),
     )
     estimates = (
         Estimate("stiffness over drag", "elastic_modulus", "m^4/s", 2e-9, 1.3e-9, 1.8e-9, 2.2e-9),
@@ -82,7 +85,7 @@ def found(**changes: Any) -> Calibration:
         "start": SETTINGS,
         "against": "seen",
         "estimates": estimates,
-        "attachment": AttachmentVerdict("glued", "pinned", {"pinned": 9.0, "glued": 0.4}),
+        "attachment": AttachmentVerdict("clamped", "pinned", {"pinned": 9.0, "clamped": 0.4}),
         "scores": (BagErrors("a/bag", 600, 3.0, 0.4, 0.5, 2.9, 0.1, 0.2), BagErrors("b", 100, 3.0, 0.4)),
         "simulated": ("camera frames", ""),
         "replays": 60,
@@ -125,9 +128,9 @@ def test_a_whole_number_is_written_with_its_point(tmp_path: Path):
 
 
 def test_an_attachment_that_cannot_be_told_is_left_out():
-    verdict = AttachmentVerdict("pinned", "pinned", {"pinned": 0.4, "glued": 0.41}, "glued is worse by 0.01 only")
+    verdict = AttachmentVerdict("pinned", "pinned", {"pinned": 0.4, "clamped": 0.41}, "clamped is worse by 0.01 only")
     text = to_yaml(found(attachment=verdict))
-    assert "# attachment is left out, as this data cannot tell it: glued is worse by 0.01 only" in text
+    assert "# attachment is left out, as this data cannot tell it: clamped is worse by 0.01 only" in text
     assert "    attachment: " not in text
 
 

@@ -56,22 +56,22 @@ def test_bags_are_one_fit_and_each_is_predicted_by_the_others():
         assert score.truth_held_out == pytest.approx(score.truth_after, abs=0.05)
 
 
-@pytest.mark.parametrize("glued", [False, True])
-def test_the_attachment_is_told_from_how_the_thread_moves(glued: bool):
-    wrong = replace(stiff(TRUE), attachment="pinned" if glued else "glued")
-    found, _ = calibrate([rig_passage(TRUE, 2e-5, glued=glued)], wrong, ["attachment", "elastic_modulus"])
-    assert found.settings.attachment == ("glued" if glued else "pinned")
+@pytest.mark.parametrize("clamped", [False, True])
+def test_the_attachment_is_told_from_how_the_thread_moves(clamped: bool):
+    wrong = replace(stiff(TRUE), attachment="pinned" if clamped else "clamped")
+    found, _ = calibrate([rig_passage(TRUE, 2e-5, clamped=clamped)], wrong, ["attachment", "elastic_modulus"])
+    assert found.settings.attachment == ("clamped" if clamped else "pinned")
     assert found.attachment is not None
     assert found.attachment.reason == ""
     assert of(found, "stiffness over drag").value == pytest.approx(TRUE, rel=0.05)
 
 
 def test_the_attachment_can_be_asked_for_alone():
-    wrong = replace(stiff(TRUE), attachment="glued")
+    wrong = replace(stiff(TRUE), attachment="clamped")
     found, _ = calibrate([rig_passage(TRUE)], wrong, ["attachment"])
     assert (found.settings, found.estimates) == (stiff(TRUE), ())
     assert found.attachment is not None
-    assert found.attachment.errors["glued"] > 3.0 * found.attachment.errors["pinned"]
+    assert found.attachment.errors["clamped"] > 3.0 * found.attachment.errors["pinned"]
 
 
 @pytest.mark.parametrize("noise", [0.0, 4e-5])

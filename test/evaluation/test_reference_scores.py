@@ -100,10 +100,10 @@ def test_the_mapping_is_what_was_promised(tmp_path: Path):
 
 
 def test_the_thread_is_the_one_in_the_file(tmp_path: Path):
-    path = write(tmp_path, "glued", boundary="clamped")
+    path = write(tmp_path, "clamped", boundary="clamped")
     thread, _ = reference_thread(read_reference(path), path)
     assert (thread.length, thread.segments, thread.diameter) == (0.019, 25, 6e-5)
-    assert thread.attachment is Attachment.GLUED
+    assert thread.attachment is Attachment.CLAMPED
     assert thread.bending_stiffness == 1.27e-9
     assert (thread.medium.drag_across, thread.medium.drag_along) == (0.974, 0.487)
     assert reference_thread(read_reference(path), path, 40)[0].segments == 40

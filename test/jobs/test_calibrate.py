@@ -34,7 +34,7 @@ SETUP = """\
     material: polyamide_7_0
     segments: 12
     attachment: pinned
-    longest_step: 0.07
+    max_step: 0.07
 """
 ONE = ("--parameters", "elastic_modulus")
 

@@ -100,7 +100,7 @@ def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: Referenc
     ("metadata", "discs", "words"),
     [
         ({"material": {"L_m": 0.15}}, (), r"thread_model\.thread_length: got 0\.019, expected 0\.15"),
-        ({"boundary": "pinned"}, (), r"thread_model\.attachment: got 'glued', expected pinned"),
+        ({"boundary": "pinned"}, (), r"thread_model\.attachment: got 'clamped', expected pinned"),
         ({}, (Disc((0.0, 0.0), 0.002),), r"scene: got \(\), expected .*radius=0\.002"),
     ],
 )

@@ -18,7 +18,7 @@ def changed(values: dict[str, Any], **before: Any) -> ThreadModelSettings:
 def test_what_is_not_told_of_a_material_stays():
     assert of_material() == {}
     assert of_material(diameter=math.nan, elastic_modulus=math.nan, viscosity=math.nan, drag_anisotropy=math.nan) == {}
-    before: dict[str, Any] = {"diameter": 7e-5, "elastic_modulus": 1e9, "rest_curvature": 5.0, "attachment": "glued"}
+    before: dict[str, Any] = {"diameter": 7e-5, "elastic_modulus": 1e9, "rest_curvature": 5.0, "attachment": "clamped"}
     after = changed(of_material(viscosity=0.8, drag_anisotropy=0.6), **before)
     assert after == from_mapping(ThreadModelSettings, {**before, "viscosity": 0.8, "drag_anisotropy": 0.6})
 
@@ -32,6 +32,6 @@ def test_a_material_that_is_named_brings_its_own_figures():
 
 
 def test_what_may_be_zero_can_be_told():
-    before = {"rest_curvature": 5.0, "attachment_offset": [1e-3, 0.0], "attachment": "glued"}
+    before = {"rest_curvature": 5.0, "attachment_offset": [1e-3, 0.0], "attachment": "clamped"}
     told = of_material(rest_curvature=[0.0], attachment_offset=[0.0, 0.0], attachment="pinned")
     assert changed(told, **before) == from_mapping(ThreadModelSettings, {"attachment_offset": [0.0, 0.0]})

@@ -8,21 +8,23 @@ import pytest
 from magnetosuture_thread.model import mechanics
 
 
-def energy(positions: np.ndarray, heading: np.ndarray, glued: bool) -> float:
+def energy(positions: np.ndarray, heading: np.ndarray, clamped: bool) -> float:
     """Return the bending energy over EI / D, straight from its formula."""
     turns = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
-    first = 2.0 * (positions[1] - positions[0] + heading) if glued else np.zeros(positions.shape[1])
+    first = 2.0 * (positions[1] - positions[0] + heading) if clamped else np.zeros(positions.shape[1])
     every = np.vstack([first, turns, np.zeros_like(first)])
     slopes = (np.diff(every, axis=0) ** 2).sum(axis=1)
-    slopes[0] *= 1.5 if glued else 1.0
+    slopes[0] *= 1.5 if clamped else 1.0
     return 0.5 * float((turns**2).sum()) + 0.25 * float((first**2).sum()) + float(slopes.sum()) / 12.0
 
 
-def gradient_of(positions: np.ndarray, heading: np.ndarray, glued: bool, rest: np.ndarray | None = None) -> np.ndarray:
+def gradient_of(
+    positions: np.ndarray, heading: np.ndarray, clamped: bool, rest: np.ndarray | None = None
+) -> np.ndarray:
     """Return the compiled gradient."""
     rest = np.zeros(len(positions) - 2) if rest is None else rest
     gradient = np.empty_like(positions)
-    mechanics.bending_gradient(positions, heading, glued, rest, np.empty((2, *positions.shape)), gradient)
+    mechanics.bending_gradient(positions, heading, clamped, rest, np.empty((2, *positions.shape)), gradient)
     return gradient
 
 
@@ -37,19 +39,19 @@ def full(bands: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("glued", [False, True])
-def test_gradient_and_hessian_are_those_of_the_energy(dimension: int, glued: bool):
+@pytest.mark.parametrize("clamped", [False, True])
+def test_gradient_and_hessian_are_those_of_the_energy(dimension: int, clamped: bool):
     random = np.random.default_rng(0)
     positions, heading = random.normal(size=(8, dimension)), random.normal(size=dimension)
-    gradient = gradient_of(positions, heading, glued)
-    hessian = full(mechanics.bending_bands(7, glued))
+    gradient = gradient_of(positions, heading, clamped)
+    hessian = full(mechanics.bending_bands(7, clamped))
     for node in range(8):
         for axis in range(dimension):
             step = np.zeros_like(positions)
             step[node, axis] = 1e-5
-            slope = (energy(positions + step, heading, glued) - energy(positions - step, heading, glued)) / 2e-5
+            slope = (energy(positions + step, heading, clamped) - energy(positions - step, heading, clamped)) / 2e-5
             assert gradient[node, axis] == pytest.approx(slope, abs=1e-8)
-            ahead, behind = (gradient_of(positions + s * step, heading, glued) for s in (1.0, -1.0))
+            ahead, behind = (gradient_of(positions + s * step, heading, clamped) for s in (1.0, -1.0))
             np.testing.assert_allclose((ahead - behind)[:, axis] / 2e-5, hessian[:, node], atol=1e-8)
 
 
@@ -76,8 +78,8 @@ def arc(segments: int, turn: float) -> np.ndarray:
 
 def test_a_thread_in_its_rest_shape_has_no_bending_force():
     straight = np.arange(6.0)[:, None] * np.array([0.6, 0.8])
-    for glued in (False, True):
-        np.testing.assert_allclose(gradient_of(straight, -np.array([0.6, 0.8]), glued), 0.0, atol=1e-14)
+    for clamped in (False, True):
+        np.testing.assert_allclose(gradient_of(straight, -np.array([0.6, 0.8]), clamped), 0.0, atol=1e-14)
     bent = arc(12, 0.1)
     at_rest = gradient_of(bent, np.zeros(2), False, np.full(11, 0.1))
     assert np.abs(at_rest).max() < 0.02 * np.abs(gradient_of(bent, np.zeros(2), False)).max()
@@ -136,19 +138,19 @@ def test_a_folded_thread_has_a_drag():
     np.testing.assert_allclose(metric[1], np.eye(2))
 
 
-@pytest.mark.parametrize("glued", [False, True])
-def test_tension_is_the_slope_of_its_energy(glued: bool):
+@pytest.mark.parametrize("clamped", [False, True])
+def test_tension_is_the_slope_of_its_energy(clamped: bool):
     random = np.random.default_rng(4)
     positions = np.cumsum(random.normal(size=(7, 2)) * 0.1 + [1.0, 0.0], axis=0)
     heading, tension, interval = np.array([-1.0, 0.1]), random.uniform(1.0, 2.0, 6), 0.3
 
     def stretched(at: np.ndarray) -> float:
         chords = np.empty(6)
-        mechanics.chord_lengths(at, heading, glued, chords)
+        mechanics.chord_lengths(at, heading, clamped, chords)
         return float(-(tension * chords).sum())
 
     blocks, couplings, linear = np.zeros((7, 2, 2)), np.zeros((3, 7)), np.zeros((7, 2))
-    mechanics.tension_stiffness(positions, heading, glued, tension, -1.0, interval, (blocks, couplings, linear))
+    mechanics.tension_stiffness(positions, heading, clamped, tension, -1.0, interval, (blocks, couplings, linear))
     for node in range(7):
         step = np.zeros_like(positions)
         step[node, 1] = 1e-6

@@ -21,15 +21,15 @@ def pose(stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Ne
 
 
 def new(
-    obstacles: tuple[Disc | Polygon, ...] = (), held: tuple[int, ...] = (), formulation: str = "rod"
+    obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = (), formulation: str = "rod"
 ) -> ThreadPredictor:
     """Return a predictor that has not started."""
-    return ThreadPredictor(THREAD, Surroundings(obstacles, 5e-3), formulation=formulation, held=held)
+    return ThreadPredictor(THREAD, Surroundings(obstacles, 5e-3), formulation=formulation, fixed_nodes=fixed_nodes)
 
 
-def started(obstacles: tuple[Disc | Polygon, ...] = (), held: tuple[int, ...] = ()) -> ThreadPredictor:
+def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = ()) -> ThreadPredictor:
     """Return a predictor of a thread that lies straight behind the needle."""
-    predictor = new(obstacles, held)
+    predictor = new(obstacles, fixed_nodes)
     predictor.start(pose(0.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
     return predictor
 
@@ -134,7 +134,7 @@ def test_warming_up_leaves_no_trace():
 
 
 def test_held_nodes_stay():
-    predictor = started(held=(10,))
+    predictor = started(fixed_nodes=(10,))
     where = -THREAD.segment_length * 10
     for k in range(1, 40):
         prediction = predictor.step(pose(k / 30.0, -5e-5 * k, 2e-5 * k))
@@ -155,7 +155,7 @@ def test_both_ends_can_be_led():
 
 
 @pytest.mark.parametrize(
-    ("driven", "words"),
+    ("prescribed", "words"),
     [
         ({0: np.zeros(2)}, "node 0 follows the needle"),
         ({26: np.zeros(2)}, "a node from 1 to 25"),
@@ -164,11 +164,11 @@ def test_both_ends_can_be_led():
         ({25: np.array([11.0, 0.0])}, "at most 10 m"),
     ],
 )
-def test_driven_nodes_that_cannot_be_are_refused(driven: dict[int, np.ndarray], words: str):
+def test_driven_nodes_that_cannot_be_are_refused(prescribed: dict[int, np.ndarray], words: str):
     with pytest.raises(InvalidInputError, match=words):
-        started().step(pose(0.1), driven)
-    with pytest.raises(InvalidInputError, match="held node"):
-        new(held=(26,))
+        started().step(pose(0.1), prescribed)
+    with pytest.raises(InvalidInputError, match="fixed node"):
+        new(fixed_nodes=(26,))
 
 
 def test_nodes_to_start_at_must_be_those_of_the_thread():
@@ -257,17 +257,22 @@ def test_any_motion_keeps_the_promises(
     attachment=st.sampled_from(list(Attachment)),
     dimension=st.sampled_from([2, 3]),
     curvature=st.floats(-100.0, 100.0),
-    held=st.sampled_from([(), (15,), (14, 15), (25,)]),
+    fixed_nodes=st.sampled_from([(), (15,), (14, 15), (25,)]),
 )
 def test_any_thread_at_any_times_stays_whole(
-    stamps: list[float], seed: int, attachment: Attachment, dimension: int, curvature: float, held: tuple[int, ...]
+    stamps: list[float],
+    seed: int,
+    attachment: Attachment,
+    dimension: int,
+    curvature: float,
+    fixed_nodes: tuple[int, ...],
 ):
-    """Intervals from a microsecond to ten seconds, in the plane and in space, curled, glued, and held."""
+    """Intervals from a microsecond to ten seconds, in the plane and in space, curled, clamped, and fixed."""
     random = np.random.default_rng(seed)
     thread = Thread.of(
         MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=attachment, rest_curvature=curvature
     )
-    predictor = ThreadPredictor(thread, Surroundings((), 5e-3, dimension), held=held)
+    predictor = ThreadPredictor(thread, Surroundings((), 5e-3, dimension), fixed_nodes=fixed_nodes)
     east = np.eye(dimension)[0]
     where, time = np.zeros(dimension), 0.0
     # Not quite straight: what is, in theory, can be pushed together and does not know to which side to bend.
@@ -276,8 +281,10 @@ def test_any_thread_at_any_times_stays_whole(
     predictor.start(NeedlePose(0.0, where, east), where - along * east + 20.0 * along**2 * side)
     for stamp in stamps:
         time += 10.0**stamp
-        # Towards what is held, so that the thread is long enough.
-        where = where + random.uniform(0.0, 1.0) * 2e-4 * (random.normal(size=dimension) * (not held) - 0.5 * east)
+        # Towards what is fixed, so that the thread is long enough.
+        where = where + random.uniform(0.0, 1.0) * 2e-4 * (
+            random.normal(size=dimension) * (not fixed_nodes) - 0.5 * east
+        )
         heading = east + 0.3 * random.normal(size=dimension)
         prediction = predictor.step(NeedlePose(time, where, heading / np.linalg.norm(heading)))
         assert np.isfinite(prediction.vertices).all()

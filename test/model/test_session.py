@@ -15,7 +15,7 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import settings as model_settings
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction
-from magnetosuture_thread.model.session import EARLY, Outcome, ThreadSession
+from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
 from test.model.worlds import polygon, scene_with
@@ -40,13 +40,13 @@ def pose(stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Need
     return NeedlePose(stamp * 1e-9, np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]))
 
 
-def go(session: ThreadSession, stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Outcome:
+def go(session: ThreadSession, stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> PredictionResult:
     """Show a session a pose at a stamp [s]."""
     at = round(stamp * SECOND)
     return session.on_pose(at, pose(at, x, y, angle))
 
 
-def predicted(outcome: Outcome) -> Prediction:
+def predicted(outcome: PredictionResult) -> Prediction:
     """Return the prediction that there must be."""
     assert outcome.problem is None
     assert outcome.prediction is not None
@@ -85,11 +85,13 @@ def test_the_thread_may_be_seen_first():
 
 def test_only_so_many_poses_wait():
     session = ThreadSession(made(), None)
-    for k in range(3 * EARLY):
+    for k in range(3 * MAX_WAITING_POSES):
         assert go(session, 1.0 + 0.01 * k).waiting
     kept = list(session.on_measured_thread(SECOND, seen()))
-    assert [outcome.waiting for outcome in kept] == [True] * EARLY  # that of the frame is among them no more
-    assert kept[0].stamp == SECOND + (2 * EARLY) * 10_000_000
+    assert [outcome.waiting for outcome in kept] == [
+        True
+    ] * MAX_WAITING_POSES  # that of the frame is among them no more
+    assert kept[0].stamp == SECOND + (2 * MAX_WAITING_POSES) * 10_000_000
 
 
 def test_an_early_pose_that_fails_does_not_keep_the_next_from_being_followed():
@@ -207,7 +209,7 @@ def test_two_sessions_say_the_same_to_the_last_bit(values: dict[str, Any]):
 # --- where the thread is fixed -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("attachment", ["pinned", "glued"])
+@pytest.mark.parametrize("attachment", ["pinned", "clamped"])
 @pytest.mark.parametrize("offset", [[1e-3, 0.0], [-2e-3, 0.0], [0.0, 7e-4], [-1e-3, -5e-4], [0.01, 0.01]])
 def test_the_thread_hangs_where_it_is_fixed(offset: list[float], attachment: str):
     session = straight(attachment_offset=offset, attachment=attachment)
@@ -260,7 +262,7 @@ def test_a_seen_thread_must_begin_at_the_tail_wherever_it_is_fixed():
     [
         {"material": "silk_6_0"},
         {"viscosity": 0.3, "drag_anisotropy": 0.7},
-        {"attachment": "glued"},
+        {"attachment": "clamped"},
         {"attachment_offset": [1e-3, 1e-3]},
         {"margin_range": 1e-2},
         {"medium": "air", "gravity": [0.0, -0.01]},
@@ -294,7 +296,7 @@ def test_a_scene_changes_what_is_around_and_what_the_predictions_name():
 
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
 def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
-    session = straight(scene_with(), formulation=formulation, attachment="glued")
+    session = straight(scene_with(), formulation=formulation, attachment="clamped")
     go(session, 1.0, x=0.007, angle=0.2)
     session.change(session.settings, scene_with(diameter=0.02))
     outcomes = [go(session, 1.0 + k / 30.0, x=0.007, angle=0.2) for k in range(1, 20)]
@@ -495,7 +497,7 @@ session, before, stamp = ThreadSession(made(), None), kernels(), 0
 for values in (
     {}, {"segments": 60}, {"thread_length": 0.03}, {"material": "silk_6_0"}, {"medium": "air", "gravity": [0.0, -1.0]},
     {"shapes": (), "diameter": 0.036}, {"shapes": (disc,)}, {"shapes": (square,)}, {"shapes": (disc, square)},
-    {"attachment": "glued", "rest_curvature": 20.0}, {"held_nodes": [20]}, {"attachment_offset": [1e-3, 0.0]},
+    {"attachment": "clamped", "rest_curvature": 20.0}, {"held_nodes": [20]}, {"attachment_offset": [1e-3, 0.0]},
 ):
     scene = None
     if "shapes" in values:

@@ -14,7 +14,7 @@ from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model import predictor
-from magnetosuture_thread.model.choices import make_formulation
+from magnetosuture_thread.model.factory import make_formulation
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.model.predictor import NeedlePose
@@ -67,7 +67,7 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
     [
         {},
         {"formulation": "paper"},
-        {"solver": "osqp", "attachment": "glued"},
+        {"solver": "osqp", "attachment": "clamped"},
         {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
         {"held_nodes": [20], "rest_curvature": 30.0},
         {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},

@@ -295,7 +295,7 @@ def test_time_set_back_starts_anew_from_what_is_seen_then(graph):
 
 def test_a_step_that_did_not_converge_gives_no_margin(graph, monkeypatch):
     """One linearisation is not enough for a leap; the thread is shown, but nothing of it is proven."""
-    monkeypatch.setattr(rod, "MOST_SOLVES", 1)
+    monkeypatch.setattr(rod, "MAX_SOLVES", 1)
     graph.add(ThreadModelNode, initial_shape="straight")
     margins, predicted = graph.listen(topics.MARGINS), graph.listen(topics.PREDICTED_THREAD)
     graph.publish(topics.NEEDLE_POSE, pose(1.0))

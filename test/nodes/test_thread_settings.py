@@ -143,7 +143,7 @@ def as_messages(values: dict[str, Any]) -> list[Any]:
         {"material": "silk_6_0"},
         {"viscosity": 0.3},
         {"segments": 40},
-        {"attachment": "glued"},
+        {"attachment": "clamped"},
         {"attachment_offset": [1e-3, 0.0]},
         {"margin_range": 0.01},
     ],
@@ -185,9 +185,9 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph):
     bench.change(viscosity=0.7, drag_anisotropy=0.6, rest_curvature=20.0)
     bench.show(3)
     assert bench.told("elastic_modulus") == 1.5e9
-    graph.publish(topics.MATERIAL, ThreadMaterial(name="silk_6_0", attachment="glued", attachment_offset=[1e-4, 0.0]))
+    graph.publish(topics.MATERIAL, ThreadMaterial(name="silk_6_0", attachment="clamped", attachment_offset=[1e-4, 0.0]))
     graph.wait(lambda: bench.node.get_parameter("material").value == "silk_6_0", "silk")
-    bench.change(material="silk_6_0", elastic_modulus=0.0, attachment="glued", attachment_offset=[1e-4, 0.0])
+    bench.change(material="silk_6_0", elastic_modulus=0.0, attachment="clamped", attachment_offset=[1e-4, 0.0])
     bench.show(3)
     assert bench.predicted[-1].material == "silk_6_0"
     graph.publish(topics.MATERIAL, ThreadMaterial())  # says nothing
@@ -264,7 +264,7 @@ def test_a_refused_scene_is_reported_and_leaves_all_as_it_was(graph, scene, alte
         ({"rest_curvature": [math.nan]}, "out of range"),
         ({"attachment_offset": [1e-3]}, "multiple of 2"),
         ({"attachment_offset": [1e-3, 1.0]}, "from -0.01 to 0.01 m"),
-        ({"attachment": "knotted"}, "pinned, glued"),
+        ({"attachment": "knotted"}, "pinned, clamped"),
     ],
 )
 def test_a_refused_material_is_said_and_leaves_all_as_it_was(graph, fields, words):

@@ -138,7 +138,7 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"faults": ("sun 1 2",)}, "KIND START DURATION"),
         ({"faults": (3,)}, "a list of texts"),
         ({"obstacle_looks": ("gold",)}, "one of silicone, tissue, hernia"),
-        ({"thread_attachment": "sewn"}, "pinned, glued"),
+        ({"thread_attachment": "sewn"}, "pinned, clamped"),
         ({"viscosity": 0.0}, "from 0.0001"),
         ({"power_stage": "battery"}, "topic, roboclaw"),
         ({"power_stage": "roboclaw"}, "a path for two of the 4 coils"),

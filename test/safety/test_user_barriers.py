@@ -56,7 +56,7 @@ def needle(*barriers: Barrier, length: float = LENGTH, scene: Scene | None = Non
 
 
 def driven(safety: NeedleSafetyFilter, seed: int, periods: int = 300) -> tuple[float, set[str]]:
-    """Drive a needle by random commands, each held for the whole hold time; return the least h, and what was active."""
+    """PrescribedMotion a needle by random commands, each held for the whole hold time; return the least h and what was active."""
     random = np.random.default_rng(seed)
     tail, heading, least, active = np.array([-0.001, 0.0]), np.array([1.0, 0.0]), math.inf, set()
     (barrier,) = safety._barriers

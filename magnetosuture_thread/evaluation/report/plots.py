@@ -11,7 +11,8 @@ import numpy as np
 
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report.headlines import AGAINST
-from magnetosuture_thread.evaluation.series import Column, WorstFrame, thinned, with_gaps
+from magnetosuture_thread.evaluation.series import MARGIN, Column, TimeSeries, WorstFrame, thinned, with_gaps
+from magnetosuture_thread.model.margins import SOLID
 
 MAX_POINTS = 5000  # of a line
 MAX_BANDS = 400

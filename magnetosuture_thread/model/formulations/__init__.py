@@ -2,6 +2,14 @@
 
 from magnetosuture_thread.model.formulations.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.model.formulations.rod import RodFormulation
-from magnetosuture_thread.model.formulations.step import Drive, Formulation, StepSolution, ThreadState
+from magnetosuture_thread.model.formulations.step import Formulation, PrescribedMotion, StepResult, ThreadState
 
-__all__ = ["Drive", "Formulation", "PaperFormulation", "PaperOptions", "RodFormulation", "StepSolution", "ThreadState"]
+__all__ = [
+    "Formulation",
+    "PaperFormulation",
+    "PaperOptions",
+    "PrescribedMotion",
+    "RodFormulation",
+    "StepResult",
+    "ThreadState",
+]

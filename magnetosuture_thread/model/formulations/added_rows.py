@@ -13,8 +13,8 @@ from magnetosuture_thread.barrier import Barrier, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Vector, WideRows
 
-DISTANCE_REACHED = 1e-7  # m; a row that is met but for this much of its nodes' way holds
-YIELDING = 1e-7  # compliance of a hard row that has to be met from outside; something else may hold against it
+DISTANCE_TOLERANCE = 1e-7  # m; a row that is met but for this much of its nodes' way holds
+UNMET_COMPLIANCE = 1e-7  # compliance of a hard row that has to be met from outside; something else may hold against it
 
 
 @dataclass(frozen=True)
@@ -147,6 +147,6 @@ class AddedBarriers:
         moved = np.einsum("rkd,rkd->r", gradient, (start - about)[nodes])
         lower = (missing / self._unit - moved) / interval
         soft = 1.0 / barrier.slack_weight
-        compliance = np.where(lower > 0.0, max(soft, YIELDING), soft)
-        off = float(missing.max(initial=0.0)) / DISTANCE_REACHED if math.isinf(barrier.slack_weight) else 0.0
+        compliance = np.where(lower > 0.0, max(soft, UNMET_COMPLIANCE), soft)
+        off = float(missing.max(initial=0.0)) / DISTANCE_TOLERANCE if math.isinf(barrier.slack_weight) else 0.0
         return LinearRows(nodes.astype(np.int64), gradient, lower, compliance, off)

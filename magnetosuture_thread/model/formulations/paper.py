@@ -46,15 +46,15 @@ from magnetosuture_thread.model.barriers import (
 )
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
 from magnetosuture_thread.model.formulations.step import (
-    DEPTH_REACHED,
+    DEPTH_TOLERANCE,
     ROW_REACH,
-    Drive,
-    Memory,
-    StepSolution,
+    PrescribedMotion,
+    StepBuffers,
+    StepResult,
     ThreadState,
     contact_rows,
-    driven,
-    remember_push,
+    keep_contact_multipliers,
+    move_prescribed,
     warmed,
 )
 from magnetosuture_thread.model.mechanics import rest_distances
@@ -119,21 +119,21 @@ class PaperFormulation:
         reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
         self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
         self._room_radius = (wall_radius - 0.5 * thread.diameter) / thread.segment_length
-        self._rest = rest_distances(thread.rest_turns)
+        self._rest = rest_distances(thread.rest_angles)
         self._rows = 3 * thread.segments - 2
-        self._memory = Memory.of(nodes, dimension, self._rows, 2 * nodes)
+        self._buffers = StepBuffers.of(nodes, dimension, self._rows, 2 * nodes)
 
-    def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
-        """Move the driven nodes and let the thread follow; see `Formulation`."""
+    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
+        """Move the prescribed nodes and let the thread follow; see `Formulation`."""
         unit, options = self._thread.segment_length, self._options
         before, velocities = state.positions / unit, state.velocities / unit
-        moved, known = driven(before, *drive.arrays(), unit)
+        moved, known = move_prescribed(before, *drive.arrays(), unit)
         start, gain = moved if options.lead_ahead else before, min(options.gain, 1.0 / interval)
         if state.interval == 0.0:
-            self._memory.forget()
+            self._buffers.forget()
         while True:
             contacts, before_depth = _assemble(
-                self._memory,
+                self._buffers,
                 self._near.data,
                 start,
                 velocities,
@@ -149,9 +149,9 @@ class PaperFormulation:
             )
             if contacts >= 0:
                 break
-            self._memory = self._memory.with_room()
+            self._buffers = self._buffers.with_room()
         count = self._rows + contacts
-        program, wide, guess = self._memory.program(count, known), None, self._memory.multipliers[:count]
+        program, wide, guess = self._buffers.program(count, known), None, self._buffers.multipliers[:count]
         if self.added:
             self.added.begin(state.positions, drive.time, interval)
             added = self.added.linearised(start, moved, known, interval)
@@ -159,25 +159,25 @@ class PaperFormulation:
             guess = np.concatenate([guess, np.zeros(len(added.lower))])
         solution = self._solver.solve(program, velocities, guess, wide)
         if not solution.residuals.largest <= self._tolerance:
-            self._memory.forget()
+            self._buffers.forget()
             raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
-        self._memory.multipliers[:count] = solution.multipliers[:count]
-        remember_push(self._memory.node, solution.multipliers[self._rows : count], self._memory.push)
+        self._buffers.multipliers[:count] = solution.multipliers[:count]
+        keep_contact_multipliers(self._buffers.node, solution.multipliers[self._rows : count], self._buffers.push)
         end = moved + interval * solution.velocities
         moved_inside(end, known, self._room_radius)
         after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
         # The hard barriers, h(x + dt u) >= (1 - alpha dt) h(x), where the obstacles themselves are.
         depth = self._depth(after.positions, known)
-        allowed = (1.0 - gain * interval) * before_depth + DEPTH_REACHED
+        allowed = (1.0 - gain * interval) * before_depth + DEPTH_TOLERANCE
         converged, status = depth <= allowed, solution.status
         if not converged:
             status = f"not converged, a node is {depth:.1e} m deep and {allowed:.1e} m are allowed; {status}"
-        return StepSolution(after, solution.solver, status, solution.residuals, 1, converged)
+        return StepResult(after, solution.solver, status, solution.residuals, 1, converged)
 
     def warm_up(self) -> None:
         """Load what follows where the first solver fails; see `Formulation`."""
-        warmed(self._solver, self._memory, np.zeros(self._thread.segments + 1, dtype=np.bool_), self._rows)
-        self._memory.forget()
+        warmed(self._solver, self._buffers, np.zeros(self._thread.segments + 1, dtype=np.bool_), self._rows)
+        self._buffers.forget()
 
     def _depth(self, positions: Points, known: NDArray[np.bool_]) -> float:
         """Return the greatest depth of a free node in an obstacle or the wall [m]."""
@@ -206,7 +206,7 @@ class PaperFormulation:
 
 @compiled
 def _assemble(
-    memory: Memory,
+    buffers: StepBuffers,
     surroundings: SurroundingsData,
     start: Points,
     velocities: Points,
@@ -223,29 +223,29 @@ def _assemble(
     """Write the program; return contacts, -1 if there is no room for them, and the greatest depth of a node [m]."""
     nodes, dimension = start.shape
     segments = nodes - 1
-    memory.couplings[:] = 0.0
+    buffers.couplings[:] = 0.0
     for i in range(nodes):
         for a in range(dimension):
             for b in range(dimension):
-                memory.blocks[i, a, b] = 1.0 if a == b else 0.0
-            memory.linear[i, a] = -damping * velocities[i, a]
+                buffers.blocks[i, a, b] = 1.0 if a == b else 0.0
+            buffers.linear[i, a] = -damping * velocities[i, a]
     enhanced, stiff = segments, 2 * segments - 1
     rows = 3 * segments - 2
     one = np.ones(segments)
-    distance_barrier(start, 1, one, memory.value, memory.gradient)
-    distance_barrier(start, 2, 2.0 * one, memory.value[enhanced:], memory.gradient[enhanced:])
-    stiffness_function(start, rest, memory.value[stiff:], memory.gradient[stiff:])
+    distance_barrier(start, 1, one, buffers.value, buffers.gradient)
+    distance_barrier(start, 2, 2.0 * one, buffers.value[enhanced:], buffers.gradient[enhanced:])
+    stiffness_function(start, rest, buffers.value[stiff:], buffers.gradient[stiff:])
     for r in range(rows):
         node = r if r < enhanced else (r - enhanced if r < stiff else r - stiff)
-        memory.first[r] = min(node, nodes - 3)
-        memory.lower[r] = -(gain if r < stiff else stiffness_gain) * memory.value[r]
-        memory.upper[r] = np.inf
-        memory.compliance[r] = connectivity_compliance if r < stiff else stiffness_compliance
-    contacts, depth = contact_rows(memory, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
+        buffers.first[r] = min(node, nodes - 3)
+        buffers.lower[r] = -(gain if r < stiff else stiffness_gain) * buffers.value[r]
+        buffers.upper[r] = np.inf
+        buffers.compliance[r] = connectivity_compliance if r < stiff else stiffness_compliance
+    contacts, depth = contact_rows(buffers, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
     for r in range(rows, rows + contacts):
-        clearance = memory.value[r]
-        if clearance > 0.0 and memory.obstacle[r - rows] != WALL:
+        clearance = buffers.value[r]
+        if clearance > 0.0 and buffers.obstacle[r - rows] != WALL:
             # grad h' u >= -alpha h, divided by the slope: the row's own size does not matter, it is hard.
             value, slope = squared_barrier(clearance + radius / unit, radius / unit)
-            memory.lower[r] = -gain * value / slope
+            buffers.lower[r] = -gain * value / slope
     return contacts, depth

@@ -4,7 +4,7 @@
     subject to        |x_i - x_{i-1}| = the chord of a segment  (connectivity and compression together)
                       h_obs >= 0,  h_wall >= 0                  (obstacles and the wall of the dish, hard)
 
-in units of the segment length D and of the drag (or mass / dt + drag) of one segment. The driven nodes,
+in units of the segment length D and of the drag (or mass / dt + drag) of one segment. The prescribed nodes,
 the needle's tail among them, have moved before the step and are no unknowns.
 
 In a viscous liquid Z_i is the drag, and the rate of change at the end of the step is the second-order
@@ -16,7 +16,7 @@ the last, has a = 1, v = 0. In air there is besides the drag, with a = 1 and v =
 
 The barriers are linearised about the end point that the last velocities predict, and again at the one
 that each solve predicts, as the discrete-time condition h(x + dt u) >= (1 - alpha dt) h(x) with
-alpha = 1 / dt, until segments are right to a thousandth and nodes to 1e-7 m, or for `MOST_SOLVES` times.
+alpha = 1 / dt, until segments are right to a thousandth and nodes to 1e-7 m, or for `MAX_SOLVES` times.
 One solve is nearly always enough: the prediction is of second order already, and with the constraints'
 curvature in P (`rod_program`) each solve is a Newton step.
 
@@ -38,14 +38,28 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
-from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, Rod, go_on, take
-from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState, warmed
+from magnetosuture_thread.model.formulations.rod_step import (
+    ENDED,
+    NO_ROOM,
+    MotionBuffers,
+    RodProperties,
+    accept_step,
+    solve_step,
+)
+from magnetosuture_thread.model.formulations.step import (
+    ROW_REACH,
+    PrescribedMotion,
+    StepBuffers,
+    StepResult,
+    ThreadState,
+    warmed,
+)
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.solvers.banded import STATUS
 from magnetosuture_thread.model.thread import Attachment, Thread
 
-MOST_SOLVES = 8  # in a step
+MAX_SOLVES = 8  # in a step
 
 
 class RodFormulation:
@@ -77,13 +91,13 @@ class RodFormulation:
         self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
         reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
         self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
-        medium, glued = thread.medium, thread.attachment is Attachment.GLUED
+        medium, clamped = thread.medium, thread.attachment is Attachment.CLAMPED
         if len(medium.gravity) not in (0, dimension):
             raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
         gravity = np.zeros(dimension)
         gravity[: len(medium.gravity)] = medium.gravity
-        self._rod = Rod(
-            glued,
+        self._rod = RodProperties(
+            clamped,
             thread.segment_length,
             0.5 * thread.diameter,
             thread.bending_stiffness,
@@ -92,22 +106,22 @@ class RodFormulation:
             medium.mass_per_length,
             medium.bending_damping,
             gravity,
-            np.ascontiguousarray(thread.rest_turns),
+            np.ascontiguousarray(thread.rest_angles),
             mechanics.end_corrected_weights(thread.segments),
-            mechanics.bending_bands(thread.segments, glued),
+            mechanics.bending_bands(thread.segments, clamped),
         )
         self.added = AddedBarriers(barriers, thread.segment_length)
         self._axes, (self._banded, self._at_once) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
         if self.added:  # compiled code knows nothing of their rows, and leaves every solve to `step`
             self._banded = BandedSolver(iterations=0)
-        self._motion = Motion.of(nodes, dimension)
-        self._give(Memory.of(nodes, dimension, thread.segments, 2 * nodes))
+        self._motion = MotionBuffers.of(nodes, dimension)
+        self._give(StepBuffers.of(nodes, dimension, thread.segments, 2 * nodes))
 
-    def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
-        """Move the driven nodes and let the thread follow; see `Formulation`."""
+    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
+        """Move the prescribed nodes and let the thread follow; see `Formulation`."""
         unit, segments = self._thread.segment_length, self._thread.segments
         if state.interval == 0.0:
-            self._memory.forget()
+            self._buffers.forget()
         # Compiled code would be compiled anew for another layout, in the middle of a run.
         positions = np.ascontiguousarray(state.positions, np.float64)
         velocities = np.ascontiguousarray(state.velocities, np.float64)
@@ -117,12 +131,12 @@ class RodFormulation:
         if self.added:
             self.added.begin(positions, drive.time, interval)
         while True:
-            code, contacts, solves, off, word, residuals = go_on(
+            code, contacts, solves, off, word, residuals = solve_step(
                 self._axes,
                 self._rod,
-                self._memory,
+                self._buffers,
                 self._near.data,
-                self._workspace,
+                self._solver_buffers,
                 motion,
                 positions,
                 velocities,
@@ -132,7 +146,7 @@ class RodFormulation:
                 interval,
                 state.interval,
                 self._at_once,
-                MOST_SOLVES,
+                MAX_SOLVES,
                 solves,
                 added.off if added is not None else 0.0,
             )
@@ -140,19 +154,19 @@ class RodFormulation:
             if code == ENDED:
                 break
             if code == NO_ROOM:
-                self._give(self._memory.with_room())
+                self._give(self._buffers.with_room())
                 continue
             count = segments + contacts
-            program, wide, guess = self._memory.program(count, motion.known), None, self._memory.multipliers[:count]
+            program, wide, guess = self._buffers.program(count, motion.known), None, self._buffers.multipliers[:count]
             if self.added:
                 added = added or self.added.linearised(motion.about, motion.start, motion.known, interval)
                 program, wide = added.joined(program)
                 guess = np.concatenate([guess, np.zeros(len(added.lower))])
             solution = self._solver.solve(program, motion.velocities, guess, wide)
             if not solution.residuals.largest <= self._tolerance:
-                self._memory.forget()
+                self._buffers.forget()
                 raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
-            take(self._memory, motion, solution.velocities, solution.multipliers[:count], interval)
+            accept_step(self._buffers, motion, solution.velocities, solution.multipliers[:count], interval)
             if self.added:
                 added = self.added.linearised(motion.about, motion.start, motion.known, interval)
             worst, solves = worst.or_worse(solution.residuals), solves + 1
@@ -161,25 +175,25 @@ class RodFormulation:
         end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
-        return StepSolution(end, solver, status, worst, solves, converged=off <= 1.0)
+        return StepResult(end, solver, status, worst, solves, converged=off <= 1.0)
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
         rows = self._thread.segments
-        solution = warmed(self._solver, self._memory, self._motion.known, rows)
-        take(self._memory, self._motion, solution.velocities, solution.multipliers, 1.0)
-        self._memory.forget()
+        solution = warmed(self._solver, self._buffers, self._motion.known, rows)
+        accept_step(self._buffers, self._motion, solution.velocities, solution.multipliers, 1.0)
+        self._buffers.forget()
 
-    def _give(self, memory: Memory) -> None:
-        """Take memory for the step, and as much for the structured solver."""
-        self._memory = memory
-        nodes, dimension = memory.linear.shape
-        self._workspace = self._banded.workspace(nodes, dimension, len(memory.first))
+    def _give(self, buffers: StepBuffers) -> None:
+        """Take buffers for the step, and as much for the structured solver."""
+        self._buffers = buffers
+        nodes, dimension = buffers.linear.shape
+        self._solver_buffers = self._banded.buffers(nodes, dimension, len(buffers.first))
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the chords of the segments' arcs; see `Formulation`."""
         chords = np.empty(self._thread.segments)
-        mechanics.chord_lengths(positions / self._thread.segment_length, heading, self._rod.glued, chords)
+        mechanics.chord_lengths(positions / self._thread.segment_length, heading, self._rod.clamped, chords)
         return chords * self._thread.segment_length
 
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:

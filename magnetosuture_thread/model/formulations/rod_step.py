@@ -12,19 +12,25 @@ from magnetosuture_thread.geometry.obstacles import SurroundingsData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
-from magnetosuture_thread.model.formulations.step import DEPTH_REACHED, Memory, contact_rows, driven, remember_push
+from magnetosuture_thread.model.formulations.step import (
+    DEPTH_TOLERANCE,
+    StepBuffers,
+    contact_rows,
+    keep_contact_multipliers,
+    move_prescribed,
+)
 from magnetosuture_thread.model.program import ChainProgram, Vector
 from magnetosuture_thread.model.solvers import banded
 
-STRETCH_REACHED = 1e-3  # of the segments; beyond it the barriers are linearised once more
+STRAIN_TOLERANCE = 1e-3  # of the segments; beyond it the barriers are linearised once more
 COMPLIANCE = 1e-7  # of a segment
-LONGEST_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
+MAX_STEP_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
 
 
-class Rod(NamedTuple):
+class RodProperties(NamedTuple):
     """What stays the same from step to step, for compiled code."""
 
-    glued: bool
+    clamped: bool
     unit: float
     radius: float
     bending_stiffness: float
@@ -33,7 +39,7 @@ class Rod(NamedTuple):
     mass_per_length: float
     bending_damping: float
     gravity: Vector
-    rest_turns: Vector
+    rest_angles: Vector
     weights: Vector
     bands: NDArray[np.float64]
 
@@ -41,8 +47,8 @@ class Rod(NamedTuple):
 @compiled
 def assemble(
     solves: int,
-    rod: Rod,
-    memory: Memory,
+    rod: RodProperties,
+    buffers: StepBuffers,
     surroundings: SurroundingsData,
     about: Points,
     start: Points,
@@ -60,19 +66,19 @@ def assemble(
     is: the stretch, the depth, or what barriers from elsewhere are, over what is allowed; 1 or less if it is exact.
     """
     segments = len(about) - 1
-    mechanics.chord_lengths(about, heading, rod.glued, memory.chords)
-    stretch = _segment_rows(memory, about, start, known, interval)
-    contacts, depth = contact_rows(memory, segments, surroundings, about, start, known, interval, rod.unit, rod.radius)
-    off = max(stretch / STRETCH_REACHED, depth / DEPTH_REACHED, elsewhere)
+    mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
+    stretch = _segment_rows(buffers, about, start, known, interval)
+    contacts, depth = contact_rows(buffers, segments, surroundings, about, start, known, interval, rod.unit, rod.radius)
+    off = max(stretch / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
     if contacts >= 0 and (solves == 0 or off > 1.0):
-        _objective(rod, memory, about, start, before, last, heading, interval, last_interval)
+        _objective(rod, buffers, about, start, before, last, heading, interval, last_interval)
     return contacts, off if solves > 0 else np.inf
 
 
 @compiled
 def _objective(
-    rod: Rod,
-    memory: Memory,
+    rod: RodProperties,
+    buffers: StepBuffers,
     about: Points,
     start: Points,
     before: Points,
@@ -85,19 +91,19 @@ def _objective(
 
         P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z v
 
-    and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the driven nodes, which have
+    and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the prescribed nodes, which have
     moved already. In air a = 1, and of Z v only the inertia's part is left.
     """
     nodes, dimension = start.shape
-    blocks, couplings, linear = memory.blocks, memory.couplings, memory.linear
+    blocks, couplings, linear = buffers.blocks, buffers.couplings, buffers.linear
     inertia = rod.mass_per_length / interval
     scale = inertia + rod.drag_across
     rate = rod.bending_stiffness / (scale * rod.unit**4)
     inertia = inertia / scale
     mechanics.metric(about, rod.weights, inertia, rod.drag_across / scale, rod.drag_along / scale, blocks)
-    mechanics.bending_gradient(start, heading, rod.glued, rod.rest_turns, memory.work, linear)
+    mechanics.bending_gradient(start, heading, rod.clamped, rod.rest_angles, buffers.work, linear)
     ratio = interval / last_interval if last_interval > 0.0 else 0.0
-    if inertia > 0.0 or ratio > LONGEST_RATIO:
+    if inertia > 0.0 or ratio > MAX_STEP_RATIO:
         ratio = 0.0
     leading, trailing = (1.0 + 2.0 * ratio) / (1.0 + ratio), ratio / (1.0 + ratio)
     stiffness = rate * (interval + rod.bending_damping)
@@ -123,13 +129,13 @@ def _objective(
                     for a in range(dimension):
                         linear[i, a] += band * (start[i + apart, a] - before[i + apart, a])
     mechanics.tension_stiffness(
-        start, heading, rod.glued, memory.multipliers, -0.5 * rate, interval, (blocks, couplings, linear)
+        start, heading, rod.clamped, buffers.multipliers, -0.5 * rate, interval, (blocks, couplings, linear)
     )
-    _taut(memory, about, start, interval)
+    _taut(buffers, about, start, interval)
 
 
 @compiled
-def _taut(memory: Memory, about: Points, start: Points, interval: float) -> None:
+def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -> None:
     """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
 
         1/2 dt sum_i T_i |w_i - w_{i-1}|^2,    w = u - (y - x) / dt
@@ -139,53 +145,55 @@ def _taut(memory: Memory, about: Points, start: Points, interval: float) -> None
     """
     nodes, dimension = about.shape
     for i in range(nodes - 1):
-        tension = max(memory.multipliers[i], 0.0)
+        tension = max(buffers.multipliers[i], 0.0)
         weight = interval * tension
         for a in range(dimension):
             moved = about[i + 1, a] - start[i + 1, a] - about[i, a] + start[i, a]
-            memory.linear[i, a] += tension * moved
-            memory.linear[i + 1, a] -= tension * moved
-            memory.blocks[i, a, a] += weight
-            memory.blocks[i + 1, a, a] += weight
-        memory.couplings[0, i] -= weight
+            buffers.linear[i, a] += tension * moved
+            buffers.linear[i + 1, a] -= tension * moved
+            buffers.blocks[i, a, a] += weight
+            buffers.blocks[i + 1, a, a] += weight
+        buffers.couplings[0, i] -= weight
 
 
 @compiled
-def _segment_rows(memory: Memory, about: Points, start: Points, known: NDArray[np.bool_], interval: float) -> float:
+def _segment_rows(
+    buffers: StepBuffers, about: Points, start: Points, known: NDArray[np.bool_], interval: float
+) -> float:
     """Write the rows  grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt; return the largest |h(y)|."""
     nodes, dimension = about.shape
-    distance_barrier(about, 1, memory.chords, memory.value, memory.gradient)
+    distance_barrier(about, 1, buffers.chords, buffers.value, buffers.gradient)
     stretch = 0.0
     for i in range(nodes - 1):
         begin = min(i, nodes - 3)
-        memory.first[i] = begin
-        bound = -memory.value[i]
+        buffers.first[i] = begin
+        bound = -buffers.value[i]
         for k in range(3):
             for a in range(dimension):
-                bound -= memory.gradient[i, k, a] * (start[begin + k, a] - about[begin + k, a])
-        memory.lower[i] = memory.upper[i] = bound / interval
-        memory.compliance[i] = COMPLIANCE
+                bound -= buffers.gradient[i, k, a] * (start[begin + k, a] - about[begin + k, a])
+        buffers.lower[i] = buffers.upper[i] = bound / interval
+        buffers.compliance[i] = COMPLIANCE
         if known[i] and known[i + 1]:
             # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
-            memory.lower[i], memory.upper[i], memory.multipliers[i] = -np.inf, np.inf, 0.0
+            buffers.lower[i], buffers.upper[i], buffers.multipliers[i] = -np.inf, np.inf, 0.0
         else:
-            stretch = max(stretch, abs(memory.value[i]))
+            stretch = max(stretch, abs(buffers.value[i]))
     return stretch
 
 
-ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `go_on` got
+ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `solve_step` got
 
 
-class Motion(NamedTuple):
-    """A step under way, in units of the segment length; kept from step to step, so that none pays for memory.
+class MotionBuffers(NamedTuple):
+    """A step under way, in units of the segment length; kept from step to step, so that none pays for buffers.
 
     Attributes:
         before: where the nodes are, shape (n + 1, d).
-        start: the same with the driven nodes moved.
+        start: the same with the prescribed nodes moved.
         last: velocities over the last step.
         velocities: those of this step, better with each solve.
         about: where they lead.
-        known: the driven nodes, shape (n + 1,).
+        known: the prescribed nodes, shape (n + 1,).
     """
 
     before: Points
@@ -196,15 +204,15 @@ class Motion(NamedTuple):
     known: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, nodes: int, dimension: int) -> Motion:
-        """Return memory for every step of a thread."""
+    def of(cls, nodes: int, dimension: int) -> MotionBuffers:
+        """Return buffers for every step of a thread."""
         before, start, last, velocities, about = np.zeros((5, nodes, dimension))
         return cls(before, start, last, velocities, about, np.zeros(nodes, dtype=np.bool_))
 
 
 @compiled
-def set_out(
-    motion: Motion,
+def init_step(
+    motion: MotionBuffers,
     positions: Points,
     velocities: Points,
     nodes: NDArray[np.int64],
@@ -222,7 +230,7 @@ def set_out(
         motion: written.
         positions: of all nodes, shape (n + 1, d) [m].
         velocities: over the last step [m/s].
-        nodes: that are driven, shape (k,).
+        nodes: of prescribed motion, shape (k,).
         ends: where these are at the end of the step, shape (k, d) [m].
         unit: D [m].
         interval: dt [s].
@@ -230,9 +238,9 @@ def set_out(
     """
     motion.before[:], motion.last[:] = positions / unit, velocities / unit
     motion.velocities[:] = motion.last
-    motion.start[:], motion.known[:] = driven(motion.before, nodes, ends, unit)
+    motion.start[:], motion.known[:] = move_prescribed(motion.before, nodes, ends, unit)
     motion.about[:] = motion.start
-    if not (last_interval > 0.0 and interval <= LONGEST_RATIO * last_interval):
+    if not (last_interval > 0.0 and interval <= MAX_STEP_RATIO * last_interval):
         return
     for i in range(len(positions)):
         for a in range(positions.shape[1]):
@@ -244,13 +252,13 @@ def set_out(
 
 
 @compiled
-def go_on(
+def solve_step(
     axes: tuple[int, ...],
-    rod: Rod,
-    memory: Memory,
+    rod: RodProperties,
+    buffers: StepBuffers,
     surroundings: SurroundingsData,
-    workspace: banded.Workspace,
-    motion: Motion,
+    solver_buffers: banded.SolverBuffers,
+    motion: MotionBuffers,
     positions: Points,
     velocities: Points,
     nodes: NDArray[np.int64],
@@ -259,7 +267,7 @@ def go_on(
     interval: float,
     last_interval: float,
     tolerance: float,
-    most_solves: int,
+    max_solves: int,
     solves: int,
     elsewhere: float,
 ) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
@@ -268,35 +276,35 @@ def go_on(
     Args:
         axes: 0 to d - 1.
         rod: the thread.
-        memory: has the program in the end, and its multipliers.
+        buffers: has the program in the end, and its multipliers.
         surroundings: obstacles and wall [m].
-        workspace: of the structured solver; one without iterations leaves every solve to the caller.
+        solver_buffers: of the structured solver; one without iterations leaves every solve to the caller.
         motion: where the step has got to; written.
-        positions: see `set_out`, as are the following.
+        positions: see `init_step`, as are the following.
         velocities: over the last step [m/s].
-        nodes: that are driven, shape (k,).
+        nodes: of prescribed motion, shape (k,).
         ends: where these are at the end of the step, shape (k, d) [m].
         heading: unit vector along the needle at the end of the step, shape (d,).
         interval: dt [s].
         last_interval: of the last step, 0 if there was none [s].
         tolerance: the largest residual with which a solution is accepted.
-        most_solves: of a step.
+        max_solves: of a step.
         solves: how many this step has had; with none it sets out.
         elsewhere: how far off the rows are that this code does not know, see `assemble`.
 
     Returns:
-        `ENDED`, `NO_ROOM` for all contacts in the memory, or `UNSOLVED`, and then the program is there for
+        `ENDED`, `NO_ROOM` for all contacts in the buffers, or `UNSOLVED`, and then the program is there for
         another solver; the number of contacts; solves; how far off the barriers are, see `assemble`; the
         first status that is not 0, see `banded.STATUS`; the largest residual of each kind.
     """
     if solves == 0:
-        set_out(motion, positions, velocities, nodes, ends, rod.unit, interval, last_interval)
+        init_step(motion, positions, velocities, nodes, ends, rod.unit, interval, last_interval)
     worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
     while True:
         contacts, off = assemble(
             solves,
             rod,
-            memory,
+            buffers,
             surroundings,
             motion.about,
             motion.start,
@@ -310,38 +318,40 @@ def go_on(
         )
         if contacts < 0:
             return NO_ROOM, contacts, solves, off, status, worst
-        if off <= 1.0 or solves == most_solves:
+        if off <= 1.0 or solves == max_solves:
             if off > 1.0:  # whatever else holds, nothing passes the wall
                 moved_inside(motion.about, motion.known, (surroundings.wall_radius - rod.radius) / rod.unit)
             return ENDED, contacts, solves, off, status, worst
-        if workspace.iterations == 0:
+        if solver_buffers.iterations == 0:
             return UNSOLVED, contacts, solves, off, status, worst
         rows = segments + contacts
         program = ChainProgram(
-            memory.blocks,
-            memory.couplings,
-            memory.linear,
+            buffers.blocks,
+            buffers.couplings,
+            buffers.linear,
             motion.known,
-            memory.first[:rows],
-            memory.gradient[:rows],
-            memory.lower[:rows],
-            memory.upper[:rows],
-            memory.compliance[:rows],
+            buffers.first[:rows],
+            buffers.gradient[:rows],
+            buffers.lower[:rows],
+            buffers.upper[:rows],
+            buffers.compliance[:rows],
         )
-        u, multipliers = motion.velocities.copy(), memory.multipliers[:rows].copy()
-        word, _, found = banded.solve_and_judge(axes, program, u, multipliers, workspace)
+        u, multipliers = motion.velocities.copy(), buffers.multipliers[:rows].copy()
+        word, _, found = banded.solve_and_judge(axes, program, u, multipliers, solver_buffers)
         if not max(found) <= tolerance:
             return UNSOLVED, contacts, solves, off, status, worst
-        take(memory, motion, u, multipliers, interval)
+        accept_step(buffers, motion, u, multipliers, interval)
         worst = (max(worst[0], found[0]), max(worst[1], found[1]), max(worst[2], found[2]))
         status, solves = status if status != 0 else word, solves + 1
 
 
 @compiled
-def take(memory: Memory, motion: Motion, velocities: Points, multipliers: Vector, interval: float) -> None:
+def accept_step(
+    buffers: StepBuffers, motion: MotionBuffers, velocities: Points, multipliers: Vector, interval: float
+) -> None:
     """Take a solution: its velocities, where they lead, and its multipliers as a guess for the next one."""
     segments = len(velocities) - 1
-    memory.multipliers[: len(multipliers)] = multipliers
-    remember_push(memory.node, multipliers[segments:], memory.push)
+    buffers.multipliers[: len(multipliers)] = multipliers
+    keep_contact_multipliers(buffers.node, multipliers[segments:], buffers.push)
     motion.velocities[:] = velocities
     motion.about[:] = motion.start + interval * velocities  # known nodes have moved, and have no velocity

@@ -16,8 +16,8 @@ from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
 
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
-DEPTH_REACHED = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
-PUSHING_OUT = 1e-7  # compliance of a contact that has to push a node out
+DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
+CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class ThreadState:
 
 
 @dataclass(frozen=True)
-class Drive:
+class PrescribedMotion:
     """The nodes whose motion is known: the lead, what tissue holds, what another instrument grasps.
 
     Attributes:
@@ -63,7 +63,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class StepSolution:
+class StepResult:
     """One step's end point and how it was found.
 
     Attributes:
@@ -97,8 +97,8 @@ class Formulation(Protocol):
     dimension: int
     added: AddedBarriers
 
-    def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
-        """Move the driven nodes and let the thread follow for one interval [s].
+    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
+        """Move the prescribed nodes and let the thread follow for one interval [s].
 
         Raises:
             SolverError: a solution's residual is above the tolerance.
@@ -118,8 +118,8 @@ class Formulation(Protocol):
         ...
 
 
-class Memory(NamedTuple):
-    """Memory for a step's program and its contacts, kept from step to step so that no step pays for it.
+class StepBuffers(NamedTuple):
+    """StepBuffers for a step's program and its contacts, kept from step to step so that no step pays for it.
 
     Attributes:
         blocks: see `ChainProgram`, as are the following; n + 1 nodes.
@@ -162,8 +162,8 @@ class Memory(NamedTuple):
     push: Vector
 
     @classmethod
-    def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> Memory:
-        """Return memory for a number of rows, and of contacts besides."""
+    def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> StepBuffers:
+        """Return buffers for a number of rows, and of contacts besides."""
         total = rows + contacts
         return cls(
             np.zeros((nodes, dimension, dimension)),
@@ -186,11 +186,11 @@ class Memory(NamedTuple):
             np.zeros(nodes),
         )
 
-    def with_room(self) -> Memory:
-        """Return memory for twice as many contacts, with the same chords and multipliers."""
+    def with_room(self) -> StepBuffers:
+        """Return buffers for twice as many contacts, with the same chords and multipliers."""
         nodes, dimension = self.linear.shape
         rows = len(self.first) - len(self.node)
-        larger = Memory.of(nodes, dimension, rows, 2 * len(self.node))
+        larger = StepBuffers.of(nodes, dimension, rows, 2 * len(self.node))
         larger.multipliers[:rows] = self.multipliers[:rows]
         larger.chords[:] = self.chords
         larger.push[:] = self.push
@@ -216,17 +216,17 @@ class Memory(NamedTuple):
         )
 
 
-def warmed(solver: Solver, memory: Memory, known: NDArray[np.bool_], rows: int) -> Solution:
-    """Return a solution of the memory's last program as a general solver gets it, its residuals worked out here."""
-    program = memory.program(rows, known)
-    solution = solver.solve(program, np.zeros_like(memory.linear), np.zeros(rows))
+def warmed(solver: Solver, buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> Solution:
+    """Return a solution of the buffers's last program as a general solver gets it, its residuals worked out here."""
+    program = buffers.program(rows, known)
+    solution = solver.solve(program, np.zeros_like(buffers.linear), np.zeros(rows))
     residuals_of(program, solution.velocities, solution.multipliers)
     return solution
 
 
 @compiled
 def contact_rows(
-    memory: Memory,
+    buffers: StepBuffers,
     row: int,
     surroundings: SurroundingsData,
     about: Points,
@@ -238,10 +238,10 @@ def contact_rows(
 ) -> tuple[int, float]:
     """Write the rows  n' u >= (-h(y) - n' (x - y)) / dt  of the contacts near y, with h = sd(y) - rho.
 
-    In the end their nodes and obstacles, `WALL` among them, are the first of the memory's.
+    In the end their nodes and obstacles, `WALL` among them, are the first of the buffers's.
 
     Args:
-        memory: written, from a row on.
+        buffers: written, from a row on.
         row: the first of these rows.
         surroundings: obstacles and wall [m].
         about: y, shape (n + 1, d) [D].
@@ -256,36 +256,36 @@ def contact_rows(
     """
     nodes, dimension = about.shape
     found = find_near(
-        about * unit, surroundings, memory.node, memory.obstacle, memory.distance, memory.outward, memory.nearest
+        about * unit, surroundings, buffers.node, buffers.obstacle, buffers.distance, buffers.outward, buffers.nearest
     )
-    if found < 0 or row + found > len(memory.first):
+    if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
     kept, depth = 0, 0.0
     for c in range(found):
-        i = memory.node[c]
+        i = buffers.node[c]
         if known[i]:
             continue
-        clearance = memory.distance[c] - radius
+        clearance = buffers.distance[c] - radius
         depth = max(depth, -clearance)
         bound = -clearance / unit
         begin, here = min(i, nodes - 3), row + kept
         for a in range(dimension):
-            outward = memory.outward[c, a]
+            outward = buffers.outward[c, a]
             for k in range(SPAN):
-                memory.gradient[here, k, a] = outward if begin + k == i else 0.0
+                buffers.gradient[here, k, a] = outward if begin + k == i else 0.0
             bound -= outward * (start[i, a] - about[i, a])
-        memory.first[here], memory.value[here] = begin, clearance / unit
-        memory.lower[here], memory.upper[here] = bound / interval, np.inf
+        buffers.first[here], buffers.value[here] = begin, clearance / unit
+        buffers.lower[here], buffers.upper[here] = bound / interval, np.inf
         # A node that has to be pushed out may be held in by something else: then as far as it goes.
-        memory.compliance[here] = PUSHING_OUT if bound > 0.0 else 0.0
-        memory.multipliers[here] = memory.push[i]
-        memory.node[kept], memory.obstacle[kept] = i, memory.obstacle[c]
+        buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 else 0.0
+        buffers.multipliers[here] = buffers.push[i]
+        buffers.node[kept], buffers.obstacle[kept] = i, buffers.obstacle[c]
         kept += 1
     return kept, depth
 
 
 @compiled
-def remember_push(node: NDArray[np.int64], multipliers: Vector, push: Vector) -> None:
+def keep_contact_multipliers(node: NDArray[np.int64], multipliers: Vector, push: Vector) -> None:
     """Keep the multipliers of the contact rows, the largest of each node, for the next guess."""
     push[:] = 0.0
     for c in range(len(multipliers)):
@@ -293,8 +293,10 @@ def remember_push(node: NDArray[np.int64], multipliers: Vector, push: Vector) ->
 
 
 @compiled
-def driven(positions: Points, nodes: NDArray[np.int64], ends: Points, unit: float) -> tuple[Points, NDArray[np.bool_]]:
-    """Return positions [D] with the driven nodes moved to their ends [m], and which nodes these are."""
+def move_prescribed(
+    positions: Points, nodes: NDArray[np.int64], ends: Points, unit: float
+) -> tuple[Points, NDArray[np.bool_]]:
+    """Return positions [D] with the prescribed nodes moved to their ends [m], and which nodes these are."""
     moved, known = positions.copy(), np.zeros(len(positions), dtype=np.bool_)
     for k in range(len(nodes)):
         for a in range(positions.shape[1]):

@@ -10,7 +10,7 @@ so that what remains is the balance of forces, a piecewise linear equation in u 
     F(u) = P u + q - sum_r a_r lambda_r(u) = 0,    F'(u) = P + sum over the rows that push of w_r a_r a_r'
 
 F' is one band of half-width 3 d. Newton's method with an exact line search solves F = 0 in finitely many
-steps; a change of the pushing rows costs one factorisation, linear in the number of nodes. A row of
+steps; a change of the active rows costs one factorisation, linear in the number of nodes. A row of
 compliance c_r >= 1 / w_max is exact at once; a harder one is by lambda^k <- lambda(u), which needs no new
 factor and converges at a rate of about 1e-3 or better.
 
@@ -44,7 +44,7 @@ Axes = tuple[int, ...]
 
 @compiled
 def assemble(
-    axes: Axes, program: ChainProgram, weights: Vector, pushing: NDArray[np.bool_], band: NDArray[np.float64]
+    axes: Axes, program: ChainProgram, weights: Vector, active: NDArray[np.bool_], band: NDArray[np.float64]
 ) -> None:
     """Write the lower band of P + sum w a a': band[j, k] is the entry of row j + k and column j."""
     d, width = len(axes), SPAN * len(axes)
@@ -59,7 +59,7 @@ def assemble(
             for apart in range(1, SPAN + 1):
                 band[j, apart * d] = program.couplings[apart - 1, i] if i + apart < nodes else 0.0
     for r in range(len(program.first)):
-        if pushing[r]:
+        if active[r]:
             j = program.first[r] * d
             for a in range(width):
                 scaled = weights[r] * program.gradient[r, a // d, a % d]
@@ -112,15 +112,15 @@ def substitute(axes: Axes, band: NDArray[np.float64], x: Vector) -> None:
         x[j] = value
 
 
-STIFFEST = 1e7  # w_max over the scale of P: the least compliance that is exact at once
-SEARCHES = 50  # of the line search
-STALLS = 3  # Newton steps without a gain: rounding allows for no more
-ROUNDING = 1e-6  # scaled imbalance that is a solution where rounding allows for no less
+MAX_WEIGHT = 1e7  # w_max over the scale of P: the least compliance that is exact at once
+MAX_LINE_SEARCHES = 50  # of the line search
+MAX_STALLS = 3  # Newton steps without a gain: rounding allows for no more
+ROUNDING_RESIDUAL = 1e-6  # scaled imbalance that is a solution where rounding allows for no less
 STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "stalled")
 SOLVED, LIMIT, INDEFINITE, NOT_FINITE, STALLED = range(5)
 
 
-class Workspace(NamedTuple):
+class SolverBuffers(NamedTuple):
     """What the compiled solver works with; kept from step to step, so that no step pays for memory.
 
     Attributes:
@@ -128,14 +128,14 @@ class Workspace(NamedTuple):
         iterations: the most Newton steps it may take.
         band: of the matrix, shape (m d + 3 d, 3 d + 1).
         vectors: seven of them, of the unknowns and of the rows.
-        pushing: which rows push.
+        active: which rows push.
     """
 
     tolerance: float
     iterations: int
     band: NDArray[np.float64]
     vectors: NDArray[np.float64]
-    pushing: NDArray[np.bool_]
+    active: NDArray[np.bool_]
 
 
 class BandedSolver:
@@ -149,7 +149,7 @@ class BandedSolver:
     name = "banded"
 
     def __init__(self, tolerance: float = 1e-8, iterations: int = 60) -> None:
-        self._workspace = Workspace(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
+        self._buffers = SolverBuffers(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
 
     def solve(
         self,
@@ -163,22 +163,22 @@ class BandedSolver:
             infinite = Residuals(np.inf, np.inf, np.inf)
             return Solution(velocities, multipliers, self.name, "cannot take rows beyond its band", 0, infinite)
         nodes, dimension = program.linear.shape
-        workspace = self.workspace(nodes, dimension, len(program.first))
+        buffers = self.buffers(nodes, dimension, len(program.first))
         u, found, axes = velocities.copy(), multipliers.copy(), (0, 1, 2)[:dimension]
-        status, iterations, residuals = solve_and_judge(axes, program, u, found, workspace)
+        status, iterations, residuals = solve_and_judge(axes, program, u, found, buffers)
         return Solution(u, found, self.name, STATUS[status], iterations, Residuals(*residuals))
 
-    def workspace(self, nodes: int, dimension: int, rows: int) -> Workspace:
+    def buffers(self, nodes: int, dimension: int, rows: int) -> SolverBuffers:
         """Return what the compiled solver needs for programs of at most so many rows."""
         width = SPAN * dimension
         unknowns = nodes * dimension + width
-        if self._workspace.band.shape != (unknowns, width + 1):
-            self._workspace = self._workspace._replace(band=np.empty((unknowns, width + 1)))
+        if self._buffers.band.shape != (unknowns, width + 1):
+            self._buffers = self._buffers._replace(band=np.empty((unknowns, width + 1)))
         wanted = max(unknowns, rows)
-        if self._workspace.vectors.shape[1] < wanted:
-            vectors, pushing = np.empty((7, 2 * wanted)), np.empty(2 * wanted, dtype=np.bool_)
-            self._workspace = self._workspace._replace(vectors=vectors, pushing=pushing)
-        return self._workspace
+        if self._buffers.vectors.shape[1] < wanted:
+            vectors, active = np.empty((7, 2 * wanted)), np.empty(2 * wanted, dtype=np.bool_)
+            self._buffers = self._buffers._replace(vectors=vectors, active=active)
+        return self._buffers
 
 
 @compiled
@@ -212,7 +212,7 @@ def images(axes: Axes, program: ChainProgram, u: NDArray[np.float64], image: Vec
 
 
 @compiled
-def push_of(program: ChainProgram, r: int, image: float, weight: float, centre: float) -> float:
+def multiplier_of(program: ChainProgram, r: int, image: float, weight: float, centre: float) -> float:
     """Return lambda_r(u) for a row's image a_r' u."""
     pull = (1.0 / weight - program.compliance[r]) * centre - image
     return float(weight * (max(program.lower[r] + pull, 0.0) + min(program.upper[r] + pull, 0.0)))
@@ -250,15 +250,15 @@ def update(
     centre: Vector,
     weights: Vector,
     multipliers: Vector,
-    pushing: NDArray[np.bool_],
+    active: NDArray[np.bool_],
 ) -> tuple[int, float]:
     """Write every multiplier; return how many rows began or ceased to push, and how far they are from bounds."""
     changes, gap = 0, 0.0
     for r in range(len(program.first)):
-        multiplier = push_of(program, r, image[r], weights[r], centre[r])
-        if (multiplier != 0.0) != pushing[r]:
+        multiplier = multiplier_of(program, r, image[r], weights[r], centre[r])
+        if (multiplier != 0.0) != active[r]:
             changes += 1
-            pushing[r] = multiplier != 0.0
+            active[r] = multiplier != 0.0
         multipliers[r] = multiplier
         hard = 1.0 / weights[r] - program.compliance[r]
         if hard > 0.0:
@@ -276,11 +276,11 @@ def search(
     at 0 and 1. A Newton's method of its own, kept within a bracket, finds the zero exactly.
     """
     low, high, part = 0.0, 1.0, 1.0
-    for _ in range(SEARCHES):
+    for _ in range(MAX_LINE_SEARCHES):
         value, slope = start + part * (end - start), end - start
         for r in range(len(program.first)):
             change = after[r] - before[r]
-            push = push_of(program, r, before[r] + part * change, weights[r], centre[r])
+            push = multiplier_of(program, r, before[r] + part * change, weights[r], centre[r])
             value -= push * change
             if push != 0.0:
                 slope += weights[r] * change * change
@@ -305,10 +305,10 @@ def solve(
     program: ChainProgram,
     u: NDArray[np.float64],
     multipliers: Vector,
-    workspace: Workspace,
+    buffers: SolverBuffers,
 ) -> tuple[int, int]:
     """Improve u and the multipliers in place; return status and iterations."""
-    tolerance, iterations, band, vectors, pushing = workspace
+    tolerance, iterations, band, vectors, active = buffers
     d, width = len(axes), SPAN * len(axes)
     nodes, rows, unknowns = len(program.linear), len(program.first), program.linear.size
     step, force, smooth = vectors[0], vectors[1, :unknowns], vectors[2, :unknowns]
@@ -319,25 +319,25 @@ def solve(
             stiffness = max(stiffness, program.blocks[i, a, a])
             if program.known[i]:
                 u[i, a] = 0.0
-    stiffest = STIFFEST * max(1.0, 1e-4 * stiffness)
+    stiffest = MAX_WEIGHT * max(1.0, 1e-4 * stiffness)
     balance(axes, program, u, smooth)
     images(axes, program, u, image)
     for r in range(rows):
         weights[r] = 1.0 / max(program.compliance[r], 1.0 / stiffest)
         centre[r] = multipliers[r]
-        multipliers[r] = push_of(program, r, image[r], weights[r], centre[r])
+        multipliers[r] = multiplier_of(program, r, image[r], weights[r], centre[r])
         # The first guess: what pushed before pushes again, though it may seem to pull.
         if multipliers[r] == 0.0 and centre[r] != 0.0:
             bound = program.lower[r] if centre[r] > 0.0 else program.upper[r]
             if np.isfinite(bound):
                 hard = 1.0 / weights[r] - program.compliance[r]
                 multipliers[r] = weights[r] * (bound - image[r] + hard * centre[r])
-        pushing[r] = multipliers[r] != 0.0
+        active[r] = multipliers[r] != 0.0
     forces(axes, program, smooth, multipliers, force)
     changes, stalled, least = 1, 0, np.inf
     for iteration in range(1, iterations + 1):
         if changes:
-            assemble(axes, program, weights, pushing, band)
+            assemble(axes, program, weights, active, band)
             if not factorise(axes, band):
                 return INDEFINITE, iteration
         start = end = 0.0
@@ -349,7 +349,7 @@ def solve(
         before[:rows] = image[:rows]
         scale = balance(axes, program, u, smooth)
         images(axes, program, u, image)
-        changes, gap = update(program, image, centre, weights, multipliers, pushing)
+        changes, gap = update(program, image, centre, weights, multipliers, active)
         if changes and iteration > 1:
             # Newton's step overshot a kink: go back to where the balance along it is zero.
             for j in range(unknowns):
@@ -359,7 +359,7 @@ def solve(
                 u[j // d, j % d] += (part - 1.0) * step[j]
             scale = balance(axes, program, u, smooth)
             images(axes, program, u, image)
-            _, gap = update(program, image, centre, weights, multipliers, pushing)
+            _, gap = update(program, image, centre, weights, multipliers, active)
         worst, largest = forces(axes, program, smooth, multipliers, force)
         if not np.isfinite(worst):
             return NOT_FINITE, iteration
@@ -368,11 +368,11 @@ def solve(
         least = min(least, worst)
         if worst <= tolerance * size and gap <= tolerance:
             return SOLVED, iteration
-        if stalled > STALLS:
-            return SOLVED if max(worst / size, gap) <= ROUNDING else STALLED, iteration
+        if stalled > MAX_STALLS:
+            return SOLVED if max(worst / size, gap) <= ROUNDING_RESIDUAL else STALLED, iteration
         if worst <= tolerance * size:
             centre[:rows] = multipliers[:rows]
-            turned, gap = update(program, image, centre, weights, multipliers, pushing)
+            turned, gap = update(program, image, centre, weights, multipliers, active)
             changes += turned
             forces(axes, program, smooth, multipliers, force)
     return LIMIT, iterations
@@ -384,8 +384,8 @@ def solve_and_judge(
     program: ChainProgram,
     u: NDArray[np.float64],
     multipliers: Vector,
-    workspace: Workspace,
+    buffers: SolverBuffers,
 ) -> tuple[int, int, tuple[float, float, float]]:
     """Solve, and judge by code that knows nothing of how it was solved; once into compiled code is cheaper."""
-    status, taken = solve(axes, program, u, multipliers, workspace)
+    status, taken = solve(axes, program, u, multipliers, buffers)
     return status, taken, compiled_residuals(program, u, multipliers)

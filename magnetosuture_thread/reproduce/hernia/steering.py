@@ -127,9 +127,7 @@ class HerniaRun:
         steps = self.instants[1:]
         took = np.array([step.took for step in steps])
         radius = 0.5 * self.settings.thread().diameter
-        nearest = min(
-            (step.margins["obstacle"].minimum for step in self.instants), default=math.inf
-        )
+        nearest = min((step.margins["obstacle"].minimum for step in self.instants), default=math.inf)
         counts = [len(step.margins.friction.nodes) for step in steps]
         return HerniaSummary(
             setup=setup,

@@ -95,7 +95,7 @@ class RigDynamics:
             thread.rest_curvature * length,
             0.5 * thread.diameter + surface.skin,
         )
-        glue = thread.bending_stiffness / length**3 if thread.attachment is Attachment.GLUED else 0.0
+        glue = thread.bending_stiffness / length**3 if thread.attachment is Attachment.CLAMPED else 0.0
         touching = min(int(2.0 * needle.length / needle.diameter) + 2, MOST_TOUCHING)
         self._needle = Needle(
             np.ascontiguousarray(needle.resistance[np.ix_([2, 0, 1], [2, 0, 1])]),

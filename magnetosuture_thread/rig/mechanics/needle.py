@@ -151,7 +151,7 @@ class Needle(NamedTuple):
         pole: at the tip [A m].
         outline: points that touch, in the needle's frame, shape (m, 2) [m].
         radius: of these [m].
-        clamp: (d, c) of the stiffness d |x_1 - x_0 + R (D, c)|^2 of a glued thread, d = 0 when pinned [N/m, m].
+        clamp: (d, c) of the stiffness d |x_1 - x_0 + R (D, c)|^2 of a clamped thread, d = 0 when pinned [N/m, m].
     """
 
     resistance: NDArray[np.float64]
@@ -248,7 +248,7 @@ def add_clamp(
     band: NDArray[np.float64],
     convex: bool,
 ) -> float:
-    """Add d |x_1 - x_0 + R (D, c)|^2, the half cell of bending at a glued tail.
+    """Add d |x_1 - x_0 + R (D, c)|^2, the half cell of bending at a clamped tail.
 
     With d = EI / D^3 and c = D^2 rest_curvature / 2 that is EI D / 4 (curvature - rest)^2, the curvature from a
     mirrored node before the tail: of second order in D.

@@ -13,7 +13,7 @@ class Attachment(str, Enum):
     """How the thread is tied to the needle's tail."""
 
     PINNED = "pinned"
-    GLUED = "glued"
+    CLAMPED = "clamped"
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ThreadProperties:
         stretching_stiffness: EA [N].
         drag_across: per length, across the thread [Pa s].
         drag_along: the same along it.
-        attachment: pinned, it turns freely at the needle's tail, or glued, it leaves against the heading.
+        attachment: pinned, it turns freely at the needle's tail, or clamped, it leaves against the heading.
         rest_curvature: of the thread when nothing acts, positive to the left from the tail on [1/m].
         diameter: for contact [m].
 

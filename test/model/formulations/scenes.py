@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from magnetosuture_thread.geometry.obstacles import Obstacle, Surroundings
-from magnetosuture_thread.model.choices import make_formulation, make_solver
-from magnetosuture_thread.model.formulations import Drive, Formulation, PaperOptions, StepSolution, ThreadState
+from magnetosuture_thread.model.factory import make_formulation, make_solver
+from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
 from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 
@@ -65,10 +65,10 @@ def straight(thread: Thread, dimension: int = 2) -> np.ndarray:
     return -thread.segment_length * np.arange(thread.segments + 1)[:, None] * east(dimension)
 
 
-def lead(tail: np.ndarray, heading: np.ndarray | None = None) -> Drive:
+def lead(tail: np.ndarray, heading: np.ndarray | None = None) -> PrescribedMotion:
     """Return a drive of the needle alone."""
     tail = np.asarray(tail, dtype=float)
-    return Drive((0,), tail[None, :], east(len(tail)) if heading is None else heading)
+    return PrescribedMotion((0,), tail[None, :], east(len(tail)) if heading is None else heading)
 
 
 def followed(
@@ -78,7 +78,7 @@ def followed(
     steps: int,
     interval: float = DT,
     heading: np.ndarray | None = None,
-) -> list[StepSolution]:
+) -> list[StepResult]:
     """Lead the needle along a way, a function of the step's number, and return every step."""
     state, done = ThreadState.at_rest(positions), []
     for step in range(1, steps + 1):

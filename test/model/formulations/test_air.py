@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.special import j0
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.model.formulations import Drive, ThreadState
+from magnetosuture_thread.model.formulations import PrescribedMotion, ThreadState
 from test.model.formulations.scenes import east, formulated, in_air, straight, stretch
 
 G = 9.81
@@ -31,7 +31,7 @@ def test_a_thread_that_nothing_holds_falls_freely(dimension: int):
     weights = np.ones(21)
     weights[[0, -2, -1]] = 0.5, 13.0 / 12.0, 5.0 / 12.0
     middle = np.average(state.positions, axis=0, weights=weights)
-    free = Drive((), np.empty((0, dimension)), east(dimension))
+    free = PrescribedMotion((), np.empty((0, dimension)), east(dimension))
     for _ in range(count):
         state = formulation.step(state, free, dt).state
     fallen = np.average(state.positions, axis=0, weights=weights) - middle
@@ -48,7 +48,7 @@ def test_a_rope_between_two_hands_hangs_in_a_catenary():
     begin, end = state.positions[-1].copy(), np.array([-span, 0.0])
     for step in range(1, 1500):
         part = min(1.0, step / 300)
-        drive = Drive((0, segments), np.array([[0.0, 0.0], begin + part * (end - begin)]), east())
+        drive = PrescribedMotion((0, segments), np.array([[0.0, 0.0], begin + part * (end - begin)]), east())
         state = formulation.step(state, drive, 5e-3).state
     assert np.abs(state.velocities).max() < 1e-5
     a = brentq(lambda a: 2.0 * a * math.sinh(0.5 * span / a) - length, 0.05, 10.0)
@@ -73,7 +73,7 @@ def test_a_hanging_chain_swings_with_its_period(segments: int, within: float):
         length / segments * np.diff(shape, axis=0) / np.linalg.norm(np.diff(shape, axis=0), axis=1)[:, None], axis=0
     )
     state, dt = ThreadState.at_rest(shape), 5e-4
-    hung = Drive((0,), np.zeros((1, 2)), east())
+    hung = PrescribedMotion((0,), np.zeros((1, 2)), east())
     ends, times = [], []
     for step in range(1, 4000):
         state = formulation.step(state, hung, dt).state
@@ -96,7 +96,7 @@ def test_bending_damping_takes_the_energy_out_of_a_spring():
         formulation = formulated(damped)
         state = ThreadState.at_rest(straight(thread))
         state.velocities[:, 1] = 0.05 * np.linspace(0.0, 1.0, 21) ** 2
-        hold = Drive((0, 1), state.positions[:2].copy(), east())
+        hold = PrescribedMotion((0, 1), state.positions[:2].copy(), east())
         moved = []
         for _ in range(600):
             state = formulation.step(state, hold, 2e-4).state
@@ -113,7 +113,7 @@ def test_a_driven_node_takes_the_damped_bending_with_it():
     velocity = np.array([0.02, 0.01])
     state = ThreadState(straight(thread), np.tile(velocity, (21, 1)), 1e-3)
     for step in range(1, 50):
-        state = formulation.step(state, Drive((0,), (step * 1e-3 * velocity)[None], east()), 1e-3).state
+        state = formulation.step(state, PrescribedMotion((0,), (step * 1e-3 * velocity)[None], east()), 1e-3).state
     np.testing.assert_allclose(state.positions, straight(thread) + 49e-3 * velocity, atol=1e-9)
 
 

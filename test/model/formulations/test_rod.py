@@ -10,9 +10,15 @@ import pytest
 
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
-from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, StepSolution, ThreadState
-from magnetosuture_thread.model.formulations.rod_step import Motion, set_out
-from magnetosuture_thread.model.formulations.step import Memory
+from magnetosuture_thread.model.formulations import (
+    Formulation,
+    PrescribedMotion,
+    RodFormulation,
+    StepResult,
+    ThreadState,
+)
+from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, init_step
+from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, WideRows
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.thread import Attachment, Thread
@@ -121,11 +127,11 @@ def test_a_free_thread_goes_to_its_rest_shape_and_stays_there(curvature: float):
 
 @pytest.mark.parametrize("segments", [25, 50])
 def test_a_clamped_thread_under_uniform_drag_bends_as_beam_theory_says(segments: int):
-    """A glued thread pulled sideways at speed V ends up as a cantilever under the load zeta_perp V.
+    """A clamped thread pulled sideways at speed V ends up as a cantilever under the load zeta_perp V.
 
     Its end then lags by zeta_perp V L^4 / (8 EI), for small deflections.
     """
-    thread = polyamide(Attachment.GLUED, segments)
+    thread = polyamide(Attachment.CLAMPED, segments)
     lag = 0.01 * thread.length
     speed = lag * 8.0 * thread.bending_stiffness / (thread.medium.drag_across * thread.length**4)
     time, steps = 60.0, 900  # 7 times the slowest mode
@@ -136,7 +142,7 @@ def test_a_clamped_thread_under_uniform_drag_bends_as_beam_theory_says(segments:
 
 
 def test_a_short_step_and_a_long_one_lead_to_the_same_place():
-    thread = polyamide(Attachment.GLUED)
+    thread = polyamide(Attachment.CLAMPED)
     positions = {}
     for steps in (40, 80, 160):
         path = 4e-3 * np.array([[k / steps, math.sin(2.0 * k / steps)] for k in range(steps + 1)])
@@ -151,13 +157,13 @@ def test_a_short_step_and_a_long_one_lead_to_the_same_place():
 def test_the_first_guess_goes_on_as_before_unless_that_is_noise_or_too_far():
     unit, lead_node, end = polyamide().segment_length, np.array([0]), np.array([[1e-4, 2e-4]])
     start, velocities = straight(polyamide()), np.full((26, 2), 3.0 * unit)
-    onwards, still = Motion.of(26, 2), Motion.of(26, 2)
-    set_out(onwards, start, velocities, lead_node, end, unit, DT, DT)
+    onwards, still = MotionBuffers.of(26, 2), MotionBuffers.of(26, 2)
+    init_step(onwards, start, velocities, lead_node, end, unit, DT, DT)
     np.testing.assert_allclose(onwards.about[1:], start[1:] / unit + 3.0 * DT)
     np.testing.assert_array_equal(onwards.about[0], end[0] / unit)
     np.testing.assert_array_equal(onwards.known, np.arange(26) == 0)
     for last_interval, speeds in ((0.0, velocities), (0.1 * DT, velocities), (DT, 100.0 * velocities)):
-        set_out(still, start, speeds, lead_node, end, unit, DT, last_interval)
+        init_step(still, start, speeds, lead_node, end, unit, DT, last_interval)
         np.testing.assert_array_equal(still.about, still.start)
         np.testing.assert_array_equal(still.start[1:], start[1:] / unit)
 
@@ -245,7 +251,7 @@ def test_held_nodes_stay_and_driven_nodes_go_where_they_are_told():
     for step in range(1, 60):
         tail = np.array([-4e-5 * step, 3e-5 * step])
         end = state.positions[25] + np.array([1e-5, -3e-5])
-        drive = Drive((0, 12, 25), np.array([tail, held, end]), east())
+        drive = PrescribedMotion((0, 12, 25), np.array([tail, held, end]), east())
         done = formulation.step(state, drive, DT)
         state = done.state
         np.testing.assert_allclose(state.positions[[0, 12, 25]], [tail, held, end], atol=1e-15)
@@ -260,7 +266,7 @@ def test_two_neighbours_that_are_held_do_not_pull_at_the_others():
     moved = {}
     for held in ((12,), (12, 13)):
         formulation, state = formulated(thread), ThreadState.at_rest(start)
-        drive = Drive((0, *held), start[[0, *held]], east())
+        drive = PrescribedMotion((0, *held), start[[0, *held]], east())
         for _ in range(60):
             state = formulation.step(state, drive, DT).state
         moved[held] = np.abs(state.positions - start).max()
@@ -282,7 +288,7 @@ def test_a_thread_among_hundreds_of_obstacles_keeps_its_length():
 
 
 def test_memory_that_grows_keeps_the_chords_and_the_multipliers():
-    memory = Memory.of(6, 2, 5, 3)
+    memory = StepBuffers.of(6, 2, 5, 3)
     memory.chords[:], memory.multipliers[:], memory.push[:] = 0.9, 7.0, 3.0
     larger = memory.with_room()
     assert len(larger.node) == 6
@@ -292,12 +298,12 @@ def test_memory_that_grows_keeps_the_chords_and_the_multipliers():
 
 
 def test_a_thread_that_starts_anew_knows_nothing_of_the_last():
-    thread = polyamide(Attachment.GLUED)
+    thread = polyamide(Attachment.CLAMPED)
     used, fresh = formulated(thread), formulated(thread)
     state = ThreadState.at_rest(straight(thread))
     for step in range(1, 20):
         state = used.step(
-            state, Drive((0, 25), np.array([[1e-4 * step, 0.0], [-thread.length, 0.0]]), east()), DT
+            state, PrescribedMotion((0, 25), np.array([[1e-4 * step, 0.0], [-thread.length, 0.0]]), east()), DT
         ).state
     for formulation in (used, fresh):
         steps = followed(formulation, bent(thread), lambda k: k * 2e-5 * east(), 5)
@@ -322,7 +328,7 @@ def test_ends_pulled_apart_by_more_than_the_thread_are_survived():
     formulation = formulated(thread)
     state = ThreadState.at_rest(straight(thread))
     for step in range(1, 30):
-        drive = Drive((0, 25), np.array([[1e-4 * step, 0.0], [-thread.length, 0.0]]), east())
+        drive = PrescribedMotion((0, 25), np.array([[1e-4 * step, 0.0], [-thread.length, 0.0]]), east())
         state = formulation.step(state, drive, DT).state
     lengths = np.linalg.norm(np.diff(state.positions, axis=0), axis=1)
     np.testing.assert_allclose(lengths, lengths.mean(), rtol=1e-3)
@@ -343,7 +349,7 @@ def test_margins_are_in_si_units():
 
 @pytest.mark.parametrize("solver", ["banded", "osqp"])
 def test_both_solvers_step_alike(solver: str):
-    thread = polyamide(Attachment.GLUED)
+    thread = polyamide(Attachment.CLAMPED)
     obstacles = (Disc((-0.009, 0.0025), 0.0015),)
 
     def way(k: int) -> np.ndarray:
@@ -391,12 +397,12 @@ class Hidden:
 
 
 def among_discs(solver: Solver) -> RodFormulation:
-    """Return a formulation of a glued thread with two discs beside it."""
+    """Return a formulation of a clamped thread with two discs beside it."""
     discs = tuple(Disc((-0.009 + 0.006 * k, 0.0025), 0.0015) for k in range(2))
-    return RodFormulation(polyamide(Attachment.GLUED), Surroundings(discs, 0.05), solver, TOLERANCE)
+    return RodFormulation(polyamide(Attachment.CLAMPED), Surroundings(discs, 0.05), solver, TOLERANCE)
 
 
-def assert_same(one: StepSolution, other: StepSolution) -> None:
+def assert_same(one: StepResult, other: StepResult) -> None:
     """Assert that two steps are the same to the last bit."""
     np.testing.assert_array_equal(one.state.positions, other.state.positions)
     np.testing.assert_array_equal(one.state.velocities, other.state.velocities)
@@ -406,7 +412,7 @@ def assert_same(one: StepSolution, other: StepSolution) -> None:
 @pytest.mark.parametrize(("coarse", "strict"), [(BandedSolver(iterations=1), 1.0), (BandedSolver(0.1), 1e-4)])
 def test_a_step_goes_on_with_the_other_solvers_where_compiled_code_leaves_it(coarse: BandedSolver, strict: float):
     """It fails now and then, or is good enough for the step, but not for who would ask the others."""
-    thread = polyamide(Attachment.GLUED)
+    thread = polyamide(Attachment.CLAMPED)
     both = FallbackSolver((coarse, Hidden(BandedSolver(), "second")), strict * TOLERANCE)
     steps, expected = (
         followed(among_discs(solver), straight(thread), lambda k: k * 6e-5 * np.array([0.3, 1.0]), 60)
@@ -435,11 +441,11 @@ def test_a_step_that_needs_more_room_is_none_the_worse():
     thread, hundreds = polyamide(), tuple(Disc((-0.0004 * k, 0.0012), 0.0009) for k in range(80))
     grown, fresh = formulated(thread, hundreds), formulated(thread, hundreds)
     state = ThreadState.at_rest(straight(thread))
-    room = vars(fresh)["_memory"].node.size
+    room = vars(fresh)["_buffers"].node.size
     grown.step(state, lead(np.zeros(2)), DT)
     expected = grown.step(state, lead(np.array([6e-5, 0.0])), DT)
     assert_same(fresh.step(state, lead(np.array([6e-5, 0.0])), DT), expected)
-    assert vars(fresh)["_memory"].node.size > room
+    assert vars(fresh)["_buffers"].node.size > room
 
 
 def test_a_step_keeps_its_memory_to_itself():

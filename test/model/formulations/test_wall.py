@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
-from magnetosuture_thread.model.formulations import StepSolution
+from magnetosuture_thread.model.formulations import StepResult
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.rig.mechanics.dynamics import Attachment as RigAttachment
@@ -21,7 +21,7 @@ RADIUS = 0.0175
 OUTSIDE = 1e-6  # m; farther outside of the dish no node may be
 
 
-def outside(thread: Thread, steps: list[StepSolution], radius: float = RADIUS) -> float:
+def outside(thread: Thread, steps: list[StepResult], radius: float = RADIUS) -> float:
     """Return how far a node behind the needle's tail ever is outside, negative if none is [m]."""
     distance = max(float(np.linalg.norm(done.state.positions[1:, :2], axis=1).max()) for done in steps)
     return distance + 0.5 * thread.diameter - radius
@@ -44,8 +44,8 @@ def test_a_thread_pushed_sideways_into_the_wall_slides_along_it(name: str, attac
 
 @pytest.mark.parametrize("name", ["rod", "paper"])
 def test_a_thread_longer_than_the_dish_is_wide_stays_in_it(name: str):
-    """A coil of stiff thread opens until the wall holds it; then its needle is driven about fast."""
-    thread = Thread.of(MATERIALS["polyamide_7_0"], length=0.12, segments=60, attachment=Attachment.GLUED)
+    """A coil of stiff thread opens until the wall holds it; then its needle is prescribed about fast."""
+    thread = Thread.of(MATERIALS["polyamide_7_0"], length=0.12, segments=60, attachment=Attachment.CLAMPED)
     formulation = formulated(thread, name=name, wall=RADIUS)
     around = -np.arange(61) * 2.0 * math.asin(0.5 * thread.segment_length / 0.016) + 0.5 * math.pi
     begin = 0.016 * np.column_stack([np.cos(around), np.sin(around)])
@@ -53,9 +53,9 @@ def test_a_thread_longer_than_the_dish_is_wide_stays_in_it(name: str):
     resting = followed(formulation, begin, lambda k: begin[0], 60, heading=west)
     assert outside(thread, resting) < OUTSIDE
     last = resting[-1].state.positions
-    driven = followed(formulation, last, lambda k: begin[0] * math.cos(0.1 * k), 120, heading=west)
-    assert outside(thread, driven) < OUTSIDE
-    assert name == "paper" or outside(thread, driven) > -1e-5  # which presses on nothing
+    prescribed = followed(formulation, last, lambda k: begin[0] * math.cos(0.1 * k), 120, heading=west)
+    assert outside(thread, prescribed) < OUTSIDE
+    assert name == "paper" or outside(thread, prescribed) > -1e-5  # which presses on nothing
 
 
 @pytest.mark.parametrize("name", ["rod", "paper"])

@@ -21,7 +21,7 @@ from magnetosuture_thread.rig.mechanics.newton import advance
 Vector = NDArray[np.float64]
 NEEDLE = NeedleBody(7e-3, 4e-4, 0.0, 1e6, 1.0)
 POLYAMIDE = ThreadProperties(19e-3, 60, 1.2723e-9, 5.65, 0.974, 0.487, Attachment.PINNED, diameter=60e-6)
-GLUED = replace(POLYAMIDE, attachment=Attachment.GLUED)
+CLAMPED = replace(POLYAMIDE, attachment=Attachment.CLAMPED)
 SLIGHT = ThreadProperties(1e-3, 4, 1e-14, 1e-3, 1e-7, 5e-8, Attachment.PINNED)
 OPEN = Surface()
 FRAME = 1.0 / 60.0
@@ -83,7 +83,7 @@ def steered(made: RigDynamics, seconds: float, strength: float = 1.0) -> RigDyna
     return made
 
 
-@pytest.mark.parametrize(("attachment", "root"), [(Attachment.PINNED, 3.926602), (Attachment.GLUED, 1.875104)])
+@pytest.mark.parametrize(("attachment", "root"), [(Attachment.PINNED, 3.926602), (Attachment.CLAMPED, 1.875104)])
 def test_a_bent_thread_relaxes_as_its_slowest_mode(attachment: Attachment, root: float):
     # Against a needle that is held: EI k^4 / drag, with tan kL = tanh kL, or cos kL cosh kL = -1.
     thread = replace(POLYAMIDE, attachment=attachment)
@@ -116,12 +116,12 @@ def test_a_thread_that_is_pulled_lengthwise():
 
 
 def test_a_turn_does_not_stretch_the_thread_and_leaves_what_it_was_told():
-    made = rig(GLUED)
+    made = rig(CLAMPED)
     for k in range(1, 121):
         a = math.pi * k / 120.0
         tail = (5e-3 * math.sin(a), 5e-3 * (1.0 - math.cos(a)))
         made.drive(tail, a, FRAME)
-        assert np.abs(made.tension).max() / GLUED.stretching_stiffness < 1e-4
+        assert np.abs(made.tension).max() / CLAMPED.stretching_stiffness < 1e-4
     np.testing.assert_allclose(made.tail, [0.0, 1e-2], atol=1e-15)
     assert made.heading == pytest.approx(math.pi)
     np.testing.assert_allclose(made.thread[0], made.tail)
@@ -132,7 +132,7 @@ def test_a_turn_does_not_stretch_the_thread_and_leaves_what_it_was_told():
 
 def test_a_glued_thread_keeps_the_tangent_and_a_pinned_one_does_not():
     turns = []
-    for thread in (GLUED, POLYAMIDE):
+    for thread in (CLAMPED, POLYAMIDE):
         made = rig(thread)
         for k in range(1, 31):
             made.drive((0.0, 0.0), k / 30.0, FRAME)
@@ -145,7 +145,7 @@ def test_a_glued_thread_keeps_the_tangent_and_a_pinned_one_does_not():
 
 
 def test_a_curved_thread_comes_to_rest_in_its_own_shape():
-    curved = replace(GLUED, rest_curvature=60.0)
+    curved = replace(CLAMPED, rest_curvature=60.0)
     made = rig(curved, curvature=30.0)
     for _ in range(10):
         made.drive((0.0, 0.0), 0.0, 8.0)
@@ -154,7 +154,7 @@ def test_a_curved_thread_comes_to_rest_in_its_own_shape():
     assert made.energy < 1e-5 * rig(curved, curvature=30.0).energy
 
 
-@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.GLUED])
+@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.CLAMPED])
 def test_without_currents_the_energy_only_falls(attachment: Attachment):
     made = rig(
         replace(POLYAMIDE, attachment=attachment), curvature=120.0, surface=Surface((Disc((-5e-3, 1e-3), 1e-3),))
@@ -168,7 +168,7 @@ def test_without_currents_the_energy_only_falls(attachment: Attachment):
 
 
 def test_the_world_can_be_turned():
-    turn, thread = 0.8, replace(GLUED, segments=30)
+    turn, thread = 0.8, replace(CLAMPED, segments=30)
     plain = steered(rig(thread, curvature=40.0, heading=0.2), 1.0, 2.0)
     turned = rig(thread, curvature=40.0, heading=0.2 + turn, field=coils(turn))
     steered(turned, 1.0, 2.0)
@@ -179,7 +179,7 @@ def test_the_world_can_be_turned():
     assert turned.heading - turn == pytest.approx(plain.heading, abs=1e-7)
 
 
-@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.GLUED])
+@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.CLAMPED])
 def test_it_converges_in_space(attachment: Attachment):
     def at(segments: int) -> RigDynamics:
         thread = replace(POLYAMIDE, attachment=attachment, segments=segments)
@@ -194,7 +194,7 @@ def test_it_converges_in_space(attachment: Attachment):
 
 def test_it_converges_in_time():
     def at(step: float) -> RigDynamics:
-        return steered(rig(replace(GLUED, segments=30), curvature=60.0, largest_step=step), 0.5, 2.0)
+        return steered(rig(replace(CLAMPED, segments=30), curvature=60.0, largest_step=step), 0.5, 2.0)
 
     fine = at(FRAME / 64)
     errors = [float(np.linalg.norm(at(FRAME / parts).thread - fine.thread, axis=1).mean()) / 19e-3
