@@ -144,7 +144,7 @@ def test_a_command_of_before_is_refused_and_the_new_one_named(
 ):
     for arguments in ([name], [name, "--help"], [name, "x", "--output", "out"]):
         assert cli.main(arguments) == 2
-        assert capsys.readouterr().err == f"error: the command '{name}' is now `{instead}`\n"
+        assert capsys.readouterr().err == f"error: the command '{name}' is now {instead}\n"
 
 
 def test_brackets_in_an_error_are_shown_as_they_are(monkeypatch, capsys, tmp_path: Path):

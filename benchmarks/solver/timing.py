@@ -18,7 +18,7 @@ from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.rod import RodFormulation
 from magnetosuture_thread.model.formulations.step import PrescribedMotion, StepResult, ThreadState
-from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector
+from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector, WideRows
 
 REACH = 5e-3  # m; of the margins, which the step does not ask for
 ANY_RESIDUAL = 1e9  # accepted by the step: a residual is shown here, not refused
@@ -58,11 +58,17 @@ class SpyingSolver:
         self.captured: list[Captured] = []
         self.solutions: list[Solution] = []
 
-    def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
+    def solve(
+        self,
+        program: ChainProgram,
+        velocities: NDArray[np.float64],
+        multipliers: Vector,
+        wide: WideRows | None = None,
+    ) -> Solution:
         """Solve one program; see `Solver`."""
         kept = ChainProgram(*(array.copy() for array in program))
         self.captured.append(Captured(kept, velocities.copy(), multipliers.copy()))
-        self.solutions.append(self._solver.solve(program, velocities, multipliers))
+        self.solutions.append(self._solver.solve(program, velocities, multipliers, wide))
         return self.solutions[-1]
 
 

@@ -14,9 +14,9 @@ from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 
 FAILED, WRONG_USE = 1, 2
 MOVED = {  # commands of before, and what is written instead
-    "bench": "python -m benchmarks solver|bridge|page, in the source tree",
-    "hernia": "magnetosuture reproduce hernia",
-    "behaviour": "magnetosuture reproduce thread-behavior",
+    "bench": "`python -m benchmarks solver|bridge|page`, in the source tree",
+    "hernia": "`magnetosuture reproduce hernia`",
+    "behaviour": "`magnetosuture reproduce thread-behavior`",
 }
 
 
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in MOVED:
-        return _fail(f"the command {given[0]!r} is now `{MOVED[given[0]]}`", WRONG_USE)
+        return _fail(f"the command {given[0]!r} is now {MOVED[given[0]]}", WRONG_USE)
     options = make_parser().parse_args(given)
     return exit_code(lambda: int(options.run(options)))
 

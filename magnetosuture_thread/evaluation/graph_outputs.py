@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.messages.reading import margins_of
 from magnetosuture_thread.interface import (
     CAMERA,
     CURRENTS,

@@ -149,9 +149,14 @@ def score(
 
     def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
         thread, paper = reference_thread(reference, path, segments)
-        surroundings = Surroundings(reference.discs, NEAR)
-        chosen = make_formulation(formulation, thread, surroundings, make_solver(solver, TOLERANCE), TOLERANCE, paper)
-        predictor = ThreadPredictor(chosen, thread)
+        predictor = ThreadPredictor(
+            thread,
+            Surroundings(reference.discs, NEAR),
+            formulation=formulation,
+            solver=solver,
+            paper=paper,
+            residual_tolerance=TOLERANCE,
+        )
         predictor.warm_up()
         headings = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])
         poses = [NeedlePose(*each) for each in zip(reference.times, reference.tails, headings, strict=True)]

@@ -19,10 +19,10 @@ from magnetosuture_thread.evaluation.closed_loop import LoopSummary
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.simulate import judge, simulate
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.images import decode_image
 
@@ -45,8 +45,7 @@ class BehaviorRun:
         instants: the predicted frames, by time.
         frames: BGR pictures of the instants to show, by their stamps [ns].
         view: where the dish is in them.
-        dish_diameter: [m]
-        obstacles: in the dish.
+        scene: that they show.
     """
 
     name: str
@@ -54,8 +53,7 @@ class BehaviorRun:
     instants: Sequence[FrameResult]
     frames: dict[int, NDArray[np.uint8]]
     view: DishView
-    dish_diameter: float
-    obstacles: Sequence[Obstacle] = ()
+    scene: Scene
 
 
 def thread_behavior(
@@ -85,23 +83,17 @@ def thread_behavior(
     with whole_folder(output) as folder:
         runs = []
         for index, setup in enumerate(setups):
+
+            def advance(share: float, done: int = index) -> None:
+                progress((done + share) / len(setups))
+
             say(setup.name)
-            simulate(
-                str(setup.path),
-                folder / setup.name,
-                say=say,
-                progress=_part(progress, index, len(setups)),
-            )
+            simulate(str(setup.path), folder / setup.name, say=say, progress=advance)
             runs.append(_judged(folder / setup.name, setup))
         figures = [run.summary.to_json() for run in runs]
         (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         draw_behavior(folder / "behaviour.png", runs)
     return runs
-
-
-def _part(progress: Progress, index: int, count: int) -> Progress:
-    """Return what reports the progress of one of several parts."""
-    return lambda share: progress((index + share) / count)
 
 
 def _judged(path: Path, setup: Setup) -> BehaviorRun:
@@ -127,13 +119,12 @@ def _judged(path: Path, setup: Setup) -> BehaviorRun:
         instants=collector.instants,
         frames=frames,
         view=setup.rig.view(setup.scene),
-        dish_diameter=setup.scene.dish.diameter,
-        obstacles=setup.scene.obstacles,
+        scene=setup.scene,
     )
 
 
 def behavior_table(runs: Sequence[BehaviorRun]) -> Table:
-    """Return the figures of the thread-behaviour tests as a table."""
+    """Return the figures of the thread-behavior tests as a table."""
     table = Table(title="thread behaviour, closed loop, simulated", title_justify="left", title_style="bold")
     table.caption = "errors: mean (greatest) over time, % of the thread's length; needle: root of the mean square"
     table.add_column("", no_wrap=True)
@@ -203,9 +194,9 @@ def _draw_row(figure: Figure, run: BehaviorRun, bottom: float, height: float) ->
 
 
 def _draw_instant(axes: Axes, run: BehaviorRun, instant: FrameResult, time: float) -> None:
-    draw_threads(axes, run.frames[instant.stamp], run.view, instant, run.obstacles, magnified=0.8)
+    draw_threads(axes, run.frames[instant.stamp], run.view, instant, run.scene.obstacles, magnified=0.8)
     centre = run.view.to_pixels(np.zeros(2))
-    half = (0.5 + BORDER) * run.dish_diameter / run.view.metres_per_pixel
+    half = (0.5 + BORDER) * run.scene.dish.diameter / run.view.metres_per_pixel
     axes.set_xlim(centre[0] - half, centre[0] + half)
     axes.set_ylim(centre[1] + half, centre[1] - half)
     axes.text(0.03, 0.97, f"{time:.1f} s", transform=axes.transAxes, fontsize=9, color=INK, va="top")

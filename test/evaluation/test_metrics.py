@@ -15,7 +15,7 @@ from magnetosuture_thread.evaluation.metrics import (
     target_points,
 )
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
-from magnetosuture_thread.model.margins import LeastBarrier, Margins
+from magnetosuture_thread.model.margins import BarrierMargins, Margins
 from magnetosuture_thread.model.predictor import Prediction
 
 NODES = np.column_stack([np.linspace(0.0, 1.0, 11), np.zeros(11)])
@@ -57,20 +57,14 @@ def prediction(y: float) -> Prediction:
     """Return a straight thread."""
     vertices = np.column_stack([-0.25 * np.arange(5), np.full(5, y)])
     stretch = np.array([0.0, -0.002, 0.001, 0.0])
-    return Prediction(1.0, "rod", "", vertices, stretch, 0.1, 1, "banded", "solved", 1e-9, True, list)
+    return Prediction(1.0, "rod", "", vertices, stretch, 0.1, 1, "banded", "solved", 1e-9, True, lambda: Margins(()))
 
 
 def margins(clearance: float) -> Margins:
     """Return margins of one node and obstacle."""
-    return Margins(
-        kind=np.array([2], dtype=np.uint8),
-        node=np.array([3], dtype=np.uint32),
-        obstacle=np.array([0], dtype=np.int32),
-        value=np.array([clearance]),
-        clearance=np.array([clearance]),
-        least=(LeastBarrier(2, 3, 0, clearance, clearance),),
-        touching=(3,) if clearance <= 0.0 else (),
-    )
+    one = np.array([clearance])
+    obstacle = BarrierMargins("obstacle", np.array([3], np.uint32), np.array([0], np.int32), one, one)
+    return Margins((obstacle,), (3,) if clearance <= 0.0 else ())
 
 
 def test_of_a_run_numbers_are_kept_and_the_worst_in_full(monkeypatch: pytest.MonkeyPatch):

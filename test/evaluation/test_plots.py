@@ -13,7 +13,7 @@ from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import MARGIN_COLOURS, SEEN, draw_summary
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.margins import LeastBarrier, Margins
+from magnetosuture_thread.model.margins import BarrierMargins, Margins
 
 NODES = np.column_stack([0.004 - 0.00076 * np.arange(26), np.zeros(26)])
 
@@ -21,10 +21,9 @@ NODES = np.column_stack([0.004 - 0.00076 * np.arange(26), np.zeros(26)])
 def run(clearance: float) -> RunMetrics:
     """Return two frames with all nodes at one distance from an obstacle."""
     metrics, count = RunMetrics(0.019), len(NODES) if np.isfinite(clearance) else 0
-    least = (LeastBarrier(2, 0, 0, clearance, clearance),) if count else ()
     distances = np.full(count, clearance)
     nodes, obstacles = np.arange(count, dtype=np.uint32), np.zeros(count, np.int32)
-    margins = Margins(np.full(count, 2, np.uint8), nodes, obstacles, distances, distances, least, ())
+    margins = Margins((BarrierMargins("obstacle", nodes, obstacles, distances, distances),))
     for k in (1, 2):
         seen = NODES + np.array([0.0, 0.0004 * k])
         frame = FrameResult(k * 10**9, NODES, strain=1e-6, margins=margins, seen=seen, tail=NODES[0], heading=0.0)

@@ -304,19 +304,28 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
         assert np.array_equal([[p.x, p.y] for p in message.vertices], prediction.vertices)
         assert np.array_equal(message.stretch, prediction.stretch)
     squeezed = Friction(FrictionState.PULLED, (2, 5, 6), 0.729)
-    for given in (margins, replace(margins, touching=(3, 4)), replace(margins, friction=squeezed), None):
+    for given in (margins, replace(margins, in_contact=(3, 4)), replace(margins, friction=squeezed), None):
         data = packed_margins((0, 7), given, "" if given else "for a reason", "" if given else "0123456789abcdef")
         message = store.deserialize_cdr(data, MARGINS.type_name)
         assert bytes(store.serialize_cdr(message, MARGINS.type_name)) == data
         assert message.valid == (given is not None)
         assert message.scene_version == (SETUP.scene.version if given else "0123456789abcdef")
-        assert message.contact_state == (0 if given is None else 2 if given.touching else 1)
+        assert message.contact_state == (0 if given is None else 2 if given.in_contact else 1)
         friction = given.friction if given else UNKNOWN
         assert (message.friction_state, tuple(message.friction_nodes)) == (friction.state, friction.nodes)
         assert message.slowdown == friction.slowdown
         if given is not None:
-            assert np.array_equal(message.clearance, given.clearance)
-            assert [entry.obstacle for entry in message.least] == [entry.obstacle for entry in given.least]
+            assert message.barrier_names == list(given)
+            for index, (name, barrier) in enumerate(given.items()):
+                of_barrier = message.barrier == index
+                assert np.array_equal(message.clearance[of_barrier], barrier.clearance)
+                assert np.array_equal(message.node[of_barrier], barrier.node)
+                assert name in [entry.barrier for entry in message.minimum] or not len(barrier)
+            assert [entry.obstacle for entry in message.minimum] == [int(row.obstacle[0]) for row in given.minima]
+            read = margins_of(message)
+            assert list(read) == list(given)
+            assert read["obstacle"].value.tolist() == given["obstacle"].value.tolist()
+            assert (read.in_contact, read.friction) == (given.in_contact, given.friction)
 
 
 def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles
+from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures
 
 GOOD, MIDDLING, BAD, NONE = "good", "middling", "bad", "none"

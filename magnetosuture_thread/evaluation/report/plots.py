@@ -19,6 +19,7 @@ MAX_BANDS = 400
 MIN_RANGE = 1.0  # s
 MIN_STRAIN = 1e-7  # %, on a scale of powers of ten
 DIGITS = 5  # of a value in the page
+LINE_COLOURS = ("kind0", "kind1", "kind3", "kind4")  # of the page
 
 
 def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX_POINTS) -> dict[str, Any]:
@@ -114,7 +115,7 @@ def _plots(
         "zero": True,
     }
     kinds = [
-        (column, column.removeprefix(MARGIN).replace("_", " "), f"kind{k % COLOURS}", "")
+        (column, column.removeprefix(MARGIN).replace("_", " "), LINE_COLOURS[k % len(LINE_COLOURS)], "")
         for k, column in enumerate(_other_margins(metrics.series))
     ]
     yield {"id": "lengths", "y": "margin [µm]", "series": _series(predicted, kinds), "zero": True}

@@ -28,7 +28,7 @@ from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, draw_worst_frame
 from magnetosuture_thread.evaluation.report.plots import page_data
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.margins import LeastBarrier, Margins
+from magnetosuture_thread.model.margins import BarrierMargins, Margins
 
 LENGTH = 0.019
 NODES = np.column_stack([0.004 - LENGTH * np.arange(26) / 25, np.zeros(26)])
@@ -39,10 +39,9 @@ VOID = {"meta", "img", "br", "link"}
 
 def margins(clearance: float) -> Margins:
     """Return margins of one node at a post."""
-    least = (LeastBarrier(2, 7, 0, clearance, clearance),)
     one = np.array([clearance])
-    kind, node, obstacle = np.array([2], np.uint8), np.array([7], np.uint32), np.array([0], np.int32)
-    return Margins(kind, node, obstacle, one, one, least, (7,) if clearance <= 0 else ())
+    obstacle = BarrierMargins("obstacle", np.array([7], np.uint32), np.array([0], np.int32), one, one)
+    return Margins((obstacle,), (7,) if clearance <= 0 else ())
 
 
 def made_metrics(frames: int = 300, targets: tuple[str, ...] = ("truth", "seen")) -> RunMetrics:
