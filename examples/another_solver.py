@@ -16,7 +16,7 @@ for solver in SOLVERS:
     for step in range(1, 61):
         tail = 1e-4 * step * np.array([0.5, 1.0])
         prediction = predictor.step(NeedlePose(step / 30.0, tail, np.array([1.0, 0.0])))
-    threads[solver] = prediction.vertices
+    threads[solver] = prediction.positions
     print(f"{prediction.solver}: {prediction.status}, residual {prediction.residual:.1e}")
 
 for solver, thread in threads.items():

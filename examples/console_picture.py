@@ -75,7 +75,7 @@ class Pilot:
     def begin(self) -> None:
         """Take steering and arm, when the needle is seen and the thread predicted."""
         self.until(lambda: self.shown("image") == "yes" and self.shown("tip"), "a camera image and the needle")
-        self.until(lambda: self.shown("friction") in ("free", "pulled", "resting"), "a prediction")
+        self.until(lambda: self.shown("friction") in ("free", "sliding", "stuck"), "a prediction")
         self.page.click("#take")
         self.page.click("#arm")
         self.until(lambda: self.page.inner_text("#coils") == "armed", "the coils to be armed")

@@ -48,7 +48,7 @@ def keys(thread: SteeredThread) -> Iterator[tuple[float, np.ndarray]]:
     """Yield what is asked for at each time, steering the thread by it."""
     stage, points, speed = 0, [], 0.0
     for k in range(round(END * RATE)):
-        time, needle = k / RATE, thread.now.prediction.vertices[0]
+        time, needle = k / RATE, thread.now.prediction.positions[0]
         if stage < len(STAGES) and time >= STAGES[stage][0]:
             _, speed, points = STAGES[stage]
             stage += 1

@@ -23,4 +23,4 @@ for step in range(1, 151):
 
 print(f"{len(prediction.margins.in_contact)} nodes lie on the mesh")
 print(f"least clearance: {1e6 * prediction.margins['obstacle'].minimum:.4f} um")
-print(f"lowest node: {1e3 * prediction.vertices[:, 2].min():.2f} mm")
+print(f"lowest node: {1e3 * prediction.positions[:, 2].min():.2f} mm")

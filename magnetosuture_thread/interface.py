@@ -69,8 +69,8 @@ LOAD_SCENE, ADD_SHAPE, REPLACE_SHAPE, REMOVE_SHAPE = "scene/load", "scene/add", 
 PAUSE_REPLAY, PAUSE_RIG = "replay/pause", "rig/pause"
 
 # What only a simulation knows; never an input of the graph.
-TRUE_NEEDLE = Channel("truth/needle", "geometry_msgs/msg/PoseStamped")
-TRUE_THREAD = Channel("truth/thread", "nav_msgs/msg/Path")
+TRUTH_NEEDLE = Channel("ground_truth/needle", "geometry_msgs/msg/PoseStamped")
+TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path")
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 

@@ -62,7 +62,7 @@ def path_of_polygon(message: Any, time: int) -> Any:
 
 def path_of_vertices(message: Any, time: int) -> Any:
     """Return a Path of a PredictedThread."""
-    return _path(message, [_pose(point) for point in message.vertices])
+    return _path(message, [_pose(point) for point in message.positions])
 
 
 def path_of_marker(message: Any, time: int) -> Any:

@@ -185,7 +185,7 @@ def _gathered(name: str, sights: Iterable[Observation], settings: ThreadModelSet
     if not run.stamps:
         raise BagError(name, "never shows half of the thread or more: nothing to start from")
     if against == "truth" and not truths:
-        raise BagError(name, "holds no truth (truth/thread), as bags of a robot do; compare against seen")
+        raise BagError(name, "holds no truth (ground_truth/thread), as bags of a robot do; compare against seen")
     return run
 
 

@@ -41,7 +41,7 @@ def replay(passage: Passage, settings: ThreadModelSettings) -> Points:
             pose = NeedlePose(stamps[index] * 1e-9, passage.tails[index], passage.headings[index])
             outcome = session.on_pose(stamps[index], pose)
             if outcome.prediction is not None:
-                last = outcome.prediction.vertices
+                last = outcome.prediction.positions
             elif index == leg:
                 break
             if index in slots:

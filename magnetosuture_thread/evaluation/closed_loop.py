@@ -20,7 +20,7 @@ from magnetosuture_thread.interface import (
     PREDICTED_THREAD,
     TIP_SETPOINT,
     TRACKER_STATE,
-    TRUE_NEEDLE,
+    TRUTH_NEEDLE,
 )
 
 TRACKED = 1  # as in the message TrackerState
@@ -114,7 +114,7 @@ class LoopCollector:
         if not hasattr(message, "header"):
             return
         stamp = nanoseconds(message.header.stamp)
-        if topic == TRUE_NEEDLE.recorded:
+        if topic == TRUTH_NEEDLE.recorded:
             self._truth[stamp] = np.array(planar_pose(message.pose))
         elif topic == NEEDLE_POSE.recorded:
             self._poses[stamp] = np.array(planar_pose(message.pose.pose))

@@ -109,8 +109,8 @@ class FrameResult:
         """
         return cls(
             observation.stamp,
-            prediction.vertices,
-            float(np.maximum.reduce(np.abs(prediction.stretch), initial=0.0)),
+            prediction.positions,
+            float(np.maximum.reduce(np.abs(prediction.strain), initial=0.0)),
             prediction.residual,
             step_time,
             margins,

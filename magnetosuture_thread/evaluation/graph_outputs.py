@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.messages.reading import margins_of
 from magnetosuture_thread.interface import (
     CAMERA,
     CURRENTS,
@@ -22,8 +21,9 @@ from magnetosuture_thread.interface import (
     NEEDLE_POSE,
     PREDICTED_THREAD,
     SEEN_THREAD,
-    TRUE_THREAD,
+    TRUTH_THREAD,
 )
+from magnetosuture_thread.messages.reading import margins_of
 
 CURRENT_VALID = 0.05  # s; a recorded current counts as in force for this long
 
@@ -56,7 +56,7 @@ class GraphCollector:
             SEEN_THREAD.recorded: self._take_seen,
             PREDICTED_THREAD.recorded: self._take_prediction,
             MARGINS.recorded: self._take_margins,
-            TRUE_THREAD.recorded: self._take_truth,
+            TRUTH_THREAD.recorded: self._take_truth,
         }.get(topic)
         if topic == DIAGNOSTICS.recorded:
             self.health.update({status.name.split(":")[0]: status.message for status in message.status})
@@ -99,8 +99,8 @@ class GraphCollector:
         frame.truth = _path(message)
 
     def _take_prediction(self, frame: FrameResult, message: Any) -> None:
-        frame.vertices = np.array([[p.x, p.y] for p in message.vertices]).reshape(-1, 2)
-        frame.strain = float(np.abs(np.asarray(message.stretch)).max(initial=0.0))
+        frame.vertices = np.array([[p.x, p.y] for p in message.positions]).reshape(-1, 2)
+        frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
         frame.residual = message.residual
         frame.step_time = message.step_time
 

@@ -16,7 +16,6 @@ from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
 from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory, read_reference
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.factory import make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
@@ -164,8 +163,8 @@ def score(
         predictor.start_at(poses[0], initial)
 
         def figures(prediction: Prediction) -> StepFigures:
-            strain = float(prediction.stretch.max())
-            return StepFigures(prediction.vertices, strain, prediction.residual, int(prediction.status != SOLVED))
+            strain = float(prediction.strain.max())
+            return StepFigures(prediction.positions, strain, prediction.residual, int(prediction.status != SOLVED))
 
         def step(index: int) -> Prediction:
             return predictor.step(poses[index])

@@ -23,7 +23,7 @@ from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, Picture, draw_worst_frame
 from magnetosuture_thread.evaluation.series import WorstFrame
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import DISH_FRAME, PREDICTED_THREAD, SEEN_THREAD, TRUE_THREAD
+from magnetosuture_thread.interface import DISH_FRAME, PREDICTED_THREAD, SEEN_THREAD, TRUTH_THREAD
 from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions, live_figures
 from magnetosuture_thread.jobs.judge import Given, opened
 from magnetosuture_thread.messages.reading import stamp_of
@@ -134,11 +134,11 @@ def _targets(given: Given, against: str) -> list[str]:
     """
     counts = given.recording.counts
     there = {
-        "truth": bool(counts.get(TRUE_THREAD.recorded)),
+        "truth": bool(counts.get(TRUTH_THREAD.recorded)),
         "seen": given.source == "camera" or bool(counts.get(SEEN_THREAD.recorded)),
     }
     if against != "auto" and not there[against]:
-        topic = TRUE_THREAD if against == "truth" else SEEN_THREAD
+        topic = TRUTH_THREAD if against == "truth" else SEEN_THREAD
         raise BagError(given.recording.path, f"has no messages on {topic.recorded} ({topic.type_name})")
     return [target for target, is_there in there.items() if is_there and against in ("auto", target)]
 

@@ -98,7 +98,7 @@ class RecordedPredictions:
         if found is None:
             return None
         try:
-            vertices = np.array([[point.x, point.y] for point in found.decode().vertices])
+            vertices = np.array([[point.x, point.y] for point in found.decode().positions])
         except BagError:
             return None
         return vertices if vertices.shape[0] > 1 and np.isfinite(vertices).all() else None

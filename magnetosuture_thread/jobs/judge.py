@@ -22,7 +22,7 @@ from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import NEEDLE_COMMAND, SCENE, SEEN_THREAD, TRUE_THREAD
+from magnetosuture_thread.interface import NEEDLE_COMMAND, SCENE, SEEN_THREAD, TRUTH_THREAD
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.offline.predictions import chosen_source
@@ -105,7 +105,7 @@ def opened(
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
     chosen = chosen_source(recording, source)
-    for channel in (SEEN_THREAD, NEEDLE_COMMAND, TRUE_THREAD):
+    for channel in (SEEN_THREAD, NEEDLE_COMMAND, TRUTH_THREAD):
         if channel.recorded in recording.unfit:
             raise BagError(path, recording.unfit[channel.recorded])
     left = recording.duration - start

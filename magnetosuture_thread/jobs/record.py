@@ -24,8 +24,8 @@ from magnetosuture_thread.interface import (
     NEEDLE_POSE,
     SCENE,
     SEEN_THREAD,
-    TRUE_NEEDLE,
-    TRUE_THREAD,
+    TRUTH_NEEDLE,
+    TRUTH_THREAD,
     Channel,
 )
 from magnetosuture_thread.jobs.output import whole_folder
@@ -145,15 +145,15 @@ class _Topics(ABC):
 
     def __init__(self, bag: BagWriter, channels: Sequence[Channel]) -> None:
         self._bag = bag
-        for channel in (*channels, NEEDLE_COMMAND, TRUE_NEEDLE, TRUE_THREAD):
+        for channel in (*channels, NEEDLE_COMMAND, TRUTH_NEEDLE, TRUTH_THREAD):
             bag.add_topic(channel.recorded, channel.type_name)
 
     def write(self, stamp: int, tail: Points, heading: float, thread: Points, velocity: Points) -> None:
         """Write an instant."""
         self._write_seen(stamp, tail, heading, thread)
         self._put(NEEDLE_COMMAND, stamp, MESSAGES.twist_message(stamp, velocity))
-        self._put(TRUE_NEEDLE, stamp, MESSAGES.placed(stamp, tail, heading))
-        self._put(TRUE_THREAD, stamp, MESSAGES.path_message(stamp, _along(thread, TRUTH_POINTS)))
+        self._put(TRUTH_NEEDLE, stamp, MESSAGES.placed(stamp, tail, heading))
+        self._put(TRUTH_THREAD, stamp, MESSAGES.path_message(stamp, _along(thread, TRUTH_POINTS)))
 
     @abstractmethod
     def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:

@@ -22,7 +22,7 @@ from magnetosuture_thread.interface import (
     NEEDLE_COMMAND,
     NEEDLE_POSE,
     PAUSE_REPLAY,
-    TRUE_THREAD,
+    TRUTH_THREAD,
 )
 from magnetosuture_thread.jobs.judge import Given, opened, replay_summary, write_results
 from magnetosuture_thread.jobs.output import whole_folder
@@ -211,10 +211,10 @@ class _Replay:
         given = self.given
         collector = GraphCollector(given.setup.model.thread_length)
         recorded, replayed = CurrentSeries(), CurrentSeries()
-        truth = [c for c in (TRUE_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
+        truth = [c for c in (TRUTH_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
         for record in given.recording.records(truth, start=given.start, duration=given.duration):
             message = record.decode()
-            collector.take(record.topic, message) if record.topic == TRUE_THREAD.recorded else recorded.take(message)
+            collector.take(record.topic, message) if record.topic == TRUTH_THREAD.recorded else recorded.take(message)
         made = Bag(self.folder / "bag")
         for record in made.records(set(made.topics)):
             message = record.decode()

@@ -92,10 +92,10 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
         material: its name.
         step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
     """
-    vertices = prediction.vertices
+    vertices = prediction.positions
     words = (prediction.formulation, prediction.scene_version, material, prediction.solver, prediction.status)
     formulation, scene, thread, solver, status = map(text, words)
-    sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.stretch), solver[0], status[0])
+    sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.strain), solver[0], status[0])
     return BEGIN + _prediction_form(*sizes).pack(
         *time,
         *DISH,
@@ -104,8 +104,8 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
         *thread,
         len(vertices),
         points_of(vertices),
-        len(prediction.stretch),
-        numbers(prediction.stretch, REAL),
+        len(prediction.strain),
+        numbers(prediction.strain, REAL),
         *solver,
         *status,
         prediction.residual,
@@ -233,11 +233,11 @@ def packed_markers(time: Time, prediction: Prediction, friction: Friction, diame
     """
     width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
     colour = (*friction_colour(friction), 1.0)
-    balls = prediction.vertices[list(friction.nodes)]
-    line = _marker(time, 0, LINE_STRIP, (width, 0.0, 0.0), colour, len(prediction.vertices))
+    balls = prediction.positions[list(friction.nodes)]
+    line = _marker(time, 0, LINE_STRIP, (width, 0.0, 0.0), colour, len(prediction.positions))
     spheres = _marker(time, 1, SPHERE_LIST, (2.0 * width,) * 3, colour, len(balls))
-    packed = _markers_form(len(prediction.vertices), len(balls)).pack(
-        2, *line, points_of(prediction.vertices), *_REST, *spheres, points_of(balls), *_REST
+    packed = _markers_form(len(prediction.positions), len(balls)).pack(
+        2, *line, points_of(prediction.positions), *_REST, *spheres, points_of(balls), *_REST
     )
     return BEGIN + packed
 

@@ -23,8 +23,8 @@ class FrictionState(IntEnum):
 
     UNKNOWN = 0
     FREE = 1
-    PULLED = 2
-    RESTING = 3
+    SLIDING = 2
+    STUCK = 3
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ def friction_colour(friction: Friction) -> Colour:
     >>> friction_colour(Friction(FrictionState.FREE, (), 1.0))
     (0.12, 0.62, 0.33)
     """
-    if friction.state is FrictionState.PULLED:
+    if friction.state is FrictionState.SLIDING:
         depth = min(1.0, (len(friction.nodes) - 1) / (_DEEPEST - 1))
         red, green, blue = ((1.0 - depth) * a + depth * b for a, b in zip(_LIGHT_ORANGE, _DEEP_ORANGE, strict=True))
         return red, green, blue
-    return {FrictionState.FREE: _GREEN, FrictionState.RESTING: _BLUE}.get(friction.state, _GREY)
+    return {FrictionState.FREE: _GREEN, FrictionState.STUCK: _BLUE}.get(friction.state, _GREY)
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class FrictionLaw:
     """Tells friction from the values of the obstacle barriers alone; no force is worked out.
 
         index = {i >= 1 : h_obs,i,O < threshold for two obstacles O or more}
-        slowdown = beta^|index|  where a node of the index moves faster than `resting_speed`, else 1
+        slowdown = beta^|index|  where a node of the index moves faster than `stuck_speed`, else 1
 
     Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback". Deviation: v_i != 0, which
     holds for every number that was ever computed, is a speed above a bound, as in the source's own draft;
@@ -79,12 +79,12 @@ class FrictionLaw:
     Attributes:
         threshold: of h_obs,i,O, a distance [m].
         beta: 0 < beta <= 1.
-        resting_speed: a node that is not faster rests [m/s].
+        stuck_speed: a node that is not faster rests [m/s].
     """
 
     threshold: float
     beta: float
-    resting_speed: float
+    stuck_speed: float
 
     def judge(self, margins: Mapping[str, BarrierMargins], speeds: NDArray[np.float64]) -> Friction:
         """Return the friction of a thread.
@@ -100,9 +100,9 @@ class FrictionLaw:
         if not len(index):
             return Friction(FrictionState.FREE, (), 1.0)
         nodes = tuple(index.tolist())
-        if float(speeds[index].max()) <= self.resting_speed:
-            return Friction(FrictionState.RESTING, nodes, 1.0)
-        return Friction(FrictionState.PULLED, nodes, self.beta ** len(nodes))
+        if float(speeds[index].max()) <= self.stuck_speed:
+            return Friction(FrictionState.STUCK, nodes, 1.0)
+        return Friction(FrictionState.SLIDING, nodes, self.beta ** len(nodes))
 
 
 class NodeMotion:

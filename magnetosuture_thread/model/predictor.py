@@ -59,8 +59,8 @@ class Prediction:
         stamp: [s]
         formulation: name of the formulation.
         scene_version: of the scene that it was predicted in; empty where the model knows none.
-        vertices: all nodes, shape (n + 1, d) [m].
-        stretch: each segment's length from end to end over what it should be, less one, shape (n,).
+        positions: of all nodes, shape (n + 1, d) [m].
+        strain: each segment's length from end to end over what it should be, less one, shape (n,).
         interval: time since the previous prediction [s].
         substeps: number of steps it was divided into.
         solver: the solver's name.
@@ -74,8 +74,8 @@ class Prediction:
     stamp: float
     formulation: str
     scene_version: str
-    vertices: Points
-    stretch: NDArray[np.float64]
+    positions: Points
+    strain: NDArray[np.float64]
     interval: float
     substeps: int
     solver: str
@@ -357,8 +357,8 @@ class ThreadPredictor:
             stamp=pose.stamp,
             formulation=formulation.name,
             scene_version=self._scene_version,
-            vertices=positions,
-            stretch=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
+            positions=positions,
+            strain=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,
             substeps=substeps,
             solver=step.solver if step else "none",

@@ -129,7 +129,7 @@ class ThreadSession:
 
     def wants_seen(self, stamp: int) -> bool:
         """Return whether a seen thread of this stamp [ns] would be of use; most are not."""
-        if self.settings.initial_shape != "seen":
+        if self.settings.initial_shape != "measured":
             return False
         return not self._predictor.started or self._last is None or stamp < self._last - MAX_LATENESS
 
@@ -176,7 +176,7 @@ class ThreadSession:
         except (InvalidInputError, SolverError) as error:
             return PredictionResult(stamp, problem=error, scene_version=self.scene_version)
         self._last = stamp
-        speeds = self._motion.take(prediction.vertices, prediction.interval)
+        speeds = self._motion.take(prediction.positions, prediction.interval)
         law = self.settings.friction_law()
         return PredictionResult(stamp, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
 

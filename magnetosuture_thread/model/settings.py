@@ -73,7 +73,7 @@ class ThreadModelSettings(Configuration):
         minimum=-2000.0,
         maximum=2000.0,
     )
-    held_nodes: tuple[int, ...] = quantity(
+    fixed_nodes: tuple[int, ...] = quantity(
         (), "nodes that stay where they are, as where tissue holds the thread", minimum=1, maximum=2000
     )
     medium: str = quantity(
@@ -127,9 +127,9 @@ class ThreadModelSettings(Configuration):
         multiple=2,
     )
     initial_shape: str = quantity(
-        "seen",
-        "where the thread starts: as the camera first sees it, or straight behind the needle",
-        choices=("seen", "straight"),
+        "measured",
+        "where the thread starts: as the camera first measures it, or straight behind the needle",
+        choices=("measured", "straight"),
     )
     max_step: float = quantity(
         0.02,
@@ -158,7 +158,7 @@ class ThreadModelSettings(Configuration):
     friction_slowdown: float = quantity(
         0.9, "beta: each node under friction slows the needle by this factor", minimum=0.01, maximum=1.0
     )
-    resting_speed: float = quantity(
+    stuck_speed: float = quantity(
         2e-4,
         "a thread under friction whose nodes there are not faster rests, and slows nothing",
         unit="m/s",
@@ -211,9 +211,9 @@ class ThreadModelSettings(Configuration):
                 raise ConfigurationError(
                     name, value, f"{about.default}, its default: it counts for medium: {other} only"
                 )
-        for node in self.held_nodes:
+        for node in self.fixed_nodes:
             if node > self.segments:
-                raise ConfigurationError(f"{self.GROUP}.held_nodes", node, f"nodes from 1 to {self.segments}")
+                raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {self.segments}")
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]
@@ -271,14 +271,14 @@ class ThreadModelSettings(Configuration):
             contact_tolerance=self.contact_tolerance,
             residual_tolerance=self.residual_tolerance,
             max_step=self.max_step,
-            fixed_nodes=self.held_nodes,
+            fixed_nodes=self.fixed_nodes,
         )
         predictor.warm_up()
         return predictor
 
     def friction_law(self) -> FrictionLaw:
         """Return what tells friction."""
-        return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.resting_speed)
+        return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.stuck_speed)
 
     def node_motion(self) -> NodeMotion:
         """Return what follows the nodes' velocities."""

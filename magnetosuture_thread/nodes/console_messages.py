@@ -40,8 +40,8 @@ BRIDGE = {
 FRICTION = {
     SafetyMargins.FRICTION_UNKNOWN: "unknown",
     SafetyMargins.FRICTION_FREE: "free",
-    SafetyMargins.FRICTION_PULLED: "pulled",
-    SafetyMargins.FRICTION_RESTING: "resting",
+    SafetyMargins.FRICTION_SLIDING: "sliding",
+    SafetyMargins.FRICTION_STUCK: "stuck",
 }
 LEVELS = {
     DiagnosticStatus.OK: "ok",
@@ -83,7 +83,7 @@ def seen(message: Path) -> list[list[float]]:
 def predicted(message: PredictedThread) -> dict[str, Any]:
     """Return the predicted vertices [m], and how they were found."""
     return {
-        "vertices": [[vertex.x, vertex.y] for vertex in message.vertices],
+        "vertices": [[vertex.x, vertex.y] for vertex in message.positions],
         "residual": message.residual,
         "step_time": message.step_time,
         "status": message.solver_status,

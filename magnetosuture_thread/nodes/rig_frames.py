@@ -28,8 +28,8 @@ class FramePublisher:
         self._compressed = topics.COMPRESSED_IMAGE.publisher(node)
         self._raw = topics.IMAGE.publisher(node)
         self._info = topics.CAMERA_INFO.publisher(node)
-        self._needle = topics.TRUE_NEEDLE.publisher(node)
-        self._thread = topics.TRUE_THREAD.publisher(node)
+        self._needle = topics.TRUTH_NEEDLE.publisher(node)
+        self._thread = topics.TRUTH_THREAD.publisher(node)
         self.take(camera)
 
     def take(self, camera: DishCamera) -> None:

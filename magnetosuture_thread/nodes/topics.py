@@ -120,8 +120,8 @@ CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR)
 NEEDLE_POSE = Topic(interface.NEEDLE_POSE, SENSOR)
 TRACKER_STATE = Topic(interface.TRACKER_STATE, RELIABLE)
 TIP_SETPOINT = Topic(interface.TIP_SETPOINT, RELIABLE)
-TRUE_NEEDLE = Topic(interface.TRUE_NEEDLE, RELIABLE)
-TRUE_THREAD = Topic(interface.TRUE_THREAD, RELIABLE)
+TRUTH_NEEDLE = Topic(interface.TRUTH_NEEDLE, RELIABLE)
+TRUTH_THREAD = Topic(interface.TRUTH_THREAD, RELIABLE)
 OPERATOR_COMMAND = Topic(interface.OPERATOR_COMMAND, RELIABLE)
 FILTER_STATE = Topic(interface.FILTER_STATE, RELIABLE)
 NEEDLE_COMMAND = Topic(interface.NEEDLE_COMMAND, RELIABLE)
@@ -156,7 +156,7 @@ OUTPUTS = (
 )
 
 SETTINGS = (SCENE, SCENE_MARKERS, MATERIAL)  # what may be told at any time, or never
-SIMULATED = (TRUE_NEEDLE, TRUE_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
+SIMULATED = (TRUTH_NEEDLE, TRUTH_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
 
 
 def lossless(depth: int) -> dict[str, Any]:

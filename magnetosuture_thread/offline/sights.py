@@ -15,7 +15,14 @@ from magnetosuture_thread.errors import BagError, InvalidInputError, Magnetosutu
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.orientation import as_told
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE, SEEN_THREAD, TRUE_THREAD, Channel
+from magnetosuture_thread.interface import (
+    COMPRESSED_IMAGE,
+    NEEDLE_POSE,
+    SCENE,
+    SEEN_THREAD,
+    TRUTH_THREAD,
+    Channel,
+)
 from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
 from magnetosuture_thread.messages.scene import scene_of
 from magnetosuture_thread.model.session import MAX_WAITING_POSES
@@ -35,7 +42,7 @@ NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
 )
 Progress = Callable[[float], None]
 _CHANGING = {channel.recorded for channel in CHANGING}
-_TRUE, _SEEN = TRUE_THREAD.recorded, SEEN_THREAD.recorded
+_TRUE, _SEEN = TRUTH_THREAD.recorded, SEEN_THREAD.recorded
 _NOTHING = np.empty((0, 2))
 
 
@@ -77,14 +84,14 @@ class Sights(Iterator[Observation]):
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
         sources = (recording.camera,) if source == "camera" else (NEEDLE_POSE, SEEN_THREAD)
-        given = (TRUE_THREAD, *CHANGING, *sources)
+        given = (TRUTH_THREAD, *CHANGING, *sources)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
         records = recording.records(channels, start=start, duration=duration)
         earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
         self._changes = [record for record in earlier if record.time < begin]
         for record in self._changes:
             self._follow(record)
-        awaited = {TRUE_THREAD, SEEN_THREAD} & set(channels)
+        awaited = {TRUTH_THREAD, SEEN_THREAD} & set(channels)
         self._going = self._go(_telling(records, begin, whole, progress), awaited)
 
     def __next__(self) -> Observation:

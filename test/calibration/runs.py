@@ -84,7 +84,7 @@ def model_run(
         heading = np.array([math.cos(angle), math.sin(angle)])
         outcome = session.on_pose(stamp, NeedlePose(stamp * 1e-9, tail, heading))
         assert outcome.prediction is not None
-        found.append(Observation(stamp, tail, heading, outcome.prediction.vertices))
+        found.append(Observation(stamp, tail, heading, outcome.prediction.positions))
     return tuple(found)
 
 

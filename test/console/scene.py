@@ -79,7 +79,7 @@ def block(name: str, corners: list[tuple[float, float]]) -> dict[str, Any]:
 def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[str, Any]:
     """Return the state of a graph that is armed and tracked, as `Graph.state` has it."""
     line = thread(nodes)
-    factor = 0.9**count if friction == "pulled" else 1.0
+    factor = 0.9**count if friction == "sliding" else 1.0
     return {
         "time": time.monotonic(),
         "needle_length": 0.007,

@@ -305,16 +305,16 @@ def test_colours_tell_the_friction(operator: Operator):
     assert "#12a150" in operator.colours_at(at)
     seen = []
     for count in (1, 4, 8):
-        graph.shown = state("pulled", count)
+        graph.shown = state("sliding", count)
         expect(operator.page.locator("#friction")).to_contain_text(f"pulled: {count} node")
         expect(operator.page.locator("#friction")).to_contain_text(f"{0.9**count:.2f}")
-        seen.append(operator.drawn("pulled"))
+        seen.append(operator.drawn("sliding"))
         operator.until(lambda: seen[-1] in operator.colours_at(at))
     greens = [int(colour[3:5], 16) for colour in seen]
     assert greens == sorted(greens, reverse=True)  # deeper with every node
     assert len(set(seen)) == 3
-    graph.shown = state("resting", 3)
-    assert operator.drawn("resting") == "#2f6bff"
+    graph.shown = state("stuck", 3)
+    assert operator.drawn("stuck") == "#2f6bff"
     assert "#2f6bff" in operator.colours_at(at)
     graph.shown["margins"].update(valid=False, reason="no program was solved")
     assert operator.drawn("invalid") == "#7d8790"
@@ -421,10 +421,10 @@ def test_what_is_silent_and_what_was_never_heard_is_said(operator: Operator):
 
 
 def test_nothing_is_cut_off(operator: Operator):
-    operator.served.graph.shown = state("pulled", 12)
+    operator.served.graph.shown = state("sliding", 12)
     for width, height in ((1366, 768), (1024, 700)):
         operator.page.set_viewport_size({"width": width, "height": height})
-        operator.drawn("pulled")
+        operator.drawn("sliding")
         expect(operator.page.locator("#friction")).to_contain_text("12 nodes")
         assert operator.cut_off() == []
         dish = operator.page.locator("#dish").bounding_box()

@@ -33,7 +33,7 @@ class Loop:
     def truth(self, stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> None:
         """Say where the needle really was."""
         message = Fake(header=header(stamp), pose=planar(x, y, angle))
-        self.collector.take("/truth/needle", stamp, message)
+        self.collector.take("/ground_truth/needle", stamp, message)
 
     def pose(self, stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0, after: int = 0) -> None:
         """Say where it was tracked, and what the tracker said of the frame."""

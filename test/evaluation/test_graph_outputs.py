@@ -32,7 +32,7 @@ def prediction(nanoseconds: int, points: np.ndarray) -> Message:
     return Message(
         header=header(nanoseconds),
         vertices=[Message(x=x, y=y) for x, y in points],
-        stretch=[0.0, -0.002, 0.001, 0.0],
+        strain=[0.0, -0.002, 0.001, 0.0],
         residual=1e-8,
         step_time=0.004,
     )
@@ -62,7 +62,7 @@ def test_messages_of_one_stamp_are_put_together():
         collector.take("/thread/predicted", prediction(k * 10**9, STRAIGHT))
         collector.take("/thread/measured", path(k * 10**9, STRAIGHT + np.array([0.0, 0.01])))
         collector.take("/thread/margins", margins(k * 10**9, clearance))
-    collector.take("/truth/thread", path(2 * 10**9, STRAIGHT + np.array([0.0, 0.02])))
+    collector.take("/ground_truth/thread", path(2 * 10**9, STRAIGHT + np.array([0.0, 0.02])))
     collector.take("/thread/measured", path(9 * 10**9, STRAIGHT))  # without a prediction
     collector.take("/thread/margins", margins(9 * 10**9, -7.0, valid=False))
     metrics, instants = collector.metrics(start=10**9), collector.frames()

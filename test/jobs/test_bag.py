@@ -34,7 +34,7 @@ def damaged(tmp_path: Path) -> Path:
 def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with BagWriter(tmp_path / "whole", {"setup": "example"}) as bag:
         bag.add_topic("/stamped", HEADER)
-        bag.add_topic("/truth/needle", "geometry_msgs/msg/PoseStamped")
+        bag.add_topic("/ground_truth/needle", "geometry_msgs/msg/PoseStamped")
         for index, seconds in enumerate((1, 2, 5, 4, 6, 3)):
             bag.write_message("/stamped", 10**9 + index * 5 * 10**8, stamped(seconds))
     found = tmp_path / "found.json"
@@ -43,7 +43,7 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for words in (
         "6 messages in 2.500 s",
         "std_msgs/Header",
-        "/truth/needle *",
+        "/ground_truth/needle *",
         "setup: example",
         "nothing is damaged",
     ):
@@ -53,7 +53,7 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     told = topics["/stamped"]
     assert (told["messages"], told["rate_hz"], told["first_s"], told["last_s"]) == (6, 2.0, 0.0, 2.5)
     assert (told["greatest_gap_s"], told["stamps_going_back"], told["frames"]) == (0.5, 2, ["dish"])
-    assert (topics["/truth/needle"]["rate_hz"], topics["/truth/needle"]["known"]) == (None, True)
+    assert (topics["/ground_truth/needle"]["rate_hz"], topics["/ground_truth/needle"]["known"]) == (None, True)
 
 
 def test_a_damaged_bag_is_shown_all_the_same(damaged: Path, capsys: pytest.CaptureFixture[str]):
@@ -72,13 +72,22 @@ def test_oddities_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     )
     pose = make("geometry_msgs/msg/Pose", point, turn)
     data = cdr("geometry_msgs/msg/PoseStamped", stamped(1, "world"), pose)
-    messages = [("/truth/needle", 1, data), ("/truth/thread", 2, cdr(STRING, "a")), ("/a", 3, cdr(STRING, "a"))]
-    types = {"/truth/needle": "geometry_msgs/msg/PoseStamped", "/truth/thread": STRING, "/a": STRING, "/b": HEADER}
+    messages = [
+        ("/ground_truth/needle", 1, data),
+        ("/ground_truth/thread", 2, cdr(STRING, "a")),
+        ("/a", 3, cdr(STRING, "a")),
+    ]
+    types = {
+        "/ground_truth/needle": "geometry_msgs/msg/PoseStamped",
+        "/ground_truth/thread": STRING,
+        "/a": STRING,
+        "/b": HEADER,
+    }
     write_mcap(path, [*messages, ("/b", 4, b"")], types)
     assert cli.main(["bag", "check", str(path), "--remap", "/a:=/both"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "/truth/needle has the frame world, from which nothing leads to dish" in shown
-    assert "/truth/thread is of type std_msgs/msg/String, expected" in shown
+    assert "/ground_truth/needle has the frame world, from which nothing leads to dish" in shown
+    assert "/ground_truth/thread is of type std_msgs/msg/String, expected" in shown
     assert "/b: 1 stamps cannot be read" in shown
 
 
@@ -178,11 +187,11 @@ def test_no_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
 
 def test_the_frame_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/truth/needle", "geometry_msgs/msg/PoseStamped")
+        bag.add_topic("/ground_truth/needle", "geometry_msgs/msg/PoseStamped")
         point = make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0)
         turn = make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
         pose = make("geometry_msgs/msg/Pose", point, turn)
-        bag.write_message("/truth/needle", 1, make("geometry_msgs/msg/PoseStamped", stamped(1, "world"), pose))
+        bag.write_message("/ground_truth/needle", 1, make("geometry_msgs/msg/PoseStamped", stamped(1, "world"), pose))
     for words, is_told in (([], True), (["--frame", "world"], False)):
         assert cli.main(["bag", "check", str(tmp_path / "bag"), *words]) == 0
         assert ("nothing leads to dish" in capsys.readouterr().out) == is_told

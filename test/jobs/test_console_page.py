@@ -142,18 +142,18 @@ def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path)
 
     pilot.at_speed(SPEED)
     pilot.follow(PATH)
-    pilot.follow(AROUND, lambda: pilot.shown("friction") == "pulled" and "Slowed to" in page.inner_text("#why"))
+    pilot.follow(AROUND, lambda: pilot.shown("friction") == "sliding" and "Slowed to" in page.inner_text("#why"))
     count, red, green, blue = bench.colour_of_thread()
     assert count > 50
     assert red > green > blue  # orange
-    light_and_dark(page, tmp_path, "pulled")
+    light_and_dark(page, tmp_path, "sliding")
     pilot.follow(AROUND, lambda: bench.under_friction() >= 3)  # so far that the thread does not slip back
     pilot.press()
-    pilot.until(lambda: pilot.shown("friction") == "resting", "the thread to rest")
+    pilot.until(lambda: pilot.shown("friction") == "stuck", "the thread to rest")
     count, red, green, blue = bench.colour_of_thread()
     assert count > 50
     assert blue > green > red
-    bench.says("friction", "resting")
+    bench.says("friction", "stuck")
 
     pilot.press("ArrowLeft")
     bench.with_current()

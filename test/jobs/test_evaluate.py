@@ -85,7 +85,7 @@ def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_ba
     both = tmp_path / "both"
     with BagWriter(both, {"setup": "petri_35mm_polyamide"}) as writer:
         for bag, names in (
-            (Bag(short_bag), {"/camera/image_raw/compressed", "/truth/thread"}),
+            (Bag(short_bag), {"/camera/image_raw/compressed", "/ground_truth/thread"}),
             (Bag(tmp_path / "replay" / "bag"), {NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded}),
         ):
             for name in names:

@@ -27,16 +27,16 @@ def test_the_bag_holds_frames_commands_and_truth_and_says_that_it_is_simulated(s
         "/camera/camera_info": 30,
         "/needle/servo_cv": 30,
         "/scene": 1,
-        "/truth/needle": 30,
-        "/truth/thread": 30,
+        "/ground_truth/needle": 30,
+        "/ground_truth/thread": 30,
     }
     assert bag.notes["setup"] == "petri_35mm_polyamide"
     assert "straight_pull" in bag.notes["simulated"]
     messages = {record.topic: record.decode() for record in bag.records(set(bag.topics))}
     assert decode_image(messages["/camera/image_raw/compressed"].data).shape == (480, 640, 3)
     assert messages["/needle/servo_cv"].twist.linear.x == pytest.approx(0.003, rel=1e-6)
-    assert messages["/truth/needle"].pose.position.x == pytest.approx(0.003 + 0.003 * 29 / 30)
-    assert len(messages["/truth/thread"].poses) == 51
+    assert messages["/ground_truth/needle"].pose.position.x == pytest.approx(0.003 + 0.003 * 29 / 30)
+    assert len(messages["/ground_truth/thread"].poses) == 51
     info = messages["/camera/camera_info"]
     # A point 5 mm east of the dish's centre, 0.3 m below the camera, is seen 62.5 px right of it.
     assert info.k[0] * 0.005 / 0.3 == pytest.approx(0.005 / (0.035 / (0.9115 * 480)))
@@ -138,7 +138,13 @@ def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: Reference
         count = record(straight_pull, setup, tmp_path / name, rate=60.0, poses=True, noise=1e-4, seed=seed)
         assert count == 120
     bag = Bag(tmp_path / "one")
-    topics = ("/needle/measured_cp", "/thread/measured", "/needle/servo_cv", "/truth/needle", "/truth/thread")
+    topics = (
+        "/needle/measured_cp",
+        "/thread/measured",
+        "/needle/servo_cv",
+        "/ground_truth/needle",
+        "/ground_truth/thread",
+    )
     assert bag.counts == {"/scene": 1, **dict.fromkeys(topics, 120)}
     assert bag.notes["simulated"] == "needle poses and seen thread from the reference trajectory straight_pull"
     off: list[float] = []

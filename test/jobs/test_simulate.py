@@ -103,8 +103,8 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     for topic in (
         "/camera/image_raw/compressed",
         "/camera/camera_info",
-        "/truth/needle",
-        "/truth/thread",
+        "/ground_truth/needle",
+        "/ground_truth/thread",
         "/needle/measured_cp",
         "/needle/tracker_state",
         "/needle/servo_cv",
@@ -122,7 +122,7 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     (told,) = bag.records({"/scene"})
     assert scene_of(told.decode()) == read_scene("dish_35mm")
     assert told.time == bag.start
-    first = min(record.time for record in bag.records({"/truth/needle"}))
+    first = min(record.time for record in bag.records({"/ground_truth/needle"}))
     assert first - bag.start < 0.5e9  # the nodes' start is not in it
     covariances = [record.decode().pose.covariance for record in bag.records({"/needle/measured_cp"})]
     assert all(0.0 < covariance[0] < 1e-8 for covariance in covariances)
@@ -192,7 +192,7 @@ def test_a_run_in_which_nothing_is_seen_fails_but_its_bag_and_logs_stay(tmp_path
     path.write_text(SHORT.replace("FAULTS", "    light_gain: 0.06"))
     with pytest.raises(GraphError, match=r"tracked in no frame; .*vision_tracker: searching"):
         simulate(str(path), tmp_path / "bag", duration=0.5)
-    assert Bag(tmp_path / "bag").counts["/truth/needle"] > 3
+    assert Bag(tmp_path / "bag").counts["/ground_truth/needle"] > 3
     assert "ready" in (tmp_path / "bag" / "logs" / "rig_simulator.log").read_text()
 
 

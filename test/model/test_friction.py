@@ -18,7 +18,7 @@ from magnetosuture_thread.model.friction import (
 )
 from magnetosuture_thread.model.margins import Margins
 
-LAW = FrictionLaw(threshold=1e-3, beta=0.9, resting_speed=2e-4)
+LAW = FrictionLaw(threshold=1e-3, beta=0.9, stuck_speed=2e-4)
 NODES = np.column_stack([np.arange(0.0, -8e-3, -1e-3), np.zeros(8)])  # 0 is the needle
 
 
@@ -38,7 +38,7 @@ def test_a_node_close_to_one_obstacle_is_free():
 
 
 def test_nodes_close_to_two_obstacles_slow_the_needle_while_pulled():
-    assert LAW.judge(barriers(*GATE), np.full(8, 1e-3)) == Friction(FrictionState.PULLED, (3, 4), 0.9**2)
+    assert LAW.judge(barriers(*GATE), np.full(8, 1e-3)) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
     third = (-3.5e-3, 1.85e-3, 1e-3)
     assert LAW.judge(barriers(*GATE, third), np.full(8, 1e-3)).nodes == (3, 4)
 
@@ -46,9 +46,9 @@ def test_nodes_close_to_two_obstacles_slow_the_needle_while_pulled():
 def test_who_moves_elsewhere_pulls_nothing():
     speeds = np.full(8, 1e-3)
     speeds[[3, 4]] = 2e-4
-    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.RESTING, (3, 4), 1.0)
+    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.STUCK, (3, 4), 1.0)
     speeds[4] = 2.1e-4  # one is enough
-    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.PULLED, (3, 4), 0.9**2)
+    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
 
 
 def test_the_threshold_is_of_the_clearance():
@@ -119,10 +119,10 @@ def test_colours_tell_the_state():
     def of(state: FrictionState, count: int = 0) -> tuple[float, float, float]:
         return friction_colour(Friction(state, tuple(range(count)), 1.0))
 
-    free, blue = of(FrictionState.FREE), of(FrictionState.RESTING, 3)
+    free, blue = of(FrictionState.FREE), of(FrictionState.STUCK, 3)
     assert free[1] == max(free)
     assert blue[2] == max(blue)
-    shades = [of(FrictionState.PULLED, count) for count in (1, 5, 10, 20, 40)]
+    shades = [of(FrictionState.SLIDING, count) for count in (1, 5, 10, 20, 40)]
     assert all(red > green > blue for red, green, blue in shades)
     assert [green for _, green, _ in shades] == sorted((green for _, green, _ in shades), reverse=True)
     assert len(set(shades)) == 4  # no deeper beyond twenty

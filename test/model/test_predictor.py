@@ -37,9 +37,9 @@ def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, 
 def test_the_thread_starts_on_the_centreline_with_full_length(thread_arc):
     seen = thread_arc(np.zeros(2), 3.0, 60.0, length=0.015)
     prediction = new().start(pose(1.0), seen)
-    assert np.abs(prediction.stretch).max() < 1e-3  # a chord is shorter than its arc
-    assert prediction.vertices.shape == (26, 2)
-    assert np.linalg.norm(seen - prediction.vertices[10], axis=1).min() < 1e-4
+    assert np.abs(prediction.strain).max() < 1e-3  # a chord is shorter than its arc
+    assert prediction.positions.shape == (26, 2)
+    assert np.linalg.norm(seen - prediction.positions[10], axis=1).min() < 1e-4
     assert prediction.interval == 0.0
 
 
@@ -50,7 +50,7 @@ def test_steps_are_bounded_whatever_the_interval():
     late = predictor.step(pose(100.0, 2e-3))
     assert late.substeps == 200
     assert late.interval == pytest.approx(100.0 - 1.0 / 66.0 - 1.0 / 30.0)
-    assert np.abs(late.stretch).max() < 1e-3
+    assert np.abs(late.strain).max() < 1e-3
 
 
 def test_the_same_motion_in_other_samples_gives_the_same_thread():
@@ -59,7 +59,7 @@ def test_the_same_motion_in_other_samples_gives_the_same_thread():
         prediction = fine.step(pose(k / 60.0, 5e-3 * k / 60.0, 2e-3 * (k / 60.0)))
     for k in range(1, 16):
         other = coarse.step(pose(k / 15.0, 5e-3 * k / 15.0, 2e-3 * (k / 15.0)))
-    difference = np.linalg.norm(prediction.vertices - other.vertices, axis=1).mean()
+    difference = np.linalg.norm(prediction.positions - other.positions, axis=1).mean()
     assert difference / THREAD.length < 2e-4
 
 
@@ -82,7 +82,7 @@ def test_a_bad_pose_is_refused_and_changes_nothing(bad: NeedlePose, words: str):
     with pytest.raises(InvalidInputError, match=words):
         predictor.step(bad)
     after, expected = predictor.step(pose(0.1, 1e-4)), untouched.step(pose(0.1, 1e-4))
-    np.testing.assert_array_equal(after.vertices, expected.vertices)
+    np.testing.assert_array_equal(after.positions, expected.positions)
 
 
 def test_a_start_needs_a_centreline():
@@ -104,7 +104,7 @@ def test_a_start_needs_a_centreline():
 def test_a_centreline_with_repeated_points_is_taken():
     seen = np.array([[0.0, 0.0], [0.0, 0.0], [-0.01, 0.0], [-0.015, 0.0], [-0.015, 0.0]])
     prediction = new().start(pose(0.0), seen)
-    np.testing.assert_allclose(prediction.vertices[:, 0], -THREAD.segment_length * np.arange(26), atol=1e-12)
+    np.testing.assert_allclose(prediction.positions[:, 0], -THREAD.segment_length * np.arange(26), atol=1e-12)
 
 
 def test_a_needle_that_leaps_onto_a_node_is_followed():
@@ -113,8 +113,8 @@ def test_a_needle_that_leaps_onto_a_node_is_followed():
     unit = THREAD.segment_length
     for k in range(1, 30):
         prediction = predictor.step(pose(k / 30.0, -unit))
-    assert np.all(np.isfinite(prediction.vertices))
-    assert np.abs(prediction.stretch).max() < 1e-2
+    assert np.all(np.isfinite(prediction.positions))
+    assert np.abs(prediction.strain).max() < 1e-2
 
 
 def test_a_reset_forgets():
@@ -130,7 +130,7 @@ def test_warming_up_leaves_no_trace():
     for predictor in (warm, cold):
         predictor.start(pose(5.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
     first, second = warm.step(pose(5.1, 1e-4)), cold.step(pose(5.1, 1e-4))
-    np.testing.assert_allclose(first.vertices, second.vertices, atol=1e-9)
+    np.testing.assert_allclose(first.positions, second.positions, atol=1e-9)
 
 
 def test_held_nodes_stay():
@@ -138,8 +138,8 @@ def test_held_nodes_stay():
     where = -THREAD.segment_length * 10
     for k in range(1, 40):
         prediction = predictor.step(pose(k / 30.0, -5e-5 * k, 2e-5 * k))
-    np.testing.assert_allclose(prediction.vertices[10], [where, 0.0], atol=1e-12)
-    assert prediction.stretch.max() < 5e-3
+    np.testing.assert_allclose(prediction.positions[10], [where, 0.0], atol=1e-12)
+    assert prediction.strain.max() < 5e-3
 
 
 def test_both_ends_can_be_led():
@@ -148,10 +148,10 @@ def test_both_ends_can_be_led():
     for k in range(1, 40):
         end = end + np.array([1e-4, 5e-5])
         prediction = predictor.step(pose(k / 30.0), {25: end})
-        np.testing.assert_allclose(prediction.vertices[25], end, atol=1e-12)
-    assert np.abs(prediction.stretch).max() < 5e-3
+        np.testing.assert_allclose(prediction.positions[25], end, atol=1e-12)
+    assert np.abs(prediction.strain).max() < 5e-3
     free = predictor.step(pose(2.0))  # let go
-    assert free.vertices.shape == (26, 2)
+    assert free.positions.shape == (26, 2)
 
 
 @pytest.mark.parametrize(
@@ -185,10 +185,10 @@ def test_a_needle_that_jumps_by_many_segments_is_followed(segments: float, formu
     jump = segments * THREAD.segment_length
     prediction = predictor.step(pose(1.0 / 60.0, -jump, 0.2 * jump))
     assert prediction.substeps >= 2.0 * segments
-    assert np.all(np.isfinite(prediction.vertices))
+    assert np.all(np.isfinite(prediction.positions))
     for k in range(2, 120):
         prediction = predictor.step(pose(k / 60.0, -jump, 0.2 * jump))
-    assert prediction.stretch.max() < 5e-3
+    assert prediction.strain.max() < 5e-3
     assert prediction.residual < 1e-6
 
 
@@ -205,7 +205,7 @@ def test_samples_that_come_twice_with_a_little_noise_do_no_harm(after: float):
         if k % 30 == 0:
             noisy = where + 1e-4 * random.normal(size=2)
             assert twice.step(pose(k / 60.0 + after, *noisy)).residual < 1e-6
-    assert np.linalg.norm(found.vertices - expected.vertices, axis=1).mean() < 2e-3 * THREAD.length
+    assert np.linalg.norm(found.positions - expected.positions, axis=1).mean() < 2e-3 * THREAD.length
 
 
 @settings(max_examples=40, deadline=None)
@@ -242,9 +242,9 @@ def test_any_motion_keeps_the_promises(
         if not (around.near(ahead[None]).distance < 2e-4).any():  # the needle itself must not enter
             where = ahead
         prediction = predictor.step(pose(k / 30.0, where[0], where[1], angle))
-        assert np.all(np.isfinite(prediction.vertices))
+        assert np.all(np.isfinite(prediction.positions))
         assert prediction.converged
-        assert np.abs(prediction.stretch).max() < 5e-3
+        assert np.abs(prediction.strain).max() < 5e-3
         assert prediction.residual < 1e-6
         obstacle = prediction.margins["obstacle"]
         assert obstacle.clearance[obstacle.node > 0].min(initial=1.0) > -1e-6
@@ -287,7 +287,7 @@ def test_any_thread_at_any_times_stays_whole(
         )
         heading = east + 0.3 * random.normal(size=dimension)
         prediction = predictor.step(NeedlePose(time, where, heading / np.linalg.norm(heading)))
-        assert np.isfinite(prediction.vertices).all()
+        assert np.isfinite(prediction.positions).all()
         assert prediction.residual < 1e-6
-        assert np.abs(prediction.stretch).max() < 5e-3 or not prediction.converged
-        assert np.abs(prediction.stretch).max() < 5e-2
+        assert np.abs(prediction.strain).max() < 5e-3 or not prediction.converged
+        assert np.abs(prediction.strain).max() < 5e-2

@@ -150,7 +150,9 @@ def test_a_bad_pose_is_refused_and_changes_nothing(bad: NeedlePose, offset: list
     refused = session.on_pose(round(bad.stamp * SECOND), bad)
     assert isinstance(refused.problem, InvalidInputError)
     assert not refused.waiting
-    np.testing.assert_array_equal(predicted(go(session, 1.2, 1e-3)).vertices, predicted(go(other, 1.2, 1e-3)).vertices)
+    np.testing.assert_array_equal(
+        predicted(go(session, 1.2, 1e-3)).positions, predicted(go(other, 1.2, 1e-3)).positions
+    )
 
 
 def test_a_step_that_is_not_solved_is_told_and_the_next_goes_on_from_before():
@@ -201,7 +203,7 @@ def test_two_sessions_say_the_same_to_the_last_bit(values: dict[str, Any]):
     scene = scene_with(Disc((-0.005, 0.003), 0.002), SQUARE, diameter=0.026)
     one, other = (on_a_curve(straight(scene, **values), 0, 60) for _ in range(2))
     for first, second in zip(one, other, strict=True):
-        np.testing.assert_array_equal(first.vertices, second.vertices)
+        np.testing.assert_array_equal(first.positions, second.positions)
         for rows, others in zip(first.margins.barriers, second.margins.barriers, strict=True):
             np.testing.assert_array_equal(rows.value, others.value)
 
@@ -221,14 +223,14 @@ def test_the_thread_hangs_where_it_is_fixed(offset: list[float], attachment: str
             1e-4 * k + along * np.cos(angle) - left * np.sin(angle),
             along * np.sin(angle) + left * np.cos(angle),
         ]
-        np.testing.assert_allclose(prediction.vertices[0], expected, atol=1e-12)
-    assert np.abs(prediction.stretch).max() < 1e-3
+        np.testing.assert_allclose(prediction.positions[0], expected, atol=1e-12)
+    assert np.abs(prediction.strain).max() < 1e-3
 
 
 def test_no_offset_is_an_offset_of_zero_to_the_last_bit():
     one, other = straight(), straight(attachment_offset=[0.0, 0.0])
     for first, second in zip(on_a_curve(one, 0, 20), on_a_curve(other, 0, 20), strict=True):
-        np.testing.assert_array_equal(first.vertices, second.vertices)
+        np.testing.assert_array_equal(first.positions, second.positions)
 
 
 @pytest.mark.parametrize(
@@ -243,8 +245,8 @@ def test_a_seen_thread_begins_where_it_is_fixed(offset: list[float], begin: floa
     session = ThreadSession(made(attachment_offset=offset), None)
     go(session, 1.0)
     prediction = predicted(next(iter(session.on_measured_thread(SECOND, seen()))))
-    np.testing.assert_allclose(prediction.vertices[0], [begin, 0.0], atol=1e-12)
-    np.testing.assert_allclose(prediction.vertices[-1], [end, 0.0], atol=1e-9)
+    np.testing.assert_allclose(prediction.positions[0], [begin, 0.0], atol=1e-12)
+    np.testing.assert_allclose(prediction.positions[-1], [end, 0.0], atol=1e-9)
 
 
 def test_a_seen_thread_must_begin_at_the_tail_wherever_it_is_fixed():
@@ -276,8 +278,8 @@ def test_it_goes_on_from_the_present_shape(values: dict[str, Any]):
     after = on_a_curve(session, 30, 31)[0]
     assert after.interval == pytest.approx(1 / 30.0)  # no pose was lost, and no time
     assert after.status == "solved"
-    assert np.linalg.norm(after.vertices[1:] - before.vertices[1:], axis=1).max() < 1.5e-3
-    assert np.abs(after.stretch).max() < 1e-3
+    assert np.linalg.norm(after.positions[1:] - before.positions[1:], axis=1).max() < 1.5e-3
+    assert np.abs(after.strain).max() < 1e-3
 
 
 def test_a_scene_changes_what_is_around_and_what_the_predictions_name():
@@ -301,7 +303,7 @@ def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
     session.change(session.settings, scene_with(diameter=0.02))
     outcomes = [go(session, 1.0 + k / 30.0, x=0.007, angle=0.2) for k in range(1, 20)]
     last = predicted(outcomes[-1])
-    away = np.linalg.norm(last.vertices[1:], axis=1).max()
+    away = np.linalg.norm(last.positions[1:], axis=1).max()
     assert away < 0.01 - 30e-6 + 1e-6
     assert formulation == "paper" or away > 0.0099  # in which a thread that is pushed shrinks instead
     margins = outcomes[-1].margins
@@ -315,13 +317,13 @@ def test_no_thread_starts_outside_of_the_dish(formulation: str, length: float):
     session = straight(scene_with(diameter=0.035), formulation=formulation, thread_length=length, segments=81)
     for k in range(10):
         prediction = predicted(go(session, 1.0 + k / 30.0, x=-0.012 + 1e-4 * k))
-        assert np.linalg.norm(prediction.vertices, axis=1).max() < 0.0175 - 30e-6 + 1e-6
+        assert np.linalg.norm(prediction.positions, axis=1).max() < 0.0175 - 30e-6 + 1e-6
     crooked = ThreadSession(made(formulation=formulation), scene_with(diameter=0.035))
     go(crooked, 1.0, x=0.0174)
     wavy = seen(0.0174) + np.array([0.0, 2e-4]) * np.sin(np.arange(60))[:, None]
     wavy[:20, 0] += np.linspace(0.0, 2e-3, 20)  # out through the wall
     (outcome,) = crooked.on_measured_thread(SECOND, wavy)
-    assert np.linalg.norm(predicted(outcome).vertices[1:], axis=1).max() < 0.0175 - 30e-6 + 1e-9
+    assert np.linalg.norm(predicted(outcome).positions[1:], axis=1).max() < 0.0175 - 30e-6 + 1e-9
 
 
 def test_what_does_not_concern_the_thread_does_not_move_it():
@@ -330,7 +332,7 @@ def test_what_does_not_concern_the_thread_does_not_move_it():
         on_a_curve(session, 0, 30)
     one.change(made(initial_shape="straight", margin_range=1e-2, contact_tolerance=1e-4), None)
     for first, second in zip(on_a_curve(one, 30, 40), on_a_curve(other, 30, 40), strict=True):
-        np.testing.assert_allclose(first.vertices, second.vertices, atol=1e-7)
+        np.testing.assert_allclose(first.positions, second.positions, atol=1e-7)
 
 
 def test_the_same_settings_change_nothing_to_the_last_bit():
@@ -339,7 +341,7 @@ def test_the_same_settings_change_nothing_to_the_last_bit():
         on_a_curve(session, 0, 30)
     one.change(made(initial_shape="straight"), None)
     for first, second in zip(on_a_curve(one, 30, 40), on_a_curve(other, 30, 40), strict=True):
-        np.testing.assert_array_equal(first.vertices, second.vertices)
+        np.testing.assert_array_equal(first.positions, second.positions)
 
 
 @pytest.mark.parametrize(
@@ -354,9 +356,9 @@ def test_the_same_settings_change_nothing_to_the_last_bit():
 )
 def test_other_segments_lie_along_the_thread_before(values: dict[str, Any]):
     session = straight()
-    before = on_a_curve(session, 0, 30)[-1].vertices
+    before = on_a_curve(session, 0, 30)[-1].positions
     session.change(made(initial_shape="straight", **values), None)
-    after = on_a_curve(session, 30, 31)[0].vertices
+    after = on_a_curve(session, 30, 31)[0].positions
     assert len(after) == session.thread.segments + 1
     assert session.thread == session.settings.thread()
     near = np.linalg.norm(after[:, None] - before, axis=2).min(axis=1)
@@ -372,24 +374,24 @@ def test_a_thread_in_air_keeps_its_speed():
         for k in range(10):
             predicted(go(one, 1.0 + k / 100.0, 1e-3 * k))
     session.change(made(**air, margin_range=1e-2), None)
-    same, kept = (predicted(go(one, 1.1, 1e-2)).vertices for one in (session, other))
+    same, kept = (predicted(go(one, 1.1, 1e-2)).positions for one in (session, other))
     np.testing.assert_allclose(same, kept, atol=1e-7)
     session.change(made(**air, segments=50), None)
-    finer, kept = (predicted(go(one, 1.11, 1.1e-2)).vertices for one in (session, other))
+    finer, kept = (predicted(go(one, 1.11, 1.1e-2)).positions for one in (session, other))
     np.testing.assert_allclose(finer[::2], kept, atol=1e-5)
 
 
 def test_tissue_that_takes_hold_later_holds_where_the_thread_is_then():
     session = straight()
-    before = on_a_curve(session, 0, 30)[-1].vertices
-    session.change(made(initial_shape="straight", held_nodes=[20]), None)
+    before = on_a_curve(session, 0, 30)[-1].positions
+    session.change(made(initial_shape="straight", fixed_nodes=[20]), None)
     for k in range(28, 0, -1):  # back, so that the thread gets slack
         after = predicted(
             go(session, 3.0 - k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0)
         )
-    np.testing.assert_allclose(after.vertices[20], before[20], atol=1e-12)
+    np.testing.assert_allclose(after.positions[20], before[20], atol=1e-12)
     session.change(made(initial_shape="straight"), None)
-    assert np.linalg.norm(on_a_curve(session, 100, 130)[-1].vertices[20] - before[20]) > 1e-3
+    assert np.linalg.norm(on_a_curve(session, 100, 130)[-1].positions[20] - before[20]) > 1e-3
 
 
 @pytest.mark.parametrize("values", [{}, {"formulation": "paper"}])
@@ -409,7 +411,7 @@ def test_settings_that_cannot_be_used_leave_those_before_in_force(values: dict[s
     assert one.settings is before
     assert one.scene is None
     for first, second in zip(on_a_curve(one, 20, 30), on_a_curve(other, 20, 30), strict=True):
-        np.testing.assert_array_equal(first.vertices, second.vertices)
+        np.testing.assert_array_equal(first.positions, second.positions)
 
 
 def test_what_is_prepared_and_not_put_in_force_changes_nothing():
@@ -417,7 +419,7 @@ def test_what_is_prepared_and_not_put_in_force_changes_nothing():
     for session in (one, other):
         on_a_curve(session, 0, 20)
     put_in_force = one.prepare(made(initial_shape="straight", material="silk_6_0"), None)
-    np.testing.assert_array_equal(on_a_curve(one, 20, 25)[-1].vertices, on_a_curve(other, 20, 25)[-1].vertices)
+    np.testing.assert_array_equal(on_a_curve(one, 20, 25)[-1].positions, on_a_curve(other, 20, 25)[-1].positions)
     put_in_force()  # later, and yet from where the thread is now
     assert on_a_curve(one, 25, 26)[0].interval == pytest.approx(1 / 30.0)
     assert one.settings.material == "silk_6_0"
@@ -465,7 +467,7 @@ def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, 
         proven += 1
         margins = prediction.margins["obstacle"]
         if isinstance(obstacle, Disc):
-            distance = obstacle.signed_distance(prediction.vertices)[0] - 30e-6
+            distance = obstacle.signed_distance(prediction.positions)[0] - 30e-6
             np.testing.assert_allclose(margins.clearance, distance[margins.node], atol=1e-12)
         assert margins.clearance.min(initial=0.0) > -1e-7
     assert (proven > 0) == (isinstance(obstacle, Polygon) or obstacle == Disc((-0.01, 1e-4), 0.001))
@@ -497,7 +499,7 @@ session, before, stamp = ThreadSession(made(), None), kernels(), 0
 for values in (
     {}, {"segments": 60}, {"thread_length": 0.03}, {"material": "silk_6_0"}, {"medium": "air", "gravity": [0.0, -1.0]},
     {"shapes": (), "diameter": 0.036}, {"shapes": (disc,)}, {"shapes": (square,)}, {"shapes": (disc, square)},
-    {"attachment": "clamped", "rest_curvature": 20.0}, {"held_nodes": [20]}, {"attachment_offset": [1e-3, 0.0]},
+    {"attachment": "clamped", "rest_curvature": 20.0}, {"fixed_nodes": [20]}, {"attachment_offset": [1e-3, 0.0]},
 ):
     scene = None
     if "shapes" in values:

@@ -47,10 +47,10 @@ def test_a_free_thread_slows_nothing():
 def test_friction_slows_a_needle_that_pulls_and_no_other():
     model = session(GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
     x, pulled = drive(model, 0, 5)
-    assert pulled.state is FrictionState.PULLED
+    assert pulled.state is FrictionState.SLIDING
     assert 0.5 < pulled.slowdown < 1.0
     _, resting = drive(model, 5, 10, speed=0.0, x=x)
-    assert (resting.state, resting.slowdown) == (FrictionState.RESTING, 1.0)
+    assert (resting.state, resting.slowdown) == (FrictionState.STUCK, 1.0)
 
 
 def test_margins_contain_the_friction_state():
@@ -62,7 +62,7 @@ def test_margins_contain_the_friction_state():
         margins = model.on_pose(SECOND + k * PERIOD, pose).margins
         assert margins is not None
         states.append(margins.friction)
-    assert [friction.state for friction in states] == [FrictionState.PULLED, FrictionState.RESTING]
+    assert [friction.state for friction in states] == [FrictionState.SLIDING, FrictionState.STUCK]
     assert states[0].nodes == states[1].nodes
     assert len(states[0].nodes) >= 2
 

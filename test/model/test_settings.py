@@ -33,8 +33,8 @@ def made(**values: Any) -> ThreadModelSettings:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"held_nodes": [26]}, "nodes from 1 to 25"),
-        ({"held_nodes": [0]}, "from 1 to"),
+        ({"fixed_nodes": [26]}, "nodes from 1 to 25"),
+        ({"fixed_nodes": [0]}, "from 1 to"),
         ({"formulation": "magic"}, "one of rod, paper"),
         ({"solver": "magic"}, "one of banded, osqp"),
         ({"medium": "honey"}, "one of liquid, air"),
@@ -69,7 +69,7 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
         {"formulation": "paper"},
         {"solver": "osqp", "attachment": "clamped"},
         {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
-        {"held_nodes": [20], "rest_curvature": 30.0},
+        {"fixed_nodes": [20], "rest_curvature": 30.0},
         {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},
         {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
         {"margin_range": 0.02},
@@ -85,7 +85,7 @@ def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
         prediction = predictor.step(NeedlePose(k / 60.0, tail + k * 5e-5 * east, east))
     assert prediction.formulation == values.get("formulation", "rod")
     assert prediction.solver == values.get("solver", "banded")
-    assert np.isfinite(prediction.vertices).all()
+    assert np.isfinite(prediction.positions).all()
     assert prediction.residual < 1e-6
 
 

@@ -75,7 +75,7 @@ def least(barrier: Barrier, predictions: list[Prediction]) -> float:
     found = []
     for prediction in predictions:
         barrier.set_time(prediction.stamp)
-        found.append(float(barrier.clearance(prediction.vertices).min()))
+        found.append(float(barrier.clearance(prediction.positions).min()))
     return min(found)
 
 
@@ -97,8 +97,8 @@ def test_a_barrier_holds_that_the_thread_would_leave(barrier: Barrier, way: Call
     # And its margins are there, of the same rows.
     for prediction in held[::10]:
         barrier.set_time(prediction.stamp)
-        np.testing.assert_array_equal(prediction.margins[barrier.name].value, barrier.value(prediction.vertices))
-    assert max(np.abs(prediction.stretch).max() for prediction in held) < 5e-3
+        np.testing.assert_array_equal(prediction.margins[barrier.name].value, barrier.value(prediction.positions))
+    assert max(np.abs(prediction.strain).max() for prediction in held) < 5e-3
 
 
 @pytest.mark.parametrize("barrier", [barrier for barrier, _ in WAYS], ids=lambda barrier: barrier.name)
@@ -131,7 +131,7 @@ def test_several_barriers_hold_together_beside_the_wall_and_a_post():
 
 def test_the_banded_and_a_general_solver_find_the_same_thread():
     barrier, way = WAYS[0]
-    banded, general = (predicted(barrier, way=way, solver=solver)[-1].vertices for solver in ("banded", "osqp"))
+    banded, general = (predicted(barrier, way=way, solver=solver)[-1].positions for solver in ("banded", "osqp"))
     np.testing.assert_allclose(banded, general, atol=1e-8)
 
 
@@ -142,7 +142,7 @@ def test_a_solver_of_qpsolvers_is_found_by_its_name():
     found = predicted(barrier, way=way, solver="clarabel")
     assert {prediction.solver for prediction in found} == {"clarabel"}
     assert least(barrier, found) > -HOLDS
-    np.testing.assert_allclose(found[-1].vertices, predicted(barrier, way=way)[-1].vertices, atol=1e-6)
+    np.testing.assert_allclose(found[-1].positions, predicted(barrier, way=way)[-1].positions, atol=1e-6)
 
 
 def test_a_gain_slows_how_fast_the_margin_falls():
@@ -254,7 +254,7 @@ def test_a_failed_row_leaves_the_thread_where_it_was():
     with pytest.raises(InvalidInputError, match="moving_disc"):
         one.step(around(2))
     barrier.broken = False
-    np.testing.assert_array_equal(one.step(around(3)).vertices, other.step(around(3)).vertices)
+    np.testing.assert_array_equal(one.step(around(3)).positions, other.step(around(3)).positions)
 
 
 @pytest.fixture

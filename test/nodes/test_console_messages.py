@@ -63,7 +63,7 @@ def test_the_tracker_with_and_without_the_dish():
 def test_the_threads():
     path = MESSAGES.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
     assert plain(console_messages.seen(path)) == [[0.0, 0.001], [0.002, 0.003]]
-    message = PredictedThread(vertices=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
+    message = PredictedThread(positions=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
     assert plain(console_messages.predicted(message)) == {
         "vertices": [[0.1, 0.2]],
         "residual": 1e-9,
@@ -73,17 +73,20 @@ def test_the_threads():
 
 
 def test_of_each_node_the_least_clearance_of_wall_and_shapes():
-    obstacle, connectivity = BarrierMargin.KIND_OBSTACLE, BarrierMargin.KIND_CONNECTIVITY
     message = SafetyMargins(
         valid=True,
-        kind=[connectivity, obstacle, obstacle, obstacle, BarrierMargin.KIND_WALL],
+        barrier_names=["connectivity", "obstacle", "wall"],
+        barrier=[0, 1, 1, 1, 2],
         node=[3, 1, 1, 2, 4],
         obstacle=[-1, 0, 1, 1, -1],
         value=[0.0] * 5,
         clearance=[0.0, 5e-4, 2e-4, 0.0, 3e-4],
-        least=[BarrierMargin(kind=obstacle, node=2, clearance=0.0), BarrierMargin(kind=connectivity, clearance=1e-6)],
+        minimum=[
+            BarrierMargin(barrier="obstacle", node=2, clearance=0.0),
+            BarrierMargin(barrier="connectivity", clearance=1e-6),
+        ],
         contact_nodes=[2],
-        friction_state=SafetyMargins.FRICTION_PULLED,
+        friction_state=SafetyMargins.FRICTION_SLIDING,
         friction_nodes=[1, 2],
         slowdown=0.81,
     )
@@ -91,7 +94,7 @@ def test_of_each_node_the_least_clearance_of_wall_and_shapes():
     assert told["clearance"] == [None, 2e-4, 0.0, None, 3e-4]
     assert told["least"] == {"obstacle": 0.0, "connectivity": 1e-6}
     assert told["contact"] == [2]
-    assert told["friction"] == {"state": "pulled", "nodes": [1, 2], "slowdown": 0.81}
+    assert told["friction"] == {"state": "sliding", "nodes": [1, 2], "slowdown": 0.81}
     assert (told["valid"], told["reason"]) == (True, "")
 
 
@@ -99,12 +102,6 @@ def test_margins_that_are_not_valid_have_no_number():
     told = plain(console_messages.margins(no_margins(STAMP, "no pose")))
     assert (told["valid"], told["reason"], told["clearance"], told["least"]) == (False, "no pose", [], {})
     assert told["friction"]["state"] == "unknown"
-
-
-def test_every_kind_of_barrier_has_a_name():
-    names = {name for name in vars(BarrierMargin) if name.startswith("KIND_")}
-    assert names
-    assert {f"KIND_{name.upper()}" for name in console_messages.KINDS.values()} == names
 
 
 def test_scene_outlines_are_simplified_to_the_resolution_of_the_screen():

@@ -12,7 +12,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-from magnetosuture_msgs.msg import BarrierMargin, CoilBridgeState, ThreadMaterial, TrackerState
+from magnetosuture_msgs.msg import CoilBridgeState, ThreadMaterial, TrackerState
 from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import Marker
 
@@ -20,16 +20,13 @@ from magnetosuture_thread.bags.types import MESSAGES as BAG_MESSAGES
 from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.coils.latch import Condition
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.evaluation.metrics import KINDS
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.messages import building, reading
 from magnetosuture_thread.messages.building import MessageBuilder
 from magnetosuture_thread.model import changes
-from magnetosuture_thread.model.barriers import BarrierKind
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES, serialised_velocity
-from magnetosuture_thread.resources import share
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.vision.look import State, no_pose
 
@@ -167,14 +164,3 @@ def test_the_bags_and_the_graph_have_the_same_own_messages():
     ):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())
-
-
-def test_the_kinds_of_barrier_have_the_same_numbers_everywhere():
-    constants = {
-        name.removeprefix("KIND_").lower(): getattr(BarrierMargin, name)
-        for name in (f"KIND_{kind.name}" for kind in BarrierKind)
-    }
-    assert constants == {kind.name.lower(): int(kind) for kind in BarrierKind}
-    assert constants == {name: number for number, name in enumerate(KINDS)}
-    text = (share("magnetosuture_msgs") / "msg" / "BarrierMargin.msg").read_text()
-    assert text.count("uint8 KIND_") == len(BarrierKind)

@@ -58,7 +58,7 @@ def marker(number: int, kind: int, scale: Vector3, friction: Friction, points: n
 
 @pytest.mark.parametrize("segments", [3, 4, 25])
 @pytest.mark.parametrize(
-    "friction", [UNKNOWN, Friction(FrictionState.FREE, (), 1.0), Friction(FrictionState.PULLED, (1, 3), 0.81)]
+    "friction", [UNKNOWN, Friction(FrictionState.FREE, (), 1.0), Friction(FrictionState.SLIDING, (1, 3), 0.81)]
 )
 @pytest.mark.parametrize("diameter", [1e-5, 1e-3])
 def test_markers_are_packed_as_rclpy_makes_them(segments: int, friction: Friction, diameter: float):

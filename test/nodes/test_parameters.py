@@ -37,7 +37,7 @@ def test_every_setting_is_a_described_parameter(graph):
     assert node.describe_parameter("segments").integer_range[0].from_value == 3
     # An empty list knows of what it is one.
     assert node.describe_parameter("gravity").type == node.get_parameter("gravity").type_.value == 8
-    assert node.describe_parameter("held_nodes").type == node.get_parameter("held_nodes").type_.value == 7
+    assert node.describe_parameter("fixed_nodes").type == node.get_parameter("fixed_nodes").type_.value == 7
 
 
 def test_what_stays_for_good_is_read_only_and_says_why(graph):

@@ -119,7 +119,7 @@ def test_markers_come_only_where_somebody_looks(graph, frames):
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=index * 33_000_000)))
         graph.wait(lambda index=index: len(predicted) >= index - 1, "an answer")
     graph.wait(lambda: len(markers) == len(frames) - 4, "markers of all frames from then on")
-    assert len(markers[-1].markers[0].points) == len(predicted[-1].vertices)
+    assert len(markers[-1].markers[0].points) == len(predicted[-1].positions)
 
 
 def test_both_say_how_they_are(graph, frames):

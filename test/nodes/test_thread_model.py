@@ -15,7 +15,7 @@ from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.model import choices
+from magnetosuture_thread.model import factory
 from magnetosuture_thread.model.formulations import rod
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.nodes import topics
@@ -54,11 +54,11 @@ def test_the_thread_starts_where_it_is_seen_and_follows(graph):
     assert last.header.frame_id == "dish"
     assert last.header.stamp == pose(1.0 + 10 / 30.0).header.stamp
     assert (last.formulation, last.material, last.solver) == ("rod", "polyamide_7_0", "banded")
-    assert len(last.vertices) == 26
-    assert len(last.stretch) == 25
-    assert last.vertices[0].x == pytest.approx(1e-3)
-    assert last.vertices[25].x == pytest.approx(1e-3 - 0.019, abs=1e-6)
-    assert max(abs(value) for value in last.stretch) < 1e-5
+    assert len(last.positions) == 26
+    assert len(last.strain) == 25
+    assert last.positions[0].x == pytest.approx(1e-3)
+    assert last.positions[25].x == pytest.approx(1e-3 - 0.019, abs=1e-6)
+    assert max(abs(value) for value in last.strain) < 1e-5
     assert 0.0 < last.residual < 1e-5
     assert last.substeps == 2
     assert last.interval == pytest.approx(1 / 30.0, abs=1e-6)
@@ -104,12 +104,12 @@ def test_friction_slows_the_needle_and_is_shown(graph):
         graph.wait(lambda k=k: len(margins) == k + 1 and len(markers) == k + 1, "margins and markers")
     pulled, resting = margins[-2:]
     assert pulled.scene_version == resting.scene_version == scene.version
-    assert pulled.friction_state == SafetyMargins.FRICTION_PULLED
+    assert pulled.friction_state == SafetyMargins.FRICTION_SLIDING
     assert list(pulled.friction_nodes) == list(resting.friction_nodes)
     count = len(pulled.friction_nodes)
     assert count >= 2
     assert pulled.slowdown == pytest.approx(0.9**count)
-    assert (resting.friction_state, resting.slowdown) == (SafetyMargins.FRICTION_RESTING, 1.0)
+    assert (resting.friction_state, resting.slowdown) == (SafetyMargins.FRICTION_STUCK, 1.0)
     red, green, blue = colour_of(markers[-2])
     assert red > green > blue
     assert colour_of(markers[-1])[2] == max(colour_of(markers[-1]))
@@ -144,7 +144,7 @@ def test_it_can_start_straight_without_a_camera(graph):
     predicted = graph.listen(topics.PREDICTED_THREAD)
     graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.003, 0.001))
     graph.wait(lambda: bool(predicted), "the start")
-    assert predicted[0].vertices[25].x == pytest.approx(0.003 - 0.019)
+    assert predicted[0].positions[25].x == pytest.approx(0.003 - 0.019)
 
 
 def test_shapes_give_margins_and_contact(graph):
@@ -209,7 +209,7 @@ class LameSolver(BandedSolver):
 
 
 def test_a_step_that_fell_back_is_published_and_said(graph, monkeypatch):
-    monkeypatch.setattr(choices, "BandedSolver", LameSolver)
+    monkeypatch.setattr(factory, "BandedSolver", LameSolver)
     graph.add(ThreadModelNode, initial_shape="straight")
     predicted, diagnostics = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.NEEDLE_POSE, pose(1.0))
@@ -244,7 +244,7 @@ def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):
     graph.wait(lambda: any(words in d.status[0].message for d in diagnostics), "a refusal")
     graph.publish(topics.NEEDLE_POSE, pose(1.2))
     graph.wait(lambda: len(predicted) == 2, "the next prediction")
-    assert np.isfinite([v.x for v in predicted[1].vertices]).all()
+    assert np.isfinite([v.x for v in predicted[1].positions]).all()
     assert predicted[1].interval == pytest.approx(0.2)
 
 
@@ -266,8 +266,8 @@ def test_the_thread_hangs_where_it_is_fixed_to_the_needle(graph):
     for k in range(3):
         graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, k * 1e-4))
         graph.wait(lambda k=k: len(predicted) == k + 1, "a prediction")
-    assert predicted[-1].vertices[0].x == pytest.approx(1.2e-3)
-    assert predicted[-1].vertices[0].y == pytest.approx(-5e-4)
+    assert predicted[-1].positions[0].x == pytest.approx(1.2e-3)
+    assert predicted[-1].positions[0].y == pytest.approx(-5e-4)
 
 
 def test_time_set_back_starts_anew(graph):

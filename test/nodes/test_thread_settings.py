@@ -65,8 +65,8 @@ class Bench:
             if outcome.prediction is None:
                 continue
             self.graph.wait(partial(self._predicted_last, message), "the prediction")
-            found = np.array([[vertex.x, vertex.y] for vertex in self.predicted[-1].vertices])
-            np.testing.assert_array_equal(found, outcome.prediction.vertices)
+            found = np.array([[vertex.x, vertex.y] for vertex in self.predicted[-1].positions])
+            np.testing.assert_array_equal(found, outcome.prediction.positions)
             assert self.margins[-1].valid == outcome.prediction.converged
             assert self.margins[-1].scene_version == self.predicted[-1].scene_version == self.scene.version
 
@@ -202,7 +202,7 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph):
         ({"viscosity": math.nan}, "out of range"),
         ({"material": "steel"}, "thread_model.material: got 'steel', expected one of polyamide_7_0, silk_6_0"),
         ({"segments": 400}, "longer than thick"),
-        ({"held_nodes": [1] * 200_000}, "200000 entries"),
+        ({"fixed_nodes": [1] * 200_000}, "200000 entries"),
         ({"scene": "dish_35mm"}, "read-only"),
         ({"gravity": [0.0, -9.8]}, "medium: air only"),
         ({"formulation": "paper"}, "read-only"),
@@ -298,7 +298,7 @@ def test_a_publisher_that_cannot_be_heard_is_named(graph):
 
 
 def test_a_scene_may_come_while_the_thread_is_waited_for(graph):
-    bench = Bench(graph, initial_shape="seen")
+    bench = Bench(graph, initial_shape="measured")
     bench.show(3)
     assert [margins.reason for margins in bench.margins] == ["waiting for the thread to be seen"] * 3
     bench.place(scene_with(POST))
@@ -310,7 +310,7 @@ def test_a_scene_may_come_while_the_thread_is_waited_for(graph):
 
 
 def test_who_waits_for_a_camera_in_vain_can_be_told_to_start(graph):
-    bench = Bench(graph, initial_shape="seen")
+    bench = Bench(graph, initial_shape="measured")
     bench.show(2)
     assert bench.set(initial_shape="straight") == []
     bench.change(initial_shape="straight")

@@ -29,12 +29,12 @@ from magnetosuture_thread.interface import (
     PREDICTED_THREAD,
     SCENE,
     SEEN_THREAD,
-    TRUE_THREAD,
+    TRUTH_THREAD,
 )
 from magnetosuture_thread.jobs.record import record
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.messages.packing import packed_margins, packed_prediction
-from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
+from magnetosuture_thread.messages.reading import margins_of, read_path, read_pose, stamp_of
 from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState
 from magnetosuture_thread.offline.predictions import predictions, sights
 from magnetosuture_thread.scene import SceneShape
@@ -114,7 +114,7 @@ def test_a_window_is_a_part_of_the_whole(pose_bag: Path):
 def test_the_source_must_be_there(pose_bag: Path, tmp_path: Path):
     with pytest.raises(BagError, match="camera/image_raw/compressed"):
         sights(Recording(Bag(pose_bag)), SETUP, source="camera")
-    blind = changed(pose_bag, tmp_path / "blind", lambda old, m: m if old.topic == TRUE_THREAD.recorded else None)
+    blind = changed(pose_bag, tmp_path / "blind", lambda old, m: m if old.topic == TRUTH_THREAD.recorded else None)
     for source in ("auto", "poses"):
         with pytest.raises(BagError, match="has no messages on"):
             sights(Recording(Bag(blind)), SETUP, source=source)
@@ -301,9 +301,9 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
         assert bytes(store.serialize_cdr(message, PREDICTED_THREAD.type_name)) == data
         assert (message.material, message.header.stamp.nanosec, message.step_time) == (material, 34, 0.0)
         assert message.scene_version == SETUP.scene.version
-        assert np.array_equal([[p.x, p.y] for p in message.vertices], prediction.vertices)
-        assert np.array_equal(message.stretch, prediction.stretch)
-    squeezed = Friction(FrictionState.PULLED, (2, 5, 6), 0.729)
+        assert np.array_equal([[p.x, p.y] for p in message.positions], prediction.positions)
+        assert np.array_equal(message.strain, prediction.strain)
+    squeezed = Friction(FrictionState.SLIDING, (2, 5, 6), 0.729)
     for given in (margins, replace(margins, in_contact=(3, 4)), replace(margins, friction=squeezed), None):
         data = packed_margins((0, 7), given, "" if given else "for a reason", "" if given else "0123456789abcdef")
         message = store.deserialize_cdr(data, MARGINS.type_name)

@@ -56,9 +56,10 @@ def needle(*barriers: Barrier, length: float = LENGTH, scene: Scene | None = Non
 
 
 def driven(safety: NeedleSafetyFilter, seed: int, periods: int = 300) -> tuple[float, set[str]]:
-    """PrescribedMotion a needle by random commands, each held for the whole hold time; return the least h and what was active."""
+    """Drive a needle by random commands, each held for the whole hold time; return the least h and what was active."""
     random = np.random.default_rng(seed)
-    tail, heading, least, active = np.array([-0.001, 0.0]), np.array([1.0, 0.0]), math.inf, set()
+    tail, heading, least = np.array([-0.001, 0.0]), np.array([1.0, 0.0]), math.inf
+    active: set[str] = set()
     (barrier,) = safety._barriers
     for period in range(periods):
         if period % 5 == 0:

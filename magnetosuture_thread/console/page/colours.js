@@ -1,7 +1,7 @@
 // What the colours mean. Each stands beside a word or a shape that says the same.
 
 export const FREE = "#12a150";
-export const RESTING = "#2f6bff";
+export const STUCK = "#2f6bff";
 export const GREY = "#7d8790";
 export const SEEN = "rgba(47, 123, 255, 0.40)";
 export const VELOCITY = "#7a3fc0";
@@ -11,7 +11,7 @@ export const COILS = ["#0f6fc6", "#c2570c", "#7b3fb5", "#0b8a7c"];
 
 // The same on dark ground.
 const ON_DARK = {
-  [FREE]: "#3fcf7d", [RESTING]: "#82a8ff", [VELOCITY]: "#b992f5", [MIDDLING]: "#ffab3d",
+  [FREE]: "#3fcf7d", [STUCK]: "#82a8ff", [VELOCITY]: "#b992f5", [MIDDLING]: "#ffab3d",
   "#0f6fc6": "#5db1f7", "#c2570c": "#ff9d5c", "#7b3fb5": "#c79bf2", "#0b8a7c": "#4fc7b8",
 };
 export const onGround = (colour, dark) => (dark ? ON_DARK[colour] ?? colour : colour);
@@ -21,7 +21,7 @@ const DEEPEST = [185, 58, 6];
 const DEEPEST_AT = 8; // nodes in friction
 
 // Orange, deeper with the number of nodes in friction.
-export function pulled(count) {
+export function sliding(count) {
   const share = Math.min(1, Math.max(0, count - 1) / (DEEPEST_AT - 1));
   const mixed = LIGHTEST.map((entry, at) => Math.round(entry + share * (DEEPEST[at] - entry)));
   return `#${mixed.map((entry) => entry.toString(16).padStart(2, "0")).join("")}`;
@@ -29,13 +29,13 @@ export function pulled(count) {
 
 export const OLD = 0.5; // [s] a prediction that is older is drawn as not valid
 
-// State and colour of the predicted thread: free, pulled, resting, unknown, invalid or old.
+// State and colour of the predicted thread: free, sliding, stuck, unknown, invalid or old.
 export function threadLook(predicted, margins, since) {
   if (!predicted) return { state: "none", colour: GREY };
   if (predicted.age + since > OLD) return { state: "old", colour: GREY };
   if (!margins || !margins.valid) return { state: "invalid", colour: GREY };
   const { state, nodes } = margins.friction;
-  const colour = { free: FREE, pulled: pulled(nodes.length), resting: RESTING }[state];
+  const colour = { free: FREE, sliding: sliding(nodes.length), stuck: STUCK }[state];
   return colour ? { state, colour } : { state: "unknown", colour: GREY };
 }
 

@@ -1,5 +1,5 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
-// data-friction (free, pulled, resting, unknown, invalid, old, none), data-colour of the predicted thread,
+// data-friction (free, sliding, stuck, unknown, invalid, old, none), data-colour of the predicted thread,
 // data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import { GREY, MIDDLING, SEEN, VELOCITY, nodeLook, onGround, threadLook } from "./colours.js";

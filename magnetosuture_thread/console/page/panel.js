@@ -139,8 +139,8 @@ function showThread({ graph, since }) {
     const { state, nodes, slowdown } = margins.friction;
     const count = plural(nodes.length, "node");
     const words = {
-      free: ["free", "ok"], pulled: [`pulled: ${count}, × ${slowdown.toFixed(2)}`, "warn"],
-      resting: [`resting: ${count}`, "rest"],
+      free: ["free", "ok"], sliding: [`sliding: ${count}, × ${slowdown.toFixed(2)}`, "warn"],
+      stuck: [`stuck: ${count}`, "rest"],
     }[state] ?? ["friction unknown", "silent"];
     write("friction", ...words);
   }

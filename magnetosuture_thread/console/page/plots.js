@@ -1,6 +1,6 @@
 // Running plots of the last 30 s, drawn a few times a second.
 
-import { COILS, FREE, MIDDLING, RESTING, VELOCITY, onGround } from "./colours.js";
+import { COILS, FREE, MIDDLING, STUCK, VELOCITY, onGround } from "./colours.js";
 import { fixed, isNumber, leastClearance, length, plural } from "./format.js";
 
 const SPAN = 30; // [s]
@@ -16,7 +16,7 @@ export class Plots {
       plot("clearance", [{ of: (s) => s.clearance, colour: FREE }], 1, (s) => figure(s.clearance, 2, "mm")),
       plot("friction", [
         { of: (s) => s.count, colour: MIDDLING, label: "nodes", steps: true },
-        { of: (s) => s.slowdown, colour: RESTING, label: "speed factor", dash: [4, 3] },
+        { of: (s) => s.slowdown, colour: STUCK, label: "speed factor", dash: [4, 3] },
       ], 2, (s) => (isNumber(s.count) ? `${plural(s.count, "node")}, × ${s.slowdown.toFixed(2)}` : "no data")),
       plot("speed", [
         { of: (s) => s.commanded, colour: VELOCITY, label: "commanded", dash: [5, 3] },

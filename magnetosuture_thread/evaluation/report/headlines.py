@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles
-from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures
+from magnetosuture_thread.model.margins import SOLID
 
 GOOD, MIDDLING, BAD, NONE = "good", "middling", "bad", "none"
 CLOSE, FAIR = 1.0, 5.0  # % of the length

@@ -66,9 +66,9 @@ def _draw_key(figure: Figure) -> None:
     """Draw what the colours mean."""
     states = (
         (Friction(FrictionState.FREE, (), 1.0), "free"),
-        (Friction(FrictionState.PULLED, (1,), 1.0), "friction at one node"),
-        (Friction(FrictionState.PULLED, tuple(range(20)), 1.0), "at twenty and more"),
-        (Friction(FrictionState.RESTING, (1,), 1.0), "between obstacles, not pulled"),
+        (Friction(FrictionState.SLIDING, (1,), 1.0), "friction at one node"),
+        (Friction(FrictionState.SLIDING, tuple(range(20)), 1.0), "at twenty and more"),
+        (Friction(FrictionState.STUCK, (1,), 1.0), "between obstacles, not pulled"),
     )
     lines = [Line2D([], [], color=friction_colour(friction), linewidth=3.0, label=label) for friction, label in states]
     figure.legend(
@@ -149,7 +149,7 @@ def draw_dish(axes: Axes, scene: Scene) -> None:
 
 def draw_thread(axes: Axes, instant: SteeredInstant, scale: float = 1.0) -> None:
     """Draw the thread in the colour of its friction, and the needle as a point with what is asked of it."""
-    points, friction = 1e3 * instant.prediction.vertices, instant.margins.friction
+    points, friction = 1e3 * instant.prediction.positions, instant.margins.friction
     colour = friction_colour(friction)
     axes.plot(points[:, 0], points[:, 1], color="white", linewidth=4.0 * scale, solid_capstyle="round", alpha=0.8)
     axes.plot(points[:, 0], points[:, 1], color=colour, linewidth=2.0 * scale, solid_capstyle="round")
@@ -176,6 +176,6 @@ def caption(instant: SteeredInstant) -> str:
     return {
         FrictionState.UNKNOWN: "unknown",
         FrictionState.FREE: "free",
-        FrictionState.PULLED: f"friction at {count}, needle slowed to {100.0 * friction.slowdown:.0f} %",
-        FrictionState.RESTING: f"{count} between obstacles, not pulled",
+        FrictionState.SLIDING: f"friction at {count}, needle slowed to {100.0 * friction.slowdown:.0f} %",
+        FrictionState.STUCK: f"{count} between obstacles, not pulled",
     }[friction.state]

@@ -137,7 +137,7 @@ class HerniaRun:
             rate=RATE,
             deepest=max(0.0, -(nearest + radius)),
             chord_deepest=max(0.0, float(self.chord_depths.max())),
-            stretch=max(float(np.abs(step.prediction.stretch).max()) for step in self.instants),
+            stretch=max(float(np.abs(step.prediction.strain).max()) for step in self.instants),
             most_friction=max(counts),
             slowest=min(step.margins.friction.slowdown for step in steps),
             median_step=float(np.median(took)),
@@ -182,9 +182,9 @@ def replay_steering(
     instants = list(_steps(SteeredThread(settings, centreline, needle), steering, progress))
     radius, obstacles = 0.5 * settings.thread().diameter, len(around.shapes)
     barriers = np.array(
-        [_distances(around, instant.prediction.vertices[1 : 1 + FIRST_NODES], obstacles) for instant in instants]
+        [_distances(around, instant.prediction.positions[1 : 1 + FIRST_NODES], obstacles) for instant in instants]
     )
-    middles = [0.5 * (i.prediction.vertices[1:] + i.prediction.vertices[:-1]) for i in instants]
+    middles = [0.5 * (i.prediction.positions[1:] + i.prediction.positions[:-1]) for i in instants]
     depths = np.array([-_distances(around, points, obstacles).min(initial=_FAR) for points in middles])
     return HerniaRun(settings, needle.scene, instants, barriers - radius, depths)
 
@@ -214,5 +214,5 @@ def _instant_figures(instant: SteeredInstant) -> dict[str, Any]:
         "slowdown": friction.slowdown,
         "asked": command.commanded.tolist() if command else [0.0, 0.0],
         "passed": command.filtered.tolist() if command else [0.0, 0.0],
-        "needle": instant.prediction.vertices[0].tolist(),
+        "needle": instant.prediction.positions[0].tolist(),
     }

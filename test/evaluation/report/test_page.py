@@ -55,7 +55,7 @@ def made_metrics(frames: int = 300, targets: tuple[str, ...] = ("truth", "seen")
             metrics.observe(Observation(stamp, reason=f"hidden by {EVIL}"))
             continue
         metrics.observe(sight)
-        prediction: Any = SimpleNamespace(vertices=NODES, stretch=np.array([0.0, -1e-5]), residual=1e-9)
+        prediction: Any = SimpleNamespace(positions=NODES, strain=np.array([0.0, -1e-5]), residual=1e-9)
         frame = FrameResult.of(sight, prediction, margins(1e-3 - 1e-5 * index), 1e-4, recorded=seen)
         metrics.add(frame)
     return metrics
@@ -319,7 +319,7 @@ def test_the_figures_are_the_worst_and_the_counts_of_all_frames():
     for index, (clearance, residual) in enumerate([(1e-4, 1e-9), (-1e-5, 1e-7), (2e-4, 1e-8)]):
         sight = Observation(index * 10**8, NODES[0], np.array([1.0, 0.0]), NODES, NODES)
         metrics.observe(sight)
-        prediction: Any = SimpleNamespace(vertices=NODES, stretch=np.zeros(25), residual=residual)
+        prediction: Any = SimpleNamespace(positions=NODES, strain=np.zeros(25), residual=residual)
         metrics.add(FrameResult.of(sight, prediction, margins(clearance), 1e-4))
     for index in range(3, 40):
         metrics.observe(Observation(index * 10**8, reason=f"{index % 20}"))

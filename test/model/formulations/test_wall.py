@@ -127,10 +127,10 @@ def test_polyamide_along_the_rim_is_where_the_rig_has_it(attachment: Attachment)
         truth = points_at(rig.thread, at)
         for wall, predictor in predictors.items():
             predicted = predictor.step(pose) if frame else predictor.start(pose, rig.thread)
-            off = np.linalg.norm(predicted.vertices - truth, axis=1)[1:].mean() / thread.length
+            off = np.linalg.norm(predicted.positions - truth, axis=1)[1:].mean() / thread.length
             errors[wall].append(float(off))
             if wall == RADIUS:
-                furthest = max(furthest, float(np.linalg.norm(predicted.vertices[1:], axis=1).max()))
+                furthest = max(furthest, float(np.linalg.norm(predicted.positions[1:], axis=1).max()))
     assert furthest < RADIUS - 0.5 * thread.diameter + OUTSIDE
     assert np.mean(errors[RADIUS]) < 0.0005
     assert max(errors[RADIUS]) < 0.0015

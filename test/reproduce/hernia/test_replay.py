@@ -38,7 +38,7 @@ def test_the_thread_is_the_papers_and_lies_in_the_dish(run: HerniaRun):
     assert run.settings.segments == 40
     assert len(run.scene.shapes) == 3
     radius = run.scene.dish.radius
-    assert max(float(np.linalg.norm(i.prediction.vertices, axis=1).max()) for i in run.instants) < radius
+    assert max(float(np.linalg.norm(i.prediction.positions, axis=1).max()) for i in run.instants) < radius
 
 
 def test_six_instants_tell_the_papers_story(run: HerniaRun):
@@ -46,16 +46,16 @@ def test_six_instants_tell_the_papers_story(run: HerniaRun):
     assert [round(instant["time"]) for instant in instants(run)] == [0, 12, 17, 27, 35, 55]
     assert free["state"] == "free"
     # Orange in the penetration path, and slowed.
-    assert penetrated["state"] == "pulled"
+    assert penetrated["state"] == "sliding"
     assert 1 <= len(penetrated["friction_nodes"]) <= 5
     assert np.hypot(*penetrated["passed"]) < 0.95 * np.hypot(*penetrated["asked"])
     # The lead moves left without pulling what is under friction.
-    assert slack["state"] == "resting"
+    assert slack["state"] == "stuck"
     assert slack["friction_nodes"]
     assert slack["passed"][0] < -1e-4
-    assert slack["needle"][0] < run.nearest(15.0).prediction.vertices[0, 0] - 2.5e-4
+    assert slack["needle"][0] < run.nearest(15.0).prediction.positions[0, 0] - 2.5e-4
     # Around the ring: more friction and slower each time.
-    assert [instant["state"] for instant in wrapped] == ["pulled"] * 3
+    assert [instant["state"] for instant in wrapped] == ["sliding"] * 3
     counts = [len(instant["friction_nodes"]) for instant in wrapped]
     assert 5 < counts[0] < counts[1] < counts[2]
     speeds = [float(np.hypot(*instant["passed"]) / np.hypot(*instant["asked"])) for instant in wrapped]
@@ -65,7 +65,7 @@ def test_six_instants_tell_the_papers_story(run: HerniaRun):
 
 def test_the_thread_goes_around_the_ring_and_is_tight_on_it(run: HerniaRun):
     ring = run.scene.obstacles[0]
-    vertices = run.nearest(55.0).prediction.vertices
+    vertices = run.nearest(55.0).prediction.positions
     assert isinstance(ring, Polygon)
     centre = np.mean(ring.rings[0], axis=0)
     around = np.unwrap(np.arctan2(*(vertices - centre).T[::-1]))

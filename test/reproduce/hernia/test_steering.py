@@ -42,12 +42,12 @@ def through() -> HerniaRun:
 def test_a_needle_goes_where_it_is_told_and_slower_under_friction(through: HerniaRun):
     states = [instant.margins.friction.state for instant in through.instants]
     assert states[0] is FrictionState.FREE
-    assert states.index(FrictionState.PULLED) < states.index(FrictionState.RESTING)
+    assert states.index(FrictionState.SLIDING) < states.index(FrictionState.STUCK)
     for last, instant in zip(through.instants[:-1], through.instants[1:], strict=True):
         assert instant.command is not None
         before = last.margins.friction.slowdown
         assert instant.command.slowdown == before
-        moved = (instant.prediction.vertices[0] - last.prediction.vertices[0]) * 33.0
+        moved = (instant.prediction.positions[0] - last.prediction.positions[0]) * 33.0
         np.testing.assert_allclose(moved, instant.command.filtered, atol=1e-9)
         if set(instant.command.active) <= {"friction"}:
             np.testing.assert_allclose(instant.command.filtered, before * instant.command.commanded, atol=1e-9)
@@ -63,7 +63,7 @@ def test_neither_needle_nor_thread_enters(through: HerniaRun):
     assert summary.stretch < 0.01
     centres = np.array([[0.004, 0.0018], [0.004, -0.0018]])
     for instant in through.instants:
-        vertices = instant.prediction.vertices
+        vertices = instant.prediction.positions
         distances = np.linalg.norm(vertices[:, None] - centres, axis=2) - 1e-3
         assert distances[1:].min() > 30e-6 - 1e-6  # the thread's radius
         assert distances[0].min() > 3e-4 - 1e-6  # the needle's clearance
@@ -72,7 +72,7 @@ def test_neither_needle_nor_thread_enters(through: HerniaRun):
 def test_the_barriers_are_those_of_the_first_nodes(through: HerniaRun):
     assert through.barriers.shape == (len(through.instants), 5, 2)
     for k in (0, 60, -1):
-        nodes = through.instants[k].prediction.vertices[1:6]
+        nodes = through.instants[k].prediction.positions[1:6]
         expected = np.linalg.norm(nodes - [0.004, -0.0018], axis=1) - 1e-3 - 30e-6
         np.testing.assert_allclose(through.barriers[k, :, 1], expected, atol=1e-9)
 
@@ -87,7 +87,7 @@ def test_the_same_steering_gives_the_same_run(through: HerniaRun):
     again = SteeredThread(SETTINGS, LINE, NEEDLE)
     for k in range(1, 120):
         again.step(1.0 / 33.0, steering((3.0, 3e-3, 0.0), (1.0, 0.0, 0.0)).at((k - 1) / 33.0))
-        np.testing.assert_array_equal(again.now.prediction.vertices, through.instants[k].prediction.vertices)
+        np.testing.assert_array_equal(again.now.prediction.positions, through.instants[k].prediction.positions)
 
 
 def test_a_velocity_in_another_unit_is_refused():
