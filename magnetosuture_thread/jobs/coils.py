@@ -21,5 +21,5 @@ def coils(action: str) -> dict[str, Any]:
 
     with CoilClient() as client:
         if action != "state":
-            client.do(action)
+            client.execute(action)
         return client.state()

@@ -1,4 +1,4 @@
-"""Between the coil bridge's messages and its core's own types."""
+"""Conversion between the coil bridge's messages and the types of its core."""
 
 from __future__ import annotations
 
@@ -6,80 +6,80 @@ from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents, FilterState
 from rclpy.serialization import deserialize_message
 
-from magnetosuture_thread.coils.bridge import Outcome
+from magnetosuture_thread.coils.bridge import BridgeOutput
+from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState
-from magnetosuture_thread.coils.latch import Condition
-from magnetosuture_thread.coils.station import CoilStation
+from magnetosuture_thread.coils.latch import ArmingState
 from magnetosuture_thread.nodes.messages import header, vector
 
 _STATES = {
-    Condition.INACTIVE: CoilBridgeState.STATE_INACTIVE,
-    Condition.ACTIVE: CoilBridgeState.STATE_ACTIVE,
-    Condition.FAULT: CoilBridgeState.STATE_FAULT,
+    ArmingState.INACTIVE: CoilBridgeState.STATE_INACTIVE,
+    ArmingState.ACTIVE: CoilBridgeState.STATE_ACTIVE,
+    ArmingState.FAULT: CoilBridgeState.STATE_FAULT,
 }
 
 
-def currents_message(stamp: Time, command: Time | None, outcome: Outcome) -> CoilCurrents:
+def currents_message(stamp: Time, command: Time | None, output: BridgeOutput) -> CoilCurrents:
     """Return coil currents with the stamp of the command that they follow, or why they are zero."""
     return CoilCurrents(
         header=header(stamp),
-        coil=list(outcome.coils),
-        current=outcome.allocation.currents.tolist(),
-        stop="; ".join(outcome.reasons),
-        saturated=outcome.allocation.saturated,
+        coil=list(output.coils),
+        current=output.allocation.currents.tolist(),
+        stop="; ".join(output.reasons),
+        saturated=output.allocation.saturated,
         command=command or Time(),
     )
 
 
-def filter_message(stamp: Time, outcome: Outcome) -> FilterState:
-    """Return what became of the command; `stamp` is the command's, or the time now where there is none."""
+def filter_message(stamp: Time, output: BridgeOutput) -> FilterState:
+    """Return the filtered command as a message; `stamp` is the command's, or the time now where there is none."""
     return FilterState(
         header=header(stamp),
-        source=outcome.source,
-        commanded=vector(outcome.commanded),
-        filtered=vector(outcome.filtered),
-        applied=vector(outcome.applied),
-        slowdown=outcome.slowdown,
-        active=list(outcome.active),
-        overridden=outcome.overridden,
-        reason=outcome.reason,
+        source=output.source,
+        commanded=vector(output.commanded),
+        filtered=vector(output.filtered),
+        applied=vector(output.applied),
+        slowdown=output.slowdown,
+        active=list(output.active),
+        overridden=output.overridden,
+        reason=output.reason,
     )
 
 
-def state_message(stamp: Time, station: CoilStation, driver: DriverState, refused: int) -> CoilBridgeState:
-    """Return what the bridge does and why.
+def state_message(stamp: Time, system: CoilSystem, driver: DriverState, refused: int) -> CoilBridgeState:
+    """Return the state of the bridge as a message.
 
     Args:
         stamp: of the message.
-        station: what the bridge has in hand.
-        driver: what its driver knows.
+        system: bridge, driver and latch.
+        driver: state of the driver.
         refused: messages so far.
     """
-    latch, outcome = station.latch, station.outcome
+    latch, output = system.latch, system.output
     message = CoilBridgeState(
         header=header(stamp),
-        state=_STATES[latch.condition],
+        state=_STATES[latch.state],
         armed=latch.armed,
         emergency_stopped=latch.emergency,
-        driver=station.driver_name,
+        driver=system.driver_name,
         driver_ready=driver.ready,
         driver_warnings=list(driver.warnings),
         supply_voltage=list(driver.voltages),
         refused=refused,
-        scene_version="" if station.bridge is None else station.bridge.scene_version,
+        scene_version="" if system.bridge is None else system.bridge.scene_version,
     )
     if driver.currents is not None:
         message.measured_current = driver.currents.tolist()
-    if outcome is None:
-        message.state = message.state if latch.latched else CoilBridgeState.STATE_UNCONFIGURED
-        message.reasons = [latch.latched or "unconfigured"]
+    if output is None:
+        message.state = message.state if latch.latched_reason else CoilBridgeState.STATE_UNCONFIGURED
+        message.reasons = [latch.latched_reason or "unconfigured"]
         return message
-    message.reasons = list(outcome.reasons)
-    message.commanded = vector(outcome.commanded)
-    message.filtered = vector(outcome.filtered)
-    message.applied = vector(outcome.applied)
-    message.saturated = outcome.allocation.saturated
-    message.current = outcome.allocation.currents.tolist()
+    message.reasons = list(output.reasons)
+    message.commanded = vector(output.commanded)
+    message.filtered = vector(output.filtered)
+    message.applied = vector(output.applied)
+    message.saturated = output.allocation.saturated
+    message.current = output.allocation.currents.tolist()
     return message
 
 
