@@ -24,10 +24,10 @@ import shapely
 from rich.console import Console
 
 from magnetosuture_thread.cli.terminal import sayer
-from magnetosuture_thread.coils.bridge import Bridge
+from magnetosuture_thread.coils.bridge import CoilBridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.coils.settings import MAX_BLIND_WAY, CoilBridgeSettings
+from magnetosuture_thread.coils.settings import MAX_BLIND_DISTANCE, CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, shape_from_mapping
@@ -134,7 +134,7 @@ def random_settings(random: np.random.Generator) -> CoilBridgeSettings:
                 driver_timeout=driver_timeout,
                 command_timeout=min(1.0, max(4.0 / rate, float(random.uniform(0.05, 1.0)))),
                 pose_timeout=min(1.0, max(4.0 / rate, float(random.uniform(0.05, 1.0)))),
-                max_speed=float(min(0.5, random.choice([1.0, random.uniform(0.1, 1.0)]) * MAX_BLIND_WAY / hold)),
+                max_speed=float(min(0.5, random.choice([1.0, random.uniform(0.1, 1.0)]) * MAX_BLIND_DISTANCE / hold)),
                 max_acceleration=float(10.0 ** random.uniform(-1.0, 2.0)),
                 max_current_slew=float(10.0 ** random.uniform(2.0, 5.0)),
                 max_current=float(random.uniform(2.0, 30.0)),
@@ -246,7 +246,7 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
     else:
         return found
     try:
-        bridge = Bridge(settings, ArmingLatch(), scene)
+        bridge = CoilBridge(settings, ArmingLatch(), scene)
     except ConfigurationError:
         return found
     bridge.latch.activate()
@@ -270,7 +270,7 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
             _, stamp, (tail, heading) = poses.popleft()
             number += 1
             try:
-                bridge.needle.see(tail, heading, stamp, number, now, now)
+                bridge.extrapolator.update(tail, heading, stamp, number, now, now)
             except InvalidInputError as error:
                 if "publishers" in str(error) or "finite" in str(error):
                     raise

@@ -61,7 +61,7 @@ def test_in_every_setup_that_ships_the_needle_gets_to_the_end_of_its_path_throug
     tail, heading, time, interval, progress = np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]), 0.0, 0.02, 0.0
     velocity, shares = np.zeros(2), []
     while progress < 1.0:
-        command = follower.follow(time, tail, heading)
+        command = follower.compute_command(time, tail, heading)
         progress, time = command.progress, time + interval
         assert time < 120.0
         velocity = safety.filter(command.velocity, tail, heading, previous=velocity, elapsed=interval).filtered

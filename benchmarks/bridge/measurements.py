@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import yaml
 
 from benchmarks.bridge.report import BridgeReport, ZeroDelays
-from magnetosuture_thread.coils.sources import SILENCE
+from magnetosuture_thread.coils.input_checks import SILENCE_TIMEOUT
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
 from magnetosuture_thread.rig.power.watch import DriveWatch
@@ -117,7 +117,7 @@ class BridgeBench:
         """
         # While the bridge still counts those that were killed as speaking, it would refuse all without looking.
         self._wait(lambda: not self._driven(), "zero")
-        time.sleep(2.0 * SILENCE)
+        time.sleep(2.0 * SILENCE_TIMEOUT)
         self._watch.forget()
         self.start("fuzzer", count=count)
         self._wait(lambda: self._nodes.ended("fuzzer"), "the fuzzer to end", PATIENCE + count / 200.0)
@@ -152,7 +152,7 @@ class BridgeBench:
             try:
                 # Another each time: the one that is not heard may be the client.
                 with self._client() as client:
-                    client.do("arm")
+                    client.execute("arm")
                 return
             except GraphError as error:
                 self._nodes.check()
@@ -236,7 +236,7 @@ def measure_bridge(
                 delays = [bench.stop_trials(trials, progress)]
                 say(delays[-1].words)
                 with CoilClient() as client:
-                    loop, scheduling = client.loop()
+                    loop, scheduling = client.loop_timing()
                 bench.start("commander")
                 for victim in ("commander", "tracker", "coil_bridge"):
                     say(f"{kills} times kill -9 of the {victim}")

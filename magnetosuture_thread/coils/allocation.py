@@ -1,4 +1,4 @@
-"""From the velocity that is asked of the needle's tip to coil currents."""
+"""Allocation of coil currents for a commanded tip velocity, by bounded least squares."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
 
-# Weights of what the currents are for. A drift cannot be kept away everywhere.
+# Weights of the least-squares objectives. Drift cannot be avoided everywhere.
 DRIVE_WEIGHT = 1.0
 TURN_WEIGHT = 1.0
 ALIGN_WEIGHT = 0.1
 DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
-STEEPEST = 0.8  # sine of the greatest angle between field and needle: beyond, more turns it no faster
-SATURATION = 0.05  # a velocity missed by more than this share, at a current limit, counts as saturated
+MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
+SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
 
 
 @dataclass(frozen=True)
 class NeedleMechanics:
-    """What the bridge must know of the needle.
+    """Geometry, magnetic moment and drag of the needle.
 
     Attributes:
         length: along the body [m].
@@ -48,7 +48,7 @@ class NeedleMechanics:
 
     @cached_property
     def kinematics(self) -> NeedleKinematics:
-        """How a velocity of the tip moves it."""
+        """Kinematics of the needle under a tip velocity."""
         return NeedleKinematics(self.length, self.curvature)
 
     @property
@@ -68,12 +68,12 @@ class NeedleMechanics:
 
 @dataclass(frozen=True)
 class Allocation:
-    """Currents and what they reach.
+    """Coil currents and the tip velocity that they give.
 
     Attributes:
         currents: of each coil, shape (m,) [A].
-        velocity: of the tip, that these currents give by the bridge's model, shape (2,) [m/s].
-        saturated: whether a current limit keeps the needle from the velocity asked for.
+        velocity: of the tip with these currents by the bridge's model, shape (2,) [m/s].
+        saturated: whether a current limit keeps the needle from the commanded velocity.
     """
 
     currents: Vector
@@ -81,25 +81,24 @@ class Allocation:
     saturated: bool
 
     def scaled(self, share: float) -> Allocation:
-        """Return a share of the currents; the velocity is linear in them."""
+        """Return the allocation scaled by a factor; the velocity is linear in the currents."""
         return self if share == 1.0 else Allocation(share * self.currents, share * self.velocity, self.saturated)
 
 
 class CoilAllocation:
-    """Turns a velocity of the needle's tip into currents.
+    """Allocates coil currents for a velocity of the needle's tip.
 
-    A slender magnet in a viscous liquid turns into the field within hundredths of a second, and is pulled
-    along where the field grows. With the unit vector e from tail to tip, n across, the chord l, the
+    A slender magnet in a viscous liquid aligns with the field within hundredths of a second, and is pulled
+    along the field's gradient. With the unit vector e from tail to tip, n across, the chord l, the
     poles -q, +q at tail and tip and q = m / length, the currents give the tip the velocity
 
         v . e = F . e / drag                                  F = q (B_tip - B_tail)
         v . n = F . n / drag_across + omega l / 2             omega = q l B . n / turning_drag
 
     with the mean field B of both ends. They are the bounded least-squares solution of: both velocities;
-    a field B_0 along the needle, which holds its direction; little force across, which is there in most
-    places since the field grows towards the coils, and makes the needle drift; and little current. The
-    needle turns against a drift that is left until it crabs along its way. A zero velocity takes zero
-    currents.
+    a field B_0 along the needle, which holds its direction; little force across, which exists in most
+    places since the field grows towards the coils, and causes drift; and little current. The needle turns
+    against the remaining drift until it moves at a constant angle to its path. A zero velocity gives zero currents.
 
     Source: none.
 
@@ -118,7 +117,7 @@ class CoilAllocation:
         self._max_current = max_current
 
     def zero(self) -> Allocation:
-        """Return no current in any coil."""
+        """Return zero currents."""
         return Allocation(np.zeros(len(self.names)), np.zeros(2), False)
 
     def allocate(
@@ -126,8 +125,8 @@ class CoilAllocation:
         velocity: Vector,
         tail: Vector,
         heading: Vector,
-        before: Vector | None = None,
-        largest_change: float = math.inf,
+        previous: Vector | None = None,
+        max_change: float = math.inf,
     ) -> Allocation:
         """Return the currents for a tip velocity.
 
@@ -135,9 +134,8 @@ class CoilAllocation:
             velocity: of the tip, shape (2,) [m/s].
             tail: the needle's tail, shape (2,) [m].
             heading: unit vector along the needle at its tail, shape (2,).
-            before: the currents until now, from which each may differ by `largest_change` [A], shape (m,);
-                from any if None.
-            largest_change: see there; not held where the velocity is zero.
+            previous: currents of the last step, shape (m,) [A]; no limit on change if None.
+            max_change: maximum change of each current [A]; not applied to a zero velocity.
         """
         if not np.any(velocity):
             return self.zero()
@@ -151,34 +149,34 @@ class CoilAllocation:
         along = e @ pull / needle.drag
         drift = n @ pull / needle.drag_across
         turning = lever * needle.pole * needle.chord / needle.turning_drag * (n @ mean)
-        # A tip speed of `fastest` takes a field at the steepest angle that still turns the needle faster.
-        fastest = STEEPEST * lever * needle.pole * needle.chord / needle.turning_drag * self._field
-        sideways = min(fastest, max(-fastest, float(velocity @ n)))
-        usual = needle.pole * self._field / needle.drag  # a speed: what the field at one pole would give
+        # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
+        max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
+        sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n)))
+        reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
         system = np.vstack(
             [
-                DRIVE_WEIGHT / usual * along,
-                TURN_WEIGHT * STEEPEST / fastest * (turning + drift),
+                DRIVE_WEIGHT / reference_speed * along,
+                TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drift),
                 ALIGN_WEIGHT / self._field * (e @ mean),
-                DRIFT_WEIGHT / usual * drift,
+                DRIFT_WEIGHT / reference_speed * drift,
                 CURRENT_WEIGHT / self._max_current * np.eye(len(self.names)),
             ]
         )
         target = np.zeros(len(system))
-        target[0] = DRIVE_WEIGHT / usual * float(velocity @ e)
-        target[1] = TURN_WEIGHT * STEEPEST / fastest * sideways
+        target[0] = DRIVE_WEIGHT / reference_speed * float(velocity @ e)
+        target[1] = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * sideways
         target[2] = ALIGN_WEIGHT
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
-        if before is not None:
-            lower = np.clip(before - largest_change, -limit, limit)
-            upper = np.clip(before + largest_change, -limit, limit)
-        # Most solutions are well inside of the limits, and then plain least squares is one of them.
+        if previous is not None:
+            lower = np.clip(previous - max_change, -limit, limit)
+            upper = np.clip(previous + max_change, -limit, limit)
+        # Most solutions are inside the limits, where the unconstrained one is optimal.
         currents = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
         if np.any((currents < lower) | (currents > upper)):
-            # Bounds that meet are refused by the solver; so little apart they do no harm.
+            # The solver rejects equal bounds; the small gap has no effect.
             found = lsq_linear(system, target, bounds=(lower, np.maximum(upper, lower + 1e-9)), method="bvls")
             currents = np.clip(found.x, lower, upper)
         reached = float(along @ currents) * e + float((turning + drift) @ currents) * n
-        missed = float(np.linalg.norm(reached - velocity)) > SATURATION * float(np.linalg.norm(velocity))
-        return Allocation(currents, reached, missed and bool(np.any(np.abs(currents) >= 0.999 * limit)))
+        inaccurate = float(np.linalg.norm(reached - velocity)) > SATURATION_TOLERANCE * float(np.linalg.norm(velocity))
+        return Allocation(currents, reached, inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit)))

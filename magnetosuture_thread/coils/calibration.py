@@ -1,4 +1,4 @@
-"""The calibration of a rig's coils: a YAML file that says of each coil what was measured."""
+"""Coil calibration: the measured properties of a rig's coils, as a YAML file."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any
 
 import yaml
 
-from magnetosuture_thread.coils.field import MODELS, CoilModel, CoilProperties, make_coils
+from magnetosuture_thread.coils.field import FIELD_MODELS, CoilModel, CoilProperties, make_coils
 from magnetosuture_thread.configuration import from_mapping, read_yaml, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
 
-WHAT = "coil calibration"
-LEAST_COILS = 3  # fewer could not pull in every direction
-TEXTS = ("name", "date", "notes")
-NEEDED = ("name", "angle", "distance", "radius", "field_per_current")
+FILE_KIND = "coil calibration"
+MIN_COILS = 3  # needed to pull in every direction
+TEXT_KEYS = ("name", "date", "notes")
+REQUIRED_KEYS = ("name", "angle", "distance", "radius", "field_per_current")
 
-HEADING = """\
+FILE_HEADER = """\
 # Calibration of a rig's coils, for the parameter `calibration` of coil_bridge. SI units: rad, m, T/A, ohm, T.
 """
 
 
 @dataclass(frozen=True)
 class CoilCalibration:
-    """What was measured of a rig's coils.
+    """Measured properties of a rig's coils.
 
     Attributes:
         name: of the rig.
@@ -43,71 +43,71 @@ class CoilCalibration:
     coils: tuple[CoilProperties, ...]
 
     def field(self) -> CoilModel:
-        """Return the coils' field."""
+        """Return the field model of the coils."""
         return make_coils(self.model, self.coils)
 
     def to_yaml(self) -> str:
-        """Return the file."""
-        head = {key: getattr(self, key) for key in (*TEXTS, "model")}
+        """Return the calibration as YAML text."""
+        head = {key: getattr(self, key) for key in (*TEXT_KEYS, "model")}
         coils = [_rounded(to_mapping(coil)) for coil in self.coils]
-        return HEADING + yaml.dump({**head, "coils": coils}, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+        return FILE_HEADER + yaml.dump({**head, "coils": coils}, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 def read_calibration(path: Path) -> CoilCalibration:
-    """Read a calibration.
+    """Read a calibration from a YAML file.
 
     Raises:
-        ConfigurationError: the file cannot be read, is no YAML, lacks a key or has one too many, or a value is
-            of the wrong type or beyond its bounds; with file, key, value and what was expected.
+        ConfigurationError: the file is unreadable or no YAML, a key is missing or unknown, or a value has the wrong
+            type or is out of bounds; with file, key, value and expectation.
     """
-    content, source = read_yaml(path, WHAT), str(path)
-    keys = (*TEXTS, "model", "coils")
+    content, source = read_yaml(path, FILE_KIND), str(path)
+    keys = (*TEXT_KEYS, "model", "coils")
     if not isinstance(content, Mapping):
-        raise ConfigurationError(WHAT, content, f"keys {', '.join(keys)}", source)
+        raise ConfigurationError(FILE_KIND, content, f"keys {', '.join(keys)}", source)
     unknown = next((key for key in content if key not in keys), None)
     if unknown is not None:
         raise ConfigurationError(str(unknown), content[unknown], f"one of {', '.join(keys)}", source)
-    _refuse_missing(content, ("model", "coils"), "", source)
-    texts = {key: content.get(key, "") for key in TEXTS}
+    _require_keys(content, ("model", "coils"), "", source)
+    texts = {key: content.get(key, "") for key in TEXT_KEYS}
     for key, text in texts.items():
         if not isinstance(text, str):
             raise ConfigurationError(key, text, "text", source)
     model = content["model"]
-    if not isinstance(model, str) or model not in MODELS:
-        raise ConfigurationError("model", model, f"one of {', '.join(MODELS)}", source)
+    if not isinstance(model, str) or model not in FIELD_MODELS:
+        raise ConfigurationError("model", model, f"one of {', '.join(FIELD_MODELS)}", source)
     listed = content["coils"]
-    if not isinstance(listed, list) or len(listed) < LEAST_COILS:
+    if not isinstance(listed, list) or len(listed) < MIN_COILS:
         given = f"{len(listed)} coils" if isinstance(listed, list) else listed
-        raise ConfigurationError("coils", given, f"a list of at least {LEAST_COILS} coils", source)
+        raise ConfigurationError("coils", given, f"a list of at least {MIN_COILS} coils", source)
     coils = tuple(_coil(values, f"coils[{index}]", source) for index, values in enumerate(listed))
     names = [coil.name for coil in coils]
-    twice = next((name for index, name in enumerate(names) if name in names[:index]), None)
-    if twice is not None:
-        raise ConfigurationError("coils", f"two of the name {twice}", "a name of its own for each", source)
+    duplicate = next((name for index, name in enumerate(names) if name in names[:index]), None)
+    if duplicate is not None:
+        raise ConfigurationError("coils", f"two of the name {duplicate}", "a name of its own for each", source)
     return CoilCalibration(texts["name"], texts["date"], texts["notes"], model, coils)
 
 
 def _coil(values: Any, where: str, source: str) -> CoilProperties:
     if not isinstance(values, Mapping):
-        raise ConfigurationError(where, values, f"keys {', '.join(NEEDED)}", source)
+        raise ConfigurationError(where, values, f"keys {', '.join(REQUIRED_KEYS)}", source)
     try:
-        _refuse_missing(values, NEEDED, f"{CoilProperties.GROUP}.", "")
+        _require_keys(values, REQUIRED_KEYS, f"{CoilProperties.GROUP}.", "")
         return from_mapping(CoilProperties, {str(key): value for key, value in values.items()})
     except ConfigurationError as error:
         name = error.name.replace(CoilProperties.GROUP, where, 1)
         raise ConfigurationError(name, error.value, error.expectation, source) from None
 
 
-def _refuse_missing(given: Mapping[Any, Any], needed: tuple[str, ...], group: str, source: str) -> None:
+def _require_keys(given: Mapping[Any, Any], needed: tuple[str, ...], group: str, source: str) -> None:
     missing = next((key for key in needed if key not in given), None)
     if missing is not None:
         raise ConfigurationError(f"{group}{missing}", None, f"a value: {', '.join(needed)} are needed", source)
 
 
 def _rounded(values: dict[str, Any]) -> dict[str, Any]:
-    """Return numbers with eight digits, more than any probe has, and none of what was not measured."""
+    """Return values rounded to eight digits, without those that were not measured."""
     named = {key: float(f"{value:.8g}") if isinstance(value, float) else value for key, value in values.items()}
-    return {key: value for key, value in named.items() if key in NEEDED or value}
+    return {key: value for key, value in named.items() if key in REQUIRED_KEYS or value}
 
 
 class _Dumper(yaml.SafeDumper):

@@ -1,4 +1,4 @@
-"""Fits the model of the coils to measurements of their field."""
+"""Least-squares fit of the coil model to measurements of its field."""
 
 from __future__ import annotations
 
@@ -10,41 +10,42 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from magnetosuture_thread.coils.calibration import LEAST_COILS, CoilCalibration
-from magnetosuture_thread.coils.field import MODELS, CoilProperties
+from magnetosuture_thread.coils.calibration import MIN_COILS, CoilCalibration
+from magnetosuture_thread.coils.field import FIELD_MODELS, CoilProperties
 from magnetosuture_thread.coils.measurements import ProbeMeasurements
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 
 Array = NDArray[np.float64]
 
-LEAST_READINGS = 6  # of a coil with current in it: twelve numbers for its four, with some to tell how well they fit
-NEAREST, FARTHEST = 1.05, 1.0  # a coil is no nearer than so many times the farthest point, nor farther than this [m]
-RADII = (0.002, 0.5)  # m
-NO_RADIUS = 0.025  # m; of a dipole, whose field has none
-ROUGH, EXACT = 1e-5, 1e-12  # of cost and parameters, where a fit ends: of one coil, which is a start, and of all
-STARTS = (1.0, 0.5, 2.0)  # of the distance that the gradient tells, where a fit begins
-WORST_FIT = 0.25  # of the field measured; with a greater residual it is not from these coils
-SINGULAR = 1e-6  # of the scaled Jacobian: below, some parameters cannot be told apart
+MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
+MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
+MAX_DISTANCE = 1.0  # m, of a coil
+RADIUS_BOUNDS = (0.002, 0.5)  # m
+DIPOLE_RADIUS = 0.025  # m; placeholder, as a dipole has none
+COIL_TOLERANCE, JOINT_TOLERANCE = 1e-5, 1e-12  # of cost and parameters: initial fit of one coil, fit of all
+START_RATIOS = (1.0, 0.5, 2.0)  # initial distances, relative to that by the field's gradient
+MAX_RELATIVE_RESIDUAL = 0.25  # of the measured field; a larger residual means other coils
+MIN_SINGULAR_VALUE = 1e-6  # of the scaled Jacobian; below, parameters are unidentifiable
 PARAMETERS = ("angle", "distance", "radius", "field_per_current")
-# Standard deviations, of the angle in rad, of the others as a share: beyond, a parameter is poorly determined, or
-# the measurements say nothing of it. The field hardly depends on the radius, so it may be anything.
-POOR = {"angle": 0.02, "distance": 0.1, "radius": 0.25, "field_per_current": 0.02}
-UNKNOWN = {"angle": 0.3, "distance": 1.0, "radius": math.inf, "field_per_current": 0.5}
+# Standard deviations, of the angle in rad, of the others relative: above, a parameter is poorly determined, or
+# unidentifiable. The field hardly depends on the radius, which has no such limit.
+POOR_DEVIATION = {"angle": 0.02, "distance": 0.1, "radius": 0.25, "field_per_current": 0.02}
+MAX_DEVIATION = {"angle": 0.3, "distance": 1.0, "radius": math.inf, "field_per_current": 0.5}
 
 
 @dataclass(frozen=True)
 class CalibrationFit:
-    """What a fit found.
+    """Result of a calibration fit.
 
     Attributes:
         calibration: the coils.
         deviations: standard deviations of angle [rad], distance [m], radius [m] and field per current [T/A]
             of each coil, shape (m, 4); not a number where the model has no such parameter.
-        poor: names of the parameters of each coil that are poorly determined.
-        background: what the probe reads without currents, shape (2,) [T].
-        residual: root of the mean square of a component's difference [T].
+        poor: names of the poorly determined parameters of each coil.
+        background: reading of the probe without currents, shape (2,) [T].
+        residual: root mean square of the difference of a component [T].
         worst: line of the file with the largest difference, and its size [T].
-        readings: how many the fit rests on.
+        readings: number used in the fit.
     """
 
     calibration: CoilCalibration
@@ -56,7 +57,7 @@ class CalibrationFit:
     readings: int
 
     def to_json(self) -> dict[str, Any]:
-        """Return all as plain values: coils with their deviations, and the whole."""
+        """Return the result as plain values."""
         coils = [
             {
                 **{key: getattr(coil, key) for key in ("name", *PARAMETERS, "residual")},
@@ -89,8 +90,8 @@ def fit_calibration(data: ProbeMeasurements, model: str = "loops") -> Calibratio
         model: loops or dipoles.
 
     Raises:
-        InvalidInputError: too few coils or readings, points beyond a coil, parameters that these readings say
-            nothing of, or a field that no such coils have.
+        InvalidInputError: too few coils or readings, points beyond a coil, unidentifiable
+            parameters, or a field that does not fit the model.
 
     Source: none; nonlinear least squares by scipy, trust region reflective.
     """
@@ -100,34 +101,34 @@ def fit_calibration(data: ProbeMeasurements, model: str = "loops") -> Calibratio
     background = off.mean(axis=0) if len(off) else np.zeros(2)
     starts = [_start(data, index, model, background, size) for index in range(len(data.names))]
     solve = _Problem(data, np.arange(len(data.names)), model, size)
-    found = solve.best([np.concatenate([*starts, background / size])], EXACT)
+    found = solve.best([np.concatenate([*starts, background / size])], JOINT_TOLERANCE)
     difference = size * found.fun.reshape(-1, 2)
     residual = float(np.sqrt(np.mean(difference**2)))
-    if residual > WORST_FIT * size:
+    if residual > MAX_RELATIVE_RESIDUAL * size:
         given = f"a field that differs from the model's by {residual / size:.0%}"
         raise InvalidInputError(data.source, given, "one coil on at a time, in the dish frame, in SI units")
     coils = [_coil(data, index, found.x, size, difference) for index in range(len(data.names))]
     deviations = _deviations(data, coils, model, found.jac, size, residual / size)
-    apart = np.linalg.norm(difference, axis=1)
-    worst = int(np.argmax(apart))
+    distances = np.linalg.norm(difference, axis=1)
+    worst = int(np.argmax(distances))
     return CalibrationFit(
         CoilCalibration("", "", "", model, tuple(coils)),
         deviations,
-        tuple(_beyond(coil, row, POOR) for coil, row in zip(coils, deviations, strict=True)),
+        tuple(_exceeding(coil, row, POOR_DEVIATION) for coil, row in zip(coils, deviations, strict=True)),
         size * found.x[-2:],
         residual,
-        (int(data.lines[worst]), float(apart[worst])),
-        len(apart),
+        (int(data.lines[worst]), float(distances[worst])),
+        len(distances),
     )
 
 
 def _check_readings(data: ProbeMeasurements) -> None:
-    if len(data.names) < LEAST_COILS:
-        raise InvalidInputError(f"{data.source}, coil", ", ".join(data.names), f"at least {LEAST_COILS} coils")
+    if len(data.names) < MIN_COILS:
+        raise InvalidInputError(f"{data.source}, coil", ", ".join(data.names), f"at least {MIN_COILS} coils")
     for index, name in enumerate(data.names):
         count = int(np.count_nonzero(data.current[data.coil == index]))
-        if count < LEAST_READINGS:
-            expected = f"at least {LEAST_READINGS} with current, all over the dish"
+        if count < MIN_READINGS:
+            expected = f"at least {MIN_READINGS} with current, all over the dish"
             raise InvalidInputError(f"{data.source}, {name}", f"{count} readings with current", expected)
     if float(np.abs(data.field).max()) < 1e-6:
         raise InvalidInputError(f"{data.source}, bx and by", "less than 1e-6 T everywhere", "the field of coils in T")
@@ -143,16 +144,16 @@ class _Problem:
         rows = np.flatnonzero(np.isin(data.coil, coils))
         self._of = np.searchsorted(coils, data.coil[rows])
         self._points, self._current = data.points[rows], data.current[rows, None]
-        self._field, self._model = data.field[rows] / size, MODELS[model]
-        nearest = max(0.01, NEAREST * float(np.hypot(*data.points.T).max()))
-        radii = RADII if model == "loops" else (NO_RADIUS, 1.000001 * NO_RADIUS)
+        self._field, self._model = data.field[rows] / size, FIELD_MODELS[model]
+        nearest = max(0.01, MIN_DISTANCE_RATIO * float(np.hypot(*data.points.T).max()))
+        radii = RADIUS_BOUNDS if model == "loops" else (DIPOLE_RADIUS, 1.000001 * DIPOLE_RADIUS)
         low = [-np.inf, math.log(nearest), math.log(radii[0]), -np.inf]
-        high = [np.inf, math.log(max(FARTHEST, 2.0 * nearest)), math.log(radii[1]), np.inf]
+        high = [np.inf, math.log(max(MAX_DISTANCE, 2.0 * nearest)), math.log(radii[1]), np.inf]
         count = len(coils)
         self._bounds = (np.array(low * count + [-np.inf] * 2), np.array(high * count + [np.inf] * 2))
 
     def best(self, starts: list[Array], tolerance: float, background: bool = True) -> Any:
-        """Return the best solution from several starts."""
+        """Return the best solution of several starts."""
         low, high = self._bounds
         if not background:  # which one coil alone might not tell from its own field
             low, high = low.copy(), high.copy()
@@ -185,7 +186,7 @@ class _Problem:
 
 
 def _start(data: ProbeMeasurements, index: int, model: str, background: Array, size: float) -> Array:
-    """Return a coil's four numbers as its own readings have them, the background taken off."""
+    """Return initial parameters of a coil from its own readings, without the background."""
     on = (data.coil == index) & (data.current != 0.0)
     per_current = (data.field[on] - background) / data.current[on, None]
     points = data.points[on]
@@ -199,20 +200,22 @@ def _start(data: ProbeMeasurements, index: int, model: str, background: Array, s
     angle = math.atan2(along[1], along[0])
     starts = [
         np.array([turned, math.log(share * distance), math.log(0.5 * share * distance), sign * strength / size])
-        for share in STARTS
+        for share in START_RATIOS
         for turned, sign in ((angle, 1.0), (angle + math.pi, -1.0))
     ]
     alone = _Problem(data, np.array([index]), model, size)
-    found = alone.best([np.concatenate([start, background / size]) for start in starts], ROUGH, background=False)
+    found = alone.best(
+        [np.concatenate([start, background / size]) for start in starts], COIL_TOLERANCE, background=False
+    )
     return np.asarray(found.x[:4])
 
 
 def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference: Array) -> CoilProperties:
-    """Return a coil from its numbers."""
+    """Return a coil from its parameters."""
     angle, distance, radius, field = x[4 * index : 4 * index + 4]
     farthest = int(np.argmax(np.hypot(*data.points.T)))
-    if math.exp(distance) <= 1.001 * NEAREST * float(np.linalg.norm(data.points[farthest])):
-        where, place = data.at(int(data.lines[farthest])), data.points[farthest].tolist()
+    if math.exp(distance) <= 1.001 * MIN_DISTANCE_RATIO * float(np.linalg.norm(data.points[farthest])):
+        where, place = data.location(int(data.lines[farthest])), data.points[farthest].tolist()
         raise InvalidInputError(
             where, f"a point at {place} m", f"points within the coils; {data.names[index]} is nearer"
         )
@@ -230,7 +233,7 @@ def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference
 def _deviations(
     data: ProbeMeasurements, coils: list[CoilProperties], model: str, jacobian: Array, size: float, residual: float
 ) -> Array:
-    """Return standard deviations, shape (m, 4), once it is known that there are any."""
+    """Return standard deviations, shape (m, 4); reject unidentifiable parameters."""
     used = np.ones(jacobian.shape[1], dtype=bool)
     if model == "dipoles":
         used[2:-2:4] = False
@@ -238,7 +241,7 @@ def _deviations(
     scale = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
     _, values, turned = np.linalg.svd(own / scale, full_matrices=False)
     labels = [f"{coil.name}.{name}" for coil in coils for name in PARAMETERS] + ["background x", "background y"]
-    if values[-1] < SINGULAR * values[0]:
+    if values[-1] < MIN_SINGULAR_VALUE * values[0]:
         weights = np.abs(turned[-1])
         mixed = [label for label, weight in zip(np.array(labels)[used], weights, strict=True) if weight > 0.3]
         words = "readings that tell them apart: all over the dish, and some without current"
@@ -250,18 +253,18 @@ def _deviations(
     shaped = deviations[:-2].reshape(-1, 4)
     shaped = shaped * np.array([[1.0, coil.distance, coil.radius, size] for coil in coils])
     for coil, row in zip(coils, shaped, strict=True):
-        unknown = _beyond(coil, row, UNKNOWN)
+        unknown = _exceeding(coil, row, MAX_DEVIATION)
         if unknown:
             words = "readings that determine it: all over the dish, with a field well above the probe's noise"
             raise InvalidInputError(f"{data.source}, {coil.name}", f"an unknown {' and '.join(unknown)}", words)
     return np.asarray(shaped)
 
 
-def _beyond(coil: CoilProperties, deviations: Array, most: dict[str, float]) -> tuple[str, ...]:
-    """Return the parameters whose standard deviation is beyond some bounds."""
+def _exceeding(coil: CoilProperties, deviations: Array, limits: dict[str, float]) -> tuple[str, ...]:
+    """Return the parameters whose standard deviation exceeds its limit."""
     sizes = {name: 1.0 if name == "angle" else abs(getattr(coil, name)) for name in PARAMETERS}
     return tuple(
         name
         for name, deviation in zip(PARAMETERS, deviations.tolist(), strict=True)
-        if deviation > most[name] * sizes[name]
+        if deviation > limits[name] * sizes[name]
     )

@@ -1,4 +1,4 @@
-"""The bridge's model of the coils: the field of each in the dish plane, per ampere."""
+"""Field models of the coils: the field of each in the dish plane, per ampere."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from magnetosuture_thread.errors import ConfigurationError
 
 Vector = NDArray[np.float64]
 
-ON_AXIS = 1e-4  # of the radius; nearer to the axis the closed form divides two zeros
-WEAKEST = 1e-6  # T/A; a coil of less moves nothing
+AXIS_TOLERANCE = 1e-4  # of the radius; closer to the axis the closed form is 0 / 0
+MIN_FIELD_PER_CURRENT = 1e-6  # T/A; a weaker coil has no effect
 
 
 @dataclass(frozen=True)
 class CoilProperties(Configuration):
-    """One coil, whose axis goes through the dish's centre.
+    """Geometry and field of one coil, whose axis passes through the dish's centre.
 
     The field is that at the dish's centre for one ampere; it points to the coil, or away from it where
-    the number is negative, as of a coil that is wired the other way round.
+    the number is negative, as of a coil with reversed wiring.
     """
 
     GROUP: ClassVar[str] = "coil"
@@ -49,25 +49,25 @@ class CoilProperties(Configuration):
         0.0, "with its cable, cold; 0 where it is not known", unit="ohm", minimum=0.0, maximum=1000.0
     )
     residual: float = quantity(
-        0.0, "root of the mean square of what the measured field differed", unit="T", minimum=0.0, maximum=1.0
+        0.0, "root mean square of the residual of the measured field", unit="T", minimum=0.0, maximum=1.0
     )
 
     def check(self) -> None:
-        """Refuse a coil without a name or without a field."""
+        """Reject a coil without a name or without a field."""
         if not self.name.strip():
             raise ConfigurationError(f"{self.GROUP}.name", self.name, "a name")
-        if abs(self.field_per_current) < WEAKEST:
+        if abs(self.field_per_current) < MIN_FIELD_PER_CURRENT:
             name = f"{self.GROUP}.field_per_current"
-            raise ConfigurationError(name, self.field_per_current, f"a size of at least {WEAKEST:g} T/A")
+            raise ConfigurationError(name, self.field_per_current, f"a size of at least {MIN_FIELD_PER_CURRENT:g} T/A")
 
 
 def coils_around(angles: Sequence[float], distance: float, radius: float, field: float) -> tuple[CoilProperties, ...]:
-    """Return coils that differ in nothing but their angles; see `CoilProperties` for what the numbers are."""
+    """Return coils that differ only in their angles; see `CoilProperties` for the arguments."""
     return tuple(CoilProperties(f"coil_{k}", a, distance, radius, field) for k, a in enumerate(angles))
 
 
 class CoilModel(Protocol):
-    """The field of several coils.
+    """Field model of several coils.
 
     Attributes:
         names: of the coils, in the order of their currents.
@@ -106,7 +106,7 @@ def loop_field(along: Vector, aside: Vector, distance: Vector, radius: Vector, f
         Components in the directions of `along` and `aside` [T/A].
     """
     a, z = radius, along - distance
-    rho = np.maximum(np.abs(aside), ON_AXIS * a)
+    rho = np.maximum(np.abs(aside), AXIS_TOLERANCE * a)
     far, near = (a + rho) ** 2 + z**2, (a - rho) ** 2 + z**2
     first, second = ellipkm1(near / far), ellipe(1.0 - near / far)
     # On the axis B_z = S a^2 / (a^2 + z^2)^(3/2).
@@ -125,7 +125,7 @@ def dipole_field(
 
         B = M (3 (u . r) r - |r|^2 u) / |r|^5,    M = field distance^3 / 2
 
-    with r from the coil's middle and the axis u. The radius says nothing here. Near a coil, at less than
+    with r from the coil's middle and the axis u. The radius has no effect. Near a coil, at less than
     twice its radius, its field is weaker than a dipole's.
 
     Source: the field of a magnetic dipole.
@@ -136,14 +136,14 @@ def dipole_field(
     return scale * (3.0 * z**2 - square), scale * (3.0 * z * aside)
 
 
-MODELS: dict[str, Callable[[Vector, Vector, Vector, Vector, Vector], tuple[Vector, Vector]]] = {
+FIELD_MODELS: dict[str, Callable[[Vector, Vector, Vector, Vector, Vector], tuple[Vector, Vector]]] = {
     "loops": loop_field,
     "dipoles": dipole_field,
 }
 
 
 class _Coils:
-    """Coils around the dish, each by the same formula."""
+    """Coils around the dish with one field model."""
 
     MODEL: ClassVar[str] = "loops"
 
@@ -152,17 +152,17 @@ class _Coils:
         angles = np.array([coil.angle for coil in coils])
         self._axes = np.array([np.cos(angles), np.sin(angles)])
         self._across = np.array([-self._axes[1], self._axes[0]])
-        self._both = np.concatenate([self._axes.T, self._across.T])
+        self._frame = np.concatenate([self._axes.T, self._across.T])
         self._distance = np.array([coil.distance for coil in coils])
         self._radius = np.array([coil.radius for coil in coils])
         self._field = np.array([coil.field_per_current for coil in coils])
-        self._of = MODELS[self.MODEL]
+        self._field_model = FIELD_MODELS[self.MODEL]
 
     def per_current(self, point: Vector) -> NDArray[np.float64]:
         """Return the field at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
-        apart = self._both @ point
+        apart = self._frame @ point
         count = len(self.names)
-        axial, aside = self._of(apart[:count], apart[count:], self._distance, self._radius, self._field)
+        axial, aside = self._field_model(apart[:count], apart[count:], self._distance, self._radius, self._field)
         return np.asarray(axial * self._axes + aside * self._across)
 
 

@@ -1,4 +1,4 @@
-"""Who may move the needle: armed or not, the emergency stop, and faults that somebody has to reset."""
+"""Arming state machine with latched emergency stop and faults."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from enum import Enum
 from magnetosuture_thread.errors import InvalidInputError
 
 
-class Condition(Enum):
-    """What the bridge as a whole is in."""
+class ArmingState(Enum):
+    """State of the bridge as a whole."""
 
     INACTIVE = "inactive"
     ACTIVE = "active"
@@ -16,16 +16,16 @@ class Condition(Enum):
 
 
 class ArmingLatch:
-    """Holds the bridge at zero until it is active, armed, and free of faults.
+    """State machine that keeps the bridge at zero until it is active, armed, and free of faults.
 
-    An emergency stop and a fault disarm, and stay until they are reset; a reset never arms. So after
-    whatever stopped the needle for good, two deliberate acts come before it moves again.
+    Emergency stop and fault disarm and stay latched until a reset; a reset never arms. After either, two
+    deliberate acts are needed before the needle moves again.
 
     Attributes:
         active: whether the node is.
-        armed: whether commands may pass.
+        armed: whether commands are followed.
         emergency: whether the emergency stop has been pressed since the last reset.
-        fault: what went wrong since the last reset; empty if nothing.
+        fault: the first fault since the last reset; empty if none.
     """
 
     def __init__(self) -> None:
@@ -35,56 +35,56 @@ class ArmingLatch:
         self.fault = ""
 
     @property
-    def condition(self) -> Condition:
-        """What the bridge is in."""
-        if self.latched:
-            return Condition.FAULT
-        return Condition.ACTIVE if self.active else Condition.INACTIVE
+    def state(self) -> ArmingState:
+        """State of the bridge."""
+        if self.latched_reason:
+            return ArmingState.FAULT
+        return ArmingState.ACTIVE if self.active else ArmingState.INACTIVE
 
     @property
-    def latched(self) -> str:
-        """Say what keeps the bridge at zero until a reset; empty if nothing."""
+    def latched_reason(self) -> str:
+        """Why the bridge stays at zero until a reset; empty if nothing is latched."""
         return "emergency stop" if self.emergency else self.fault
 
     @property
-    def waits(self) -> bool:
-        """Whether nothing but arming is missing."""
-        return self.active and not self.armed and not self.latched
+    def ready_to_arm(self) -> bool:
+        """Whether only arming is missing."""
+        return self.active and not self.armed and not self.latched_reason
 
     @property
-    def holds(self) -> str:
-        """Say why no command may pass; empty if one may."""
-        if self.latched:
-            return self.latched
+    def stop_reason(self) -> str:
+        """Why no command is followed; empty while armed."""
+        if self.latched_reason:
+            return self.latched_reason
         if not self.active:
             return "inactive"
         return "" if self.armed else "disarmed"
 
     def activate(self) -> None:
-        """Let the bridge be armed.
+        """Activate, so that the bridge can be armed.
 
         Raises:
-            InvalidInputError: something is latched.
+            InvalidInputError: an emergency stop or a fault is latched.
         """
-        if self.latched:
-            raise InvalidInputError("activate", self.latched, "a reset before")
+        if self.latched_reason:
+            raise InvalidInputError("activate", self.latched_reason, "a reset before")
         self.active = True
 
     def deactivate(self) -> None:
-        """Disarm for good, until somebody activates and arms again."""
+        """Deactivate and disarm."""
         self.active = self.armed = False
 
     def arm(self, driver_problem: str) -> None:
-        """Let commands pass from now on.
+        """Arm: follow commands from now on.
 
         Args:
-            driver_problem: why currents do not get to the coils now; empty if they do.
+            driver_problem: why the driver is not ready; empty if it is.
 
         Raises:
-            InvalidInputError: something is latched, the node is not active, or the driver not ready.
+            InvalidInputError: an emergency stop or a fault is latched, the node is not active, or the driver not ready.
         """
-        if self.latched:
-            raise InvalidInputError("arm", self.latched, "a reset before")
+        if self.latched_reason:
+            raise InvalidInputError("arm", self.latched_reason, "a reset before")
         if not self.active:
             raise InvalidInputError("arm", "an inactive bridge", "an active one")
         if driver_problem:
@@ -92,22 +92,22 @@ class ArmingLatch:
         self.armed = True
 
     def disarm(self) -> None:
-        """Let no command pass from now on."""
+        """Disarm: follow no command from now on."""
         self.armed = False
 
     def stop(self) -> None:
-        """Press the emergency stop."""
+        """Latch the emergency stop."""
         self.emergency, self.armed = True, False
 
     def trip(self, fault: str) -> None:
-        """Say what went wrong; the first fault is kept, as others may follow from it."""
+        """Latch a fault; the first is kept, as others may follow from it."""
         self.fault, self.armed = self.fault or fault, False
 
     def reset(self, driver_problem: str) -> None:
-        """Forget the emergency stop and the fault; the bridge stays disarmed.
+        """Clear emergency stop and fault; the bridge stays disarmed.
 
         Args:
-            driver_problem: why currents do not get to the coils now; empty if they do.
+            driver_problem: why the driver is not ready; empty if it is.
 
         Raises:
             InvalidInputError: the driver is not ready.

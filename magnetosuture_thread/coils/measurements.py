@@ -1,4 +1,4 @@
-"""Measurements of the coils' field by a probe: a table in a CSV file."""
+"""Probe measurements of the coils' field, from a CSV file."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError
 
 COLUMNS = ("coil", "current", "x", "y", "bx", "by")
-# Beyond these a number is taken for one in another unit.
-BOUNDS = {"current": (1000.0, "A"), "x": (0.5, "m"), "y": (0.5, "m"), "bx": (1.0, "T"), "by": (1.0, "T")}
-MOST_COILS = 64
+# Values out of these bounds are assumed to have another unit.
+VALUE_BOUNDS = {"current": (1000.0, "A"), "x": (0.5, "m"), "y": (0.5, "m"), "bx": (1.0, "T"), "by": (1.0, "T")}
+MAX_COILS = 64
 
 
 @dataclass(frozen=True, eq=False)
 class ProbeMeasurements:
-    """Readings of a probe in the dish plane, one coil on at a time.
+    """Readings of a field probe in the dish plane, one coil on at a time.
 
     Attributes:
         source: the file.
         names: of the coils, in the order of their currents.
         coil: index of the coil that is on, shape (n,).
         current: in it, shape (n,) [A].
-        points: where the probe was, in the dish frame, shape (n, 2) [m].
-        field: what it read along x and y, shape (n, 2) [T].
+        points: positions of the probe in the dish frame, shape (n, 2) [m].
+        field: readings along x and y, shape (n, 2) [T].
         lines: of the file, shape (n,).
     """
 
@@ -40,8 +40,8 @@ class ProbeMeasurements:
     field: NDArray[np.float64]
     lines: NDArray[np.int64]
 
-    def at(self, line: int) -> str:
-        """Return where in the file a line is, for an error."""
+    def location(self, line: int) -> str:
+        """Return file and line number, for an error."""
         return f"{self.source}, line {line}"
 
 
@@ -50,10 +50,10 @@ def read_measurements(path: Path) -> ProbeMeasurements:
 
     A coil is given by its index, from 0, or as coil_0, and then every index must be there; or by any other
     name, and then the coils' order is that in which they come. Empty lines and lines that begin with # are
-    passed over.
+    ignored.
 
     Raises:
-        InvalidInputError: the file cannot be read, or a line holds anything else; with its number.
+        InvalidInputError: the file is unreadable, or a line is invalid; with its number.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -82,7 +82,7 @@ def read_measurements(path: Path) -> ProbeMeasurements:
             raise InvalidInputError(f"{where}, coil", "nothing", "index or name of the coil that is on")
         named.append(f"coil_{int(values['coil'])}" if _is_index(values["coil"]) else values["coil"])
         numbers.append([_number(f"{where}, {column}", values[column], column) for column in COLUMNS[1:]])
-    names = _in_order(named, path)
+    names = _ordered_names(named, path)
     table = np.array(numbers)
     index = {name: k for k, name in enumerate(names)}
     coil = np.array([index[name] for name in named], dtype=np.int64)
@@ -95,21 +95,21 @@ def _is_index(text: str) -> bool:
 
 
 def _number(where: str, text: str, column: str) -> float:
-    most, unit = BOUNDS[column]
+    limit, unit = VALUE_BOUNDS[column]
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not abs(value) <= most:
-        raise InvalidInputError(where, text or "nothing", f"a number from {-most:g} to {most:g} {unit}")
+    if not abs(value) <= limit:
+        raise InvalidInputError(where, text or "nothing", f"a number from {-limit:g} to {limit:g} {unit}")
     return value
 
 
-def _in_order(named: list[str], path: Path) -> tuple[str, ...]:
+def _ordered_names(named: list[str], path: Path) -> tuple[str, ...]:
     """Return the coils' names in the order of their currents."""
     names = list(dict.fromkeys(named))
-    if len(names) > MOST_COILS:
-        raise InvalidInputError(f"{path}, coil", f"{len(names)} coils", f"at most {MOST_COILS}")
+    if len(names) > MAX_COILS:
+        raise InvalidInputError(f"{path}, coil", f"{len(names)} coils", f"at most {MAX_COILS}")
     if not all(name.startswith("coil_") and _is_index(name.removeprefix("coil_")) for name in names):
         return tuple(names)
     wanted = [f"coil_{k}" for k in range(len(names))]

@@ -20,43 +20,43 @@ from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared
 
-INSIDE = 0.9  # of the distance to the coils
-FEWEST = 4.0  # periods of the loop in a timeout; two of them are given away so that no current outlives it
-FEWEST_HELD = 2.0  # periods of the loop in the drivers' timeout, or they would switch off between two steps
-MAX_BLIND_WAY = 0.0125  # m; that the needle could go while nobody looks, was there nothing in its way
+REACH_RATIO = 0.9  # of the reach to the coils' distance
+MIN_TIMEOUT_PERIODS = 4.0  # of the loop; two of them are the lookahead of the bridge
+MIN_DRIVER_TIMEOUT_PERIODS = 2.0  # of the loop, or drivers would switch off between two steps
+MAX_BLIND_DISTANCE = 0.0125  # m; maximum distance of free motion within the hold time
 
 
 @dataclass(frozen=True)
 class CoilBridgeSettings(Configuration):
-    """What the coil bridge must know of the coils and of the limits on the needle."""
+    """Parameters of the coil bridge: coils, needle, limits, timeouts and driver."""
 
     GROUP: ClassVar[str] = "coil_bridge"
 
     autostart: str = quantity(
         "active",
-        "how far the node goes by itself when it starts; armed only with a driver that moves nothing real",
+        "state that the node enters by itself at start; armed only with a driver without hardware",
         choices=("unconfigured", "inactive", "active", "armed"),
     )
     driver: str = quantity(
         "recording",
-        "what the currents go to: recording keeps them, simulated sends them to rig_simulator, roboclaw is hardware",
+        "sink of the currents: recording keeps them, simulated sends them to rig_simulator, roboclaw is hardware",
         choices=("recording", "simulated", "roboclaw"),
     )
     rate: float = quantity(
-        200.0, "how often limits and watchdog run and currents go out", unit="Hz", minimum=10.0, maximum=1000.0
+        200.0, "of the loop that checks limits and timeouts and sends currents", unit="Hz", minimum=10.0, maximum=1000.0
     )
     realtime_priority: int = quantity(
         10,
-        "of the process among the real-time ones, where the system allows any; 0 asks for none",
+        "real-time priority of the process, where the system permits it; 0 requests none",
         minimum=0,
         maximum=99,
     )
     command_timeout: float = quantity(
-        0.1, "without a new velocity command for this long the coils go to zero", unit="s", minimum=0.01, maximum=1.0
+        0.1, "the coils go to zero after this long without a new velocity command", unit="s", minimum=0.01, maximum=1.0
     )
     pose_timeout: float = quantity(
         0.2,
-        "without a new needle pose for this long the coils go to zero: currents depend on where the needle is",
+        "the coils go to zero after this long without a new needle pose, on which the currents depend",
         unit="s",
         minimum=0.01,
         maximum=1.0,
@@ -64,21 +64,29 @@ class CoilBridgeSettings(Configuration):
     zero_hold: float = quantity(
         1.0, "after a stop, zero currents are published for this long", unit="s", minimum=0.1, maximum=60.0
     )
-    max_speed: float = quantity(0.02, "greatest speed of the needle's tip", unit="m/s", minimum=1e-5, maximum=0.5)
+    max_speed: float = quantity(0.02, "maximum speed of the needle's tip", unit="m/s", minimum=1e-5, maximum=0.5)
     max_acceleration: float = quantity(
-        0.5, "greatest change of that velocity; a stop is not limited", unit="m/s^2", minimum=1e-3, maximum=100.0
+        0.5,
+        "maximum acceleration of the needle's tip; a stop is not limited",
+        unit="m/s^2",
+        minimum=1e-3,
+        maximum=100.0,
     )
     max_current: float = quantity(
-        10.0, "greatest current in a coil, in either direction", unit="A", minimum=0.01, maximum=100.0
+        10.0, "maximum current in a coil, in either direction", unit="A", minimum=0.01, maximum=100.0
     )
     max_current_slew: float = quantity(
-        1000.0, "greatest change of a coil's current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
+        1000.0,
+        "maximum slew rate of a coil's current; a stop is not limited",
+        unit="A/s",
+        minimum=1.0,
+        maximum=1e6,
     )
 
     scene: str = shared("scene")
     keep_out: float = quantity(
         0.0005,
-        "clearance that the needle's axis keeps of the wall and of obstacles; half of its width is within",
+        "minimum clearance of the needle's axis to wall and obstacles, half of its width included",
         unit="m",
         minimum=2.5e-5,
         maximum=0.05,
@@ -86,37 +94,36 @@ class CoilBridgeSettings(Configuration):
     barriers: tuple[str, ...] = quantity((), "barriers of your own for the needle, each as module:class; see Barrier")
     approach_rate: float = quantity(
         10.0,
-        "share of its clearance by which the needle may approach, each second",
+        "gain of the needle's barriers: fraction of the clearance by which it may approach per second",
         unit="1/s",
         minimum=0.1,
         maximum=1e3,
     )
     pose_uncertainty: float = quantity(
         0.0005,
-        "by how much tail and tip may be measured outside of the dish or farther on than the needle can go, besides "
-        "three sigma of the pose's own covariance",
+        "error of tail and tip in the checks of bounds and jumps, in addition to three sigma of the pose's covariance",
         unit="m",
         minimum=0.0,
         maximum=0.01,
     )
     prediction_timeout: float = quantity(
-        0.5, "margins of the thread model are good for this long", unit="s", minimum=0.05, maximum=5.0
+        0.5, "margins of the thread model are valid for this long", unit="s", minimum=0.05, maximum=5.0
     )
     without_prediction: str = quantity(
         "stop",
-        "what becomes of the needle while the thread is not predicted: stop, or slow, to speed_without_prediction",
+        "behaviour while the thread is not predicted: stop, or slow, to speed_without_prediction",
         choices=("stop", "slow"),
     )
     speed_without_prediction: float = quantity(
-        0.002, "greatest speed of the needle's tip then", unit="m/s", minimum=1e-5, maximum=0.5
+        0.002, "maximum speed of the needle's tip without a prediction", unit="m/s", minimum=1e-5, maximum=0.5
     )
 
     calibration: str = quantity(
         "",
-        "file of the coils' calibration, from the working directory; it replaces what the parameters say of the coils",
+        "file of the coils' calibration, from the working directory; it replaces the coil parameters",
     )
     coil_model: str = quantity(
-        "loops", "field of a coil: that of a loop, or of a dipole in its middle", choices=("loops", "dipoles")
+        "loops", "field model of a coil: a current loop, or a dipole at its centre", choices=("loops", "dipoles")
     )
     field_per_current: float = quantity(
         1.2e-3,
@@ -136,18 +143,20 @@ class CoilBridgeSettings(Configuration):
     needle_width: float = shared("needle_width")
     needle_curvature: float = shared("needle_curvature")
     needle_moment: float = quantity(
-        8.8e-4, "magnetic moment of the needle, were it straight", unit="A m^2", minimum=1e-6, maximum=1.0
+        8.8e-4, "magnetic moment of the straight needle", unit="A m^2", minimum=1e-6, maximum=1.0
     )
     needle_drag: float = quantity(
         0.0255,
-        "force along the needle for a speed of 1 m/s, what the thread adds to it included",
+        "drag force along the needle at 1 m/s, with that of the thread",
         unit="N s/m",
         minimum=1e-5,
         maximum=10.0,
     )
-    needle_drag_across: float = quantity(0.033, "the same across the needle", unit="N s/m", minimum=1e-5, maximum=10.0)
+    needle_drag_across: float = quantity(
+        0.033, "drag force across the needle at 1 m/s", unit="N s/m", minimum=1e-5, maximum=10.0
+    )
     needle_turning_drag: float = quantity(
-        1.6e-7, "torque that turns the needle by 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2
+        1.6e-7, "drag torque of the needle at 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2
     )
     coil_angles: tuple[float, ...] = quantity(
         (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi),
@@ -170,7 +179,7 @@ class CoilBridgeSettings(Configuration):
     driver_timeout: float = shared("driver_timeout")
     roboclaw_answer_timeout: float = quantity(
         0.03,
-        "that a board has for an answer, of which it needs 1 or 2 ms over USB; it may miss one",
+        "timeout of a board's answer, which takes 1 or 2 ms over USB; one timeout is tolerated",
         unit="s",
         minimum=0.03,
         maximum=1.0,
@@ -178,8 +187,8 @@ class CoilBridgeSettings(Configuration):
 
     @property
     def reach(self) -> float:
-        """How far from the dish's centre a needle may be: well within the coils [m]."""
-        return INSIDE * min(coil.distance for coil in self.coils_properties())
+        """Maximum distance of the needle from the dish's centre, inside the coils [m]."""
+        return REACH_RATIO * min(coil.distance for coil in self.coils_properties())
 
     def needle(self) -> NeedleMechanics:
         """Return the needle's mechanics."""
@@ -194,39 +203,39 @@ class CoilBridgeSettings(Configuration):
 
     @cached_property
     def _calibration(self) -> CoilCalibration | None:
-        """What the calibration file says, read once; None without one."""
+        """The calibration file, read once; None without one."""
         if not self.calibration:
             return None
         try:
             return read_calibration(Path(os.path.expanduser(self.calibration)))
         except ConfigurationError as error:
-            # What reads the set-up puts its own file's name in front.
+            # The reader of the setup prepends its own file name.
             name = f"{self.GROUP}.calibration, {error.source}: {error.name}"
             raise ConfigurationError(name, error.value, error.expectation) from None
 
     def coils_properties(self) -> tuple[CoilProperties, ...]:
-        """Return the coils, in the order of their currents: as calibrated, else as the parameters have them."""
+        """Return the coils, in the order of their currents: as calibrated, else by the parameters."""
         if self._calibration is not None:
             return self._calibration.coils
         return coils_around(self.coil_angles, self.coil_distance, self.coil_radius, self.field_per_current)
 
     def resistances(self) -> tuple[float, ...]:
-        """Return each coil's resistance with its cable, as calibrated where that is known [ohm]."""
+        """Return each coil's resistance with its cable, as calibrated if known [ohm]."""
         return tuple(coil.resistance or self.coil_resistance for coil in self.coils_properties())
 
     def allocation(self) -> CoilAllocation:
-        """Return what turns velocities into currents."""
+        """Return the allocation of velocities to currents."""
         model = self.coil_model if self._calibration is None else self._calibration.model
         coils = make_coils(model, self.coils_properties())
         return CoilAllocation(coils, self.needle(), self.aligning_field, self.max_current)
 
     @property
     def hold_time(self) -> float:
-        """For how long a velocity may go on without anybody looking: until the drivers switch off, and a period [s]."""
+        """Maximum time for which a velocity may last without a step: driver timeout and one period [s]."""
         return self.driver_timeout + 1.0 / self.rate
 
     def safety_filter(self, scene: Scene) -> NeedleSafetyFilter:
-        """Return what keeps the needle clear of the wall and of the shapes of a scene.
+        """Return the safety filter for the wall and the shapes of a scene.
 
         Raises:
             ConfigurationError: the needle has no room in it, or a barrier cannot be used.
@@ -244,7 +253,7 @@ class CoilBridgeSettings(Configuration):
         )
 
     def check(self) -> None:
-        """Refuse too few coils, a coiled needle, and limits that cannot hold."""
+        """Reject too few coils, a coiled needle, and limits that cannot be kept."""
         require_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
             name = f"{self.GROUP}.coil_angles"
@@ -256,22 +265,28 @@ class CoilBridgeSettings(Configuration):
                 raise ConfigurationError(name, f"{count} coils in {self.calibration}", f"{known}, as in coil_angles")
         if self.autostart == "armed" and self.driver == "roboclaw":
             name = f"{self.GROUP}.autostart"
-            raise ConfigurationError(name, self.autostart, "active at most: hardware is armed by a person")
+            raise ConfigurationError(name, self.autostart, "active at most: hardware is armed by an operator")
         if self.keep_out < 0.5 * self.needle_width:
             expected = f"at least {0.5 * self.needle_width:g} m, half of {self.GROUP}.needle_width"
             raise ConfigurationError(f"{self.GROUP}.keep_out", self.keep_out, expected)
         for name in ("command_timeout", "pose_timeout"):
-            if getattr(self, name) * self.rate < FEWEST:
-                expected = f"at least {FEWEST / self.rate:g} s, {FEWEST:g} periods of the loop"
+            if getattr(self, name) * self.rate < MIN_TIMEOUT_PERIODS:
+                expected = (
+                    f"at least {MIN_TIMEOUT_PERIODS / self.rate:g} s, {MIN_TIMEOUT_PERIODS:g} periods of the loop"
+                )
                 raise ConfigurationError(f"{self.GROUP}.{name}", getattr(self, name), expected)
-        if self.driver_timeout * self.rate < FEWEST_HELD * (1.0 - 1e-9):
-            expected = f"at least {FEWEST_HELD / self.rate:g} s, {FEWEST_HELD:g} periods of the loop"
+        if self.driver_timeout * self.rate < MIN_DRIVER_TIMEOUT_PERIODS * (1.0 - 1e-9):
+            expected = _periods_text(MIN_DRIVER_TIMEOUT_PERIODS, self.rate)
             raise ConfigurationError(f"{self.GROUP}.driver_timeout", self.driver_timeout, expected)
-        if self.max_speed * self.hold_time > MAX_BLIND_WAY * (1.0 + 1e-9):
-            most = MAX_BLIND_WAY / self.hold_time
-            rule = f"max_speed x (driver_timeout + 1 / rate) may be at most {MAX_BLIND_WAY:g} m"
-            raise ConfigurationError(f"{self.GROUP}.max_speed", self.max_speed, f"at most {most:.3g} m/s: {rule}")
-        # One step may not take more than all that is left of the clearance.
+        if self.max_speed * self.hold_time > MAX_BLIND_DISTANCE * (1.0 + 1e-9):
+            limit = MAX_BLIND_DISTANCE / self.hold_time
+            rule = f"max_speed x (driver_timeout + 1 / rate) may be at most {MAX_BLIND_DISTANCE:g} m"
+            raise ConfigurationError(f"{self.GROUP}.max_speed", self.max_speed, f"at most {limit:.3g} m/s: {rule}")
+        # One step may not use more than the whole clearance.
         if self.approach_rate > self.rate:
             name = f"{self.GROUP}.approach_rate"
             raise ConfigurationError(name, self.approach_rate, f"at most {self.GROUP}.rate, {self.rate:g} 1/s")
+
+
+def _periods_text(periods: float, rate: float) -> str:
+    return f"at least {periods / rate:g} s, {periods:g} periods of the loop"

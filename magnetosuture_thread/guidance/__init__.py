@@ -1,1 +1,1 @@
-"""Guidance: which velocity takes the needle along a path."""
+"""Guidance: velocity commands that move the needle along a path."""

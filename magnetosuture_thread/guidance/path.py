@@ -1,4 +1,4 @@
-"""A smooth path through waypoints, by arc length."""
+"""Smooth path through waypoints, parametrised by arc length."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from scipy.interpolate import CubicSpline
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 
-SAMPLES = 200  # of each stretch between two waypoints, to measure the arc length
+SAMPLES_PER_SPAN = 200  # between two waypoints, to measure the arc length
 
 
 class SmoothPath:
-    """A cubic spline through waypoints, that leaves the first in a given direction.
+    """Cubic spline through waypoints with an optional initial direction.
 
         p(l), 0 <= l <= L,    |dp / dl| = 1
 
     Args:
         waypoints: shape (m, 2), m >= 2, no two the same after one another [m].
-        direction: unit vector in which the path begins, shape (2,); free if None.
+        direction: initial unit tangent, shape (2,); free if None.
 
     Raises:
-        InvalidInputError: the waypoints make no path.
+        InvalidInputError: the waypoints do not define a path.
     """
 
     def __init__(self, waypoints: Points, direction: NDArray[np.float64] | None = None) -> None:
@@ -35,7 +35,7 @@ class SmoothPath:
         knots = np.concatenate([[0.0], np.cumsum(steps)])
         free: tuple[Literal[1, 2], NDArray[np.float64]] = (2, np.zeros(2))
         curve = CubicSpline(knots, waypoints, bc_type=(free if direction is None else (1, direction), free))
-        at = np.unique(np.concatenate([np.linspace(a, b, SAMPLES) for a, b in pairwise(knots)]))
+        at = np.unique(np.concatenate([np.linspace(a, b, SAMPLES_PER_SPAN) for a, b in pairwise(knots)]))
         self._points = np.asarray(curve(at))
         self._tangents = np.asarray(curve(at, 1))
         self._tangents /= np.linalg.norm(self._tangents, axis=1)[:, None]
@@ -43,14 +43,14 @@ class SmoothPath:
 
     @property
     def length(self) -> float:
-        """L [m]."""
+        """Arc length L [m]."""
         return float(self._lengths[-1])
 
     def point(self, length: float) -> NDArray[np.float64]:
-        """Return p(l), shape (2,) [m]; beyond either end, that end."""
+        """Return the point p(l), shape (2,) [m]; l is clamped to the path."""
         return np.array([np.interp(length, self._lengths, self._points[:, k]) for k in range(2)])
 
     def tangent(self, length: float) -> NDArray[np.float64]:
-        """Return dp / dl, shape (2,)."""
+        """Return the unit tangent dp / dl, shape (2,)."""
         tangent = np.array([np.interp(length, self._lengths, self._tangents[:, k]) for k in range(2)])
         return np.asarray(tangent / np.linalg.norm(tangent))

@@ -17,13 +17,13 @@ from magnetosuture_thread.shared_parameters import shared
 
 @dataclass(frozen=True)
 class PathFollowerSettings(Configuration):
-    """Where the needle's tip is to go, and how fast."""
+    """Path of the needle's tip, its speed and the controller gains."""
 
     GROUP: ClassVar[str] = "path_follower"
 
     waypoints: tuple[float, ...] = quantity(
         (),
-        "where the tip goes from where it is: x and y of each point, in the dish frame",
+        "waypoints of the tip after its initial position: x and y of each, in the dish frame",
         unit="m",
         minimum=-0.5,
         maximum=0.5,
@@ -31,39 +31,43 @@ class PathFollowerSettings(Configuration):
     )
     speed: float = quantity(0.005, "of the tip along the path", unit="m/s", minimum=1e-5, maximum=0.1)
     acceleration: float = quantity(0.01, "at both ends of the path", unit="m/s^2", minimum=1e-4, maximum=10.0)
-    gain: float = quantity(
-        8.0, "how fast a distance from the path is made up for", unit="1/s", minimum=0.0, maximum=50.0
+    gain: float = quantity(8.0, "proportional gain on the tip's position error", unit="1/s", minimum=0.0, maximum=50.0)
+    integral_gain: float = quantity(
+        4.0, "integral gain on the tip's position error", unit="1/s^2", minimum=0.0, maximum=50.0
     )
-    integral_gain: float = quantity(4.0, "how fast a lasting distance is", unit="1/s^2", minimum=0.0, maximum=50.0)
     tolerance: float = quantity(
-        0.0005, "the path is done when the tip is this near to its end", unit="m", minimum=1e-5, maximum=0.1
+        0.0005, "the path is done when the tip is this close to its end", unit="m", minimum=1e-5, maximum=0.1
     )
     settle: float = quantity(
         1.5,
-        "between the first pose and the start, for all nodes to have found each other and the thread to rest",
+        "between the first pose and the start, for node discovery and for the thread to come to rest",
         unit="s",
         minimum=0.0,
         maximum=60.0,
     )
     audience: int = quantity(
-        1, "subscribers to its commands that it waits for: the bridge, and whoever records", minimum=1, maximum=100
+        1, "subscribers to its commands that it waits for: the bridge, and any recorder", minimum=1, maximum=100
     )
     longest_lag: float = quantity(
-        0.002, "the wish waits while the tip is farther from it", unit="m", minimum=1e-5, maximum=0.1
+        0.002,
+        "maximum distance from the tip to its setpoint while the setpoint moves",
+        unit="m",
+        minimum=1e-5,
+        maximum=0.1,
     )
     scene: str = shared("scene")
     needle_length: float = shared("needle_length")
     needle_curvature: float = shared("needle_curvature")
 
     def check(self) -> None:
-        """Refuse a coiled needle."""
+        """Reject a coiled needle."""
         require_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
     def check_path(self, scene: Scene) -> None:
-        """Refuse a waypoint beyond the wall or inside of a shape.
+        """Reject a waypoint beyond the wall or inside a shape.
 
         Raises:
-            ConfigurationError: the message names the waypoint and what is there.
+            ConfigurationError: the message names the waypoint and the shape.
         """
         for point in np.reshape(self.waypoints, (-1, 2)):
             what = occupant(scene, point[None])
@@ -72,7 +76,7 @@ class PathFollowerSettings(Configuration):
                 raise ConfigurationError(f"{self.GROUP}.waypoints", point.tolist(), expected)
 
     def follower(self) -> PathFollower:
-        """Return a follower of this path."""
+        """Return a controller for this path."""
         return PathFollower(
             np.reshape(self.waypoints, (-1, 2)),
             self.speed,

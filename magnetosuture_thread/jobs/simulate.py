@@ -214,7 +214,7 @@ def _arm(make: type[CoilClient]) -> None:
     while True:
         try:
             with make() as client:
-                return client.do("arm")
+                return client.execute("arm")
         except GraphError as error:
             if time.monotonic() > deadline:
                 raise GraphError(f"the bridge cannot be armed: {error}") from None

@@ -35,9 +35,9 @@ from magnetosuture_thread.messages.scene import scene_fields
 from magnetosuture_thread.scene import Scene, SceneShape
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.coils.bridge import Outcome
+    from magnetosuture_thread.coils.bridge import BridgeOutput
+    from magnetosuture_thread.coils.coil_system import CoilSystem
     from magnetosuture_thread.coils.drivers import DriverState
-    from magnetosuture_thread.coils.station import CoilStation
     from magnetosuture_thread.vision.look import Track
 
 Make = Callable[..., Any]
@@ -217,57 +217,57 @@ class MessageBuilder:
             p=np.column_stack([matrix, np.zeros(3)]).ravel(),
         )
 
-    def currents_message(self, stamp: Any, command: Any, outcome: Outcome) -> Any:
+    def currents_message(self, stamp: Any, command: Any, output: BridgeOutput) -> Any:
         """Return coil currents with the stamp of the command that they follow, or why they are zero."""
         return self.make(
             CURRENTS.type_name,
             header=self.header(stamp),
-            coil=list(outcome.coils),
-            current=self.numbers("d", outcome.allocation.currents),
+            coil=list(output.coils),
+            current=self.numbers("d", output.allocation.currents),
             command=self.time(command or 0),
-            stop="; ".join(outcome.reasons),
-            saturated=outcome.allocation.saturated,
+            stop="; ".join(output.reasons),
+            saturated=output.allocation.saturated,
         )
 
-    def filter_message(self, stamp: Any, outcome: Outcome) -> Any:
+    def filter_message(self, stamp: Any, output: BridgeOutput) -> Any:
         """Return what became of the command; `stamp` is the command's, or the time now where there is none."""
         return self.make(
             FILTER_STATE.type_name,
             header=self.header(stamp),
-            source=outcome.source,
-            **self._velocities(outcome),
-            slowdown=outcome.slowdown,
-            active=list(outcome.active),
-            overridden=outcome.overridden,
-            reason=outcome.reason,
+            source=output.source,
+            **self._velocities(output),
+            slowdown=output.slowdown,
+            active=list(output.active),
+            overridden=output.overridden,
+            reason=output.reason,
         )
 
-    def state_message(self, stamp: Any, station: CoilStation, driver: DriverState, refused: int) -> Any:
+    def state_message(self, stamp: Any, system: CoilSystem, driver: DriverState, refused: int) -> Any:
         """Return what the bridge does and why.
 
         Args:
             stamp: of the message.
-            station: what the bridge has in hand.
+            system: bridge, driver and latch.
             driver: what its driver knows.
             refused: messages so far.
         """
-        latch, outcome = station.latch, station.outcome
-        if outcome is not None:
-            current, saturated, reasons = outcome.allocation.currents, outcome.allocation.saturated, outcome.reasons
-            fields = {**self._velocities(outcome), "current": self.numbers("d", current), "saturated": saturated}
+        latch, output = system.latch, system.output
+        if output is not None:
+            current, saturated, reasons = output.allocation.currents, output.allocation.saturated, output.reasons
+            fields = {**self._velocities(output), "current": self.numbers("d", current), "saturated": saturated}
         else:
-            reasons, fields = (latch.latched or "unconfigured",), {}
+            reasons, fields = (latch.latched_reason or "unconfigured",), {}
         if driver.currents is not None:
             fields["measured_current"] = self.numbers("d", driver.currents)
         return self.make(
             BRIDGE_STATE.type_name,
             header=self.header(stamp),
-            state=UNCONFIGURED if outcome is None and not latch.latched else CONDITIONS[latch.condition.name],
+            state=UNCONFIGURED if output is None and not latch.latched_reason else CONDITIONS[latch.state.name],
             armed=latch.armed,
             emergency_stopped=latch.emergency,
-            scene_version="" if station.bridge is None else station.bridge.scene_version,
+            scene_version="" if system.bridge is None else system.bridge.scene_version,
             reasons=list(reasons),
-            driver=station.driver_name,
+            driver=system.driver_name,
             driver_ready=driver.ready,
             driver_warnings=list(driver.warnings),
             supply_voltage=self.numbers("d", driver.voltages),
@@ -275,8 +275,8 @@ class MessageBuilder:
             **fields,
         )
 
-    def _velocities(self, outcome: Outcome) -> dict[str, Any]:
-        return {name: self.vector(*getattr(outcome, name)) for name in ("commanded", "filtered", "applied")}
+    def _velocities(self, output: BridgeOutput) -> dict[str, Any]:
+        return {name: self.vector(*getattr(output, name)) for name in ("commanded", "filtered", "applied")}
 
     def scene_message(self, stamp: Any, scene: Scene) -> Any:
         """Return a scene."""

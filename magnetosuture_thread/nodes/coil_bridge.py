@@ -1,4 +1,4 @@
-"""The coil bridge node: needle velocity commands in, filtered, coil currents out."""
+"""Coil bridge node: needle velocity commands in, filtered, coil currents out."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.clock import Clock, ClockType
 from rclpy.timer import Timer
 
-from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, Bridge
+from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, CoilBridge
+from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.station import CoilStation
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
@@ -26,25 +26,25 @@ from magnetosuture_thread.nodes.scheduling import take_priority
 from magnetosuture_thread.nodes.switches import Switches
 from magnetosuture_thread.scene import Scene
 
-UNUSABLE = (InvalidInputError, ArithmeticError, ValueError)  # the last two where a check has been forgotten
+INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
 
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
-    """Forwards velocity commands to the coils while active and armed, and zeros as soon as they cease.
+    """Drives the coils by filtered velocity commands while active and armed, and with zeros otherwise.
 
-    Every command passes the needle's safety filter, whoever sent it: an operator's on `operator/servo_cv`, which are
-    followed first, and those of a planner or path follower on `needle/servo_cv`.
+    Every command passes the needle's safety filter: those of an operator on `operator/servo_cv`, which have priority,
+    and those of a planner or path follower on `needle/servo_cv`.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("coil_bridge", CoilBridgeSettings, **options)
-        self.station = CoilStation()
-        self._stamps: dict[str, Any] = {}  # of the last good command of each input
-        self._resumes = False  # whether a reset makes it active again
-        # A clock of its own for the watchdog: simulated time may stand still, the coils must not stay on.
+        self.system = CoilSystem()
+        self._stamps: dict[str, Any] = {}  # of the last valid command of each input
+        self._reactivate = False  # whether a reset activates the node again
+        # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog: Timer | None = None
-        self._report = CoilReport(self, self.station, self._steady)
+        self._report = CoilReport(self, self.system, self._steady)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
         self._scene = SceneFollower(self, self._report.health, None, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
@@ -53,120 +53,122 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         Switches(self, self.arm, self.stop, self.reset)
         self.start()
         if self.settings is not None and self.settings.autostart == "armed":
-            self.station.arm_when_ready()
+            self.system.arm_when_ready()
 
     def begin(self, settings: CoilBridgeSettings) -> None:
-        """Open the driver; from now on it is told zero again and again."""
-        bridge = Bridge(settings, self.station.latch, self._scene.load(settings.scene))
-        driver = make_driver(settings, len(bridge.coils), self._report.to_rig, self._report.rigs)
-        self.station.open(settings, bridge, driver)
+        """Open the driver; from now on it receives zeros periodically."""
+        bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
+        driver = make_driver(settings, len(bridge.coils), self._report.send_to_rig, self._report.count_rigs)
+        self.system.open(settings, bridge, driver)
         self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
 
     def resume(self) -> None:
-        """Let the bridge be armed."""
-        self.station.latch.activate()
+        """Activate, so that the bridge can be armed."""
+        self.system.latch.activate()
 
     def pause(self) -> None:
-        """Stop at once, and pass nothing until somebody activates and arms again."""
-        self.station.latch.deactivate()
-        self.station.zero()
+        """Stop at once; activation and arming are needed again."""
+        self.system.latch.deactivate()
+        self.system.zero()
         self._step()
 
     def end(self) -> None:
-        """Leave the coils at zero."""
+        """Set the coils to zero and close the driver."""
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
-        self._watchdog, self._resumes = None, False
+        self._watchdog, self._reactivate = None, False
         self._stamps.clear()
-        self.station.close()
+        self.system.close()
 
-    def arm(self, asked: bool) -> None:
-        """Let commands pass that come from now on, or none."""
-        self.station.arm(asked)
+    def arm(self, armed: bool) -> None:
+        """Arm or disarm."""
+        self.system.arm(armed)
         self._step()
 
     def stop(self) -> None:
-        """Press the emergency stop, in whatever state."""
-        self.station.latch.stop()
-        self.station.zero()
+        """Latch the emergency stop, in any state."""
+        self.system.latch.stop()
+        self.system.zero()
         self._step()
 
     def reset(self) -> None:
-        """Forget the emergency stop and faults; a node that they made inactive is active again, but not armed."""
-        self.station.reset()
-        if self._resumes and self.stage == "inactive":
+        """Clear the emergency stop and faults; a node that they deactivated is active again, but disarmed."""
+        self.system.reset()
+        if self._reactivate and self.stage == "inactive":
             self.require(self.trigger_activate)
-        self._resumes = False
+        self._reactivate = False
         self._step()
 
     def on_pose(self, message: PoseWithCovarianceStamped, number: int) -> None:
-        """Take the needle's pose, for the next currents."""
-        if self.station.bridge is None:
+        """Register a needle pose, for the next currents."""
+        if self.system.bridge is None:
             return
         try:
             pose = reading.needle_pose(message)
             covariance = reading.pose_covariance(message)
-            self.station.bridge.needle.see(pose.tail, pose.heading, pose.stamp, number, *self._times(), covariance)
-        except UNUSABLE as error:
-            self._report.refuse(error)
+            self.system.bridge.extrapolator.update(
+                pose.tail, pose.heading, pose.stamp, number, *self._times(), covariance
+            )
+        except INPUT_ERRORS as error:
+            self._report.report_refused(error)
 
     def on_margins(self, message: SafetyMargins) -> None:
-        """Take the thread's friction, and the scene that it is predicted in."""
-        if self.station.bridge is None:
+        """Register the thread's margins: slowdown by friction, and the scene of the prediction."""
+        if self.system.bridge is None:
             return
         try:
             stamp, arrival = reading.seconds(message.header.stamp), self._times()[1]
-            self.station.bridge.on_margins(stamp, message.valid, message.slowdown, message.scene_version, arrival)
-        except UNUSABLE as error:
-            self._report.refuse(error)
+            self.system.bridge.on_margins(stamp, message.valid, message.slowdown, message.scene_version, arrival)
+        except INPUT_ERRORS as error:
+            self._report.report_refused(error)
 
     def on_scene(self, scene: Scene) -> None:
-        """Keep the needle within another scene, from the next step on."""
-        if self.station.bridge is None:
+        """Replace the scene, from the next step on."""
+        if self.system.bridge is None:
             return
-        self.station.zero()  # what is built of the scene takes some milliseconds
-        self.station.bridge.set_scene(scene)
+        self.system.zero()  # building the filter takes some milliseconds
+        self.system.bridge.set_scene(scene)
         self._step()
 
     def on_command(self, source: str, message: TwistStamped, number: int) -> None:
-        """Take a velocity command of an input, and follow it at once."""
-        if self.station.bridge is None:
+        """Register a velocity command of an input, and follow it at once."""
+        if self.system.bridge is None:
             return
         try:
             velocity = reading.plane_velocity(message, INPUTS[source])
             stamp = reading.checked_nanoseconds(message.header.stamp, INPUTS[source]) * 1e-9
-            self.station.bridge.command(source, velocity, stamp, number, *self._times())
-        except UNUSABLE as error:
-            self._report.refuse(error)
+            self.system.bridge.command(source, velocity, stamp, number, *self._times())
+        except INPUT_ERRORS as error:
+            self._report.report_refused(error)
         else:
             self._stamps[source] = message.header.stamp
             self._step()
 
     def on_watchdog(self) -> None:
-        """Ask the coils for what the last good command and pose amount to now."""
-        self.station.rhythm.tick(self._times()[1])
+        """Apply the currents of the last valid command and pose."""
+        self.system.timing.tick(self._times()[1])
         self._step()
-        if self.station.latch.latched and self.stage == "active":
-            self._resumes = True
+        if self.system.latch.latched_reason and self.stage == "active":
+            self._reactivate = True
             self.trigger_deactivate()
 
     def take_priority(self) -> None:
-        """Let the loop not wait for other processes; meant for a process of its own."""
-        self._report.scheduled(take_priority((self.settings or CoilBridgeSettings()).realtime_priority))
+        """Set the real-time priority of the loop; meant for a process of its own."""
+        self._report.report_scheduling(take_priority((self.settings or CoilBridgeSettings()).realtime_priority))
 
     def destroy_node(self) -> None:
-        """Leave the coils at zero."""
+        """Set the coils to zero and close the driver."""
         try:
             self.end()
         finally:
             super().destroy_node()
 
     def _step(self) -> None:
-        """Apply what the bridge says now, and tell."""
-        outcome = self.station.step(*self._times())
-        if outcome is not None and outcome.publish:
-            self._report.applied(None if outcome.reasons else self._stamps.get(outcome.source), outcome)
-        self._report.state(anyway=False)
+        """Compute, apply and publish the currents."""
+        output = self.system.step(*self._times())
+        if output is not None and output.publish:
+            self._report.publish_output(None if output.reasons else self._stamps.get(output.source), output)
+        self._report.publish_state(force=False)
 
     def _times(self) -> tuple[float, float]:
         """Return the time of the stamps' clock and a monotonic time [s]."""

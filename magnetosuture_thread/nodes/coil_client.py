@@ -1,4 +1,4 @@
-"""Asks a running coil bridge: its state, its switches, its lifecycle."""
+"""Client of a running coil bridge: its state, services and lifecycle."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from std_srvs.srv import SetBool, Trigger
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_report import LOOP, SCHEDULING
+from magnetosuture_thread.nodes.coil_report import JITTER_KEYS, SCHEDULING
 
 TIMEOUT = 10.0  # s for the bridge to be found and to answer
-FOUND = 0.5  # s after we have heard the bridge, for it to have found us
-AGAIN = 0.5  # s without an answer, after which a switch is pressed again
-SETTLE = 0.15  # s after an answer, in which the bridge says its new state
+DISCOVERY_TIME = 0.5  # s after the first message of the bridge, for it to have discovered this client
+RETRY_PERIOD = 0.5  # s without an answer, after which a service is called again
+SETTLE_TIME = 0.15  # s after an answer, for the bridge to publish its new state
 
 TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE,
@@ -32,7 +32,7 @@ TRANSITIONS = {
     "deactivate": Transition.TRANSITION_DEACTIVATE,
     "cleanup": Transition.TRANSITION_CLEANUP,
 }
-_NAMES = {
+_STATE_NAMES = {
     CoilBridgeState.STATE_UNCONFIGURED: "unconfigured",
     CoilBridgeState.STATE_INACTIVE: "inactive",
     CoilBridgeState.STATE_ACTIVE: "active",
@@ -41,7 +41,7 @@ _NAMES = {
 
 
 class CoilClient:
-    """Talks to the coil bridge of the ROS domain that the environment names."""
+    """Client of the coil bridge on the ROS domain of the environment."""
 
     def __init__(self) -> None:
         self._context = Context()
@@ -54,8 +54,8 @@ class CoilClient:
         self._node = rclpy.create_node("coil_client", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        topics.BRIDGE_STATE.subscribe(self._node, self._take)
-        topics.DIAGNOSTICS.subscribe(self._node, self._hear)
+        topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
+        topics.DIAGNOSTICS.subscribe(self._node, self._on_diagnostics)
         return self
 
     def __exit__(
@@ -66,16 +66,16 @@ class CoilClient:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def do(self, action: str) -> None:
-        """Do what a person asks for: a transition, arm, disarm, stop, or reset.
+    def execute(self, action: str) -> None:
+        """Execute a command: a lifecycle transition, arm, disarm, stop, or reset.
 
         Raises:
-            GraphError: no bridge is there, or it refuses.
+            GraphError: no bridge was found, or it rejects the command.
         """
         if action in TRANSITIONS:
             transition = Transition(id=TRANSITIONS[action])
             answer = self._call(ChangeState, "coil_bridge/change_state", ChangeState.Request(transition=transition))
-            refusal = f"the bridge refuses to {action}: not possible in its state, or its log says why"
+            refusal = f"the bridge rejected {action}: not possible in its state, or see its log"
         elif action in ("arm", "disarm"):
             answer = self._call(SetBool, ARM, SetBool.Request(data=action == "arm"))
             refusal = answer.message
@@ -84,20 +84,20 @@ class CoilClient:
             refusal = answer.message
         if not answer.success:
             raise GraphError(refusal)
-        self._spin(lambda: False, SETTLE)
+        self._spin(lambda: False, SETTLE_TIME)
 
     def state(self) -> dict[str, Any]:
-        """Return what the bridge says of itself, for a person.
+        """Return the state of the bridge as text for display.
 
         Raises:
-            GraphError: no bridge says anything.
+            GraphError: no state was received.
         """
         self._spin(lambda: self._state is not None, TIMEOUT)
         state = self._state
         if state is None:
-            raise GraphError(f"no coil_bridge says anything within {TIMEOUT:g} s on this ROS domain")
+            raise GraphError(f"no coil_bridge state received within {TIMEOUT:g} s on this ROS domain")
         return {
-            "state": _NAMES[state.state] + (", armed" if state.armed else ""),
+            "state": _STATE_NAMES[state.state] + (", armed" if state.armed else ""),
             "currents are zero because": "; ".join(state.reasons) or "they are not: a command is followed",
             "velocity commanded [mm/s]": _millimetres(state.commanded),
             "velocity filtered [mm/s]": _millimetres(state.filtered),
@@ -110,21 +110,21 @@ class CoilClient:
             "messages refused": str(state.refused),
         }
 
-    def loop(self) -> tuple[tuple[float, float, float], str]:
-        """Return by how much the bridge's intervals are off their period, and how its process is scheduled.
+    def loop_timing(self) -> tuple[tuple[float, float, float], str]:
+        """Return the jitter of the bridge's loop, and how its process is scheduled.
 
         Returns:
-            Median, 99th percentile and greatest of the last some thousand intervals [ms]; words.
+            Median, 99th percentile and maximum over the last intervals [ms]; scheduling as text.
 
         Raises:
-            GraphError: no bridge says so.
+            GraphError: no diagnostics were received.
         """
         self._values = {}
         self._spin(lambda: SCHEDULING in self._values, TIMEOUT)
         if SCHEDULING not in self._values:
-            raise GraphError(f"no coil_bridge says how its loop runs within {TIMEOUT:g} s")
-        middle, high, most = (float(self._values[name]) for name in LOOP)
-        return (middle, high, most), self._values[SCHEDULING]
+            raise GraphError(f"no coil_bridge diagnostics received within {TIMEOUT:g} s")
+        median, p99, maximum = (float(self._values[name]) for name in JITTER_KEYS)
+        return (median, p99, maximum), self._values[SCHEDULING]
 
     def _call(self, kind: Any, name: str, request: Any) -> Any:
         client = self._node.create_client(kind, name)
@@ -132,30 +132,30 @@ class CoilClient:
         if not client.service_is_ready():
             raise GraphError(f"no coil_bridge found within {TIMEOUT:g} s on this ROS domain (service {name})")
         deadline = time.monotonic() + TIMEOUT
-        once = kind is ChangeState
-        if once:
-            # We have found the bridge; it must have found us, or its answer goes nowhere.
+        is_transition = kind is ChangeState
+        if is_transition:
+            # The bridge must have discovered this client too, or its answer is lost.
             self._spin(lambda: self._state is not None, TIMEOUT)
-            self._spin(lambda: False, FOUND)
+            self._spin(lambda: False, DISCOVERY_TIME)
         while time.monotonic() < deadline:
-            # A switch does no harm if it is pressed again: nothing waits for an answer that got lost.
+            # The services may be called repeatedly: a lost answer blocks nothing.
             future = client.call_async(request)
-            self._spin(future.done, TIMEOUT if once else AGAIN)
+            self._spin(future.done, TIMEOUT if is_transition else RETRY_PERIOD)
             if future.done():
                 return future.result()
         raise GraphError(f"coil_bridge did not answer within {TIMEOUT:g} s (service {name})")
 
-    def _spin(self, until: Callable[[], bool], longest: float) -> None:
-        deadline = time.monotonic() + longest
+    def _spin(self, until: Callable[[], bool], timeout: float) -> None:
+        deadline = time.monotonic() + timeout
         while not until() and time.monotonic() < deadline:
             self._executor.spin_once(timeout_sec=0.02)
 
-    def _hear(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.startswith("coil_bridge:"):
                 self._values = {value.key: value.value for value in status.values}
 
-    def _take(self, message: CoilBridgeState) -> None:
+    def _on_state(self, message: CoilBridgeState) -> None:
         self._state = message
 
 

@@ -1,4 +1,4 @@
-"""The path follower node: needle poses in, velocity commands for a fixed path out."""
+"""Path follower node: needle poses in, velocity commands along a fixed path out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from magnetosuture_thread.scene import Scene
 
 
 class PathFollowerNode(Node):
-    """Asks for a velocity at every needle pose; without a pose it is silent, and the coil bridge stops."""
+    """Publishes a velocity command for every needle pose; without poses the coil bridge times out."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("path_follower", **node_options("path_follower", options))
@@ -31,7 +31,7 @@ class PathFollowerNode(Node):
         scene = initial_scene(settings.scene)
         if scene is not None:
             settings.check_path(scene)
-        self._blocked = ""  # why the path cannot be followed
+        self._blocked = ""  # reason why the path cannot be followed
         self._health = Health(self)
         self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         self._commands = topics.NEEDLE_COMMAND.publisher(self)
@@ -40,7 +40,7 @@ class PathFollowerNode(Node):
         self._health.warn("no needle pose yet", progress=0.0)
 
     def on_scene(self, scene: Scene) -> None:
-        """Check the path against another scene; one that is blocked is not followed any farther."""
+        """Check the path against a new scene; a blocked path is not followed further."""
         try:
             self._settings.check_path(scene)
         except ConfigurationError as error:
@@ -49,26 +49,26 @@ class PathFollowerNode(Node):
             self._blocked = ""
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Ask for the velocity that takes the tip along its path."""
+        """Publish the velocity command that moves the tip along its path."""
         if self._blocked:
             self._health.error(self._blocked)
             return
-        audience = self._commands.get_subscription_count()
-        if audience < self._settings.audience:
-            some = f"{audience} of {self._settings.audience} take velocity commands"
-            self._health.warn(some if audience else "nobody takes velocity commands")
+        subscribers = self._commands.get_subscription_count()
+        if subscribers < self._settings.audience:
+            some = f"{subscribers} of {self._settings.audience} subscribers to velocity commands"
+            self._health.warn(some if subscribers else "no subscriber to velocity commands")
             return
         try:
             pose = reading.needle_pose(message)
-            wish = self._follower.follow(pose.stamp, pose.tail, pose.heading)
+            command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
         except InvalidInputError as error:
             self._health.refuse(error)
             return
-        self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), wish.velocity))
-        if 0.0 < wish.progress < 1.0:
-            self._setpoints.publish(MESSAGES.placed(message.header.stamp, wish.tip, 0.0))
-        text = "done" if wish.progress >= 1.0 else "following" if wish.progress else "settling"
-        self._health.ok(text, progress=round(wish.progress, 4))
+        self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), command.velocity))
+        if 0.0 < command.progress < 1.0:
+            self._setpoints.publish(MESSAGES.placed(message.header.stamp, command.tip, 0.0))
+        text = "done" if command.progress >= 1.0 else "following" if command.progress else "settling"
+        self._health.ok(text, progress=round(command.progress, 4))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -15,7 +15,7 @@ from magnetosuture_thread.geometry.arc import needle_points
 from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, AddedRows, measure, nearest_clear
 from magnetosuture_thread.safety.certificate import NOTHING, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
-from magnetosuture_thread.safety.limits import approached, shortened
+from magnetosuture_thread.safety.limits import limit_norm, rate_limit
 from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
 
@@ -190,13 +190,13 @@ class NeedleSafetyFilter:
             return FilteredCommand(commanded, np.zeros(2), slowdown)
         active = [FRICTION] if slowdown < 1.0 else []
         largest = min(self._max_speed, max_speed, MAX_SPEED)
-        velocity = shortened(slowdown * commanded, largest)
+        velocity = limit_norm(slowdown * commanded, largest)
         if slowdown * speed > largest * (1.0 + 1e-12):
             active.append(SPEED)
         if previous is not None and math.isfinite(self._max_acceleration):
             change = self._max_acceleration * elapsed
             if math.hypot(*(velocity - previous)) > change * (1.0 + 1e-12):
-                velocity = approached(previous, velocity, change)
+                velocity = rate_limit(previous, velocity, change)
                 active.append(ACCELERATION)
         passed, touched = self.nearest_clear(velocity, tail, heading)
         active += touched

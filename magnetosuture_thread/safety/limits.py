@@ -1,4 +1,4 @@
-"""Limits on how large a vector is and how fast it changes."""
+"""Limits on the norm of a vector and on its rate of change."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from numpy.typing import NDArray
 Vector = NDArray[np.float64]
 
 
-def shortened(vector: Vector, largest: float) -> Vector:
-    """Return a vector of at most a length, its direction kept.
+def limit_norm(vector: Vector, max_norm: float) -> Vector:
+    """Return a vector scaled down to a maximum norm; its direction is kept.
 
-    >>> shortened(np.array([3.0, 4.0]), 1.0)
+    >>> limit_norm(np.array([3.0, 4.0]), 1.0)
     array([0.6, 0.8])
     """
-    # By the greatest component first: the squares of what a hostile command holds may be infinite.
+    # Scaled by the largest component first: the squares of a hostile command may overflow.
     greatest = float(np.max(np.abs(vector)))
     if greatest == 0.0:
         return np.zeros_like(vector)
     direction = vector / greatest
-    length = float(np.linalg.norm(direction))
-    return vector if greatest * length <= largest else direction * (largest / length)
+    norm = float(np.linalg.norm(direction))
+    return vector if greatest * norm <= max_norm else direction * (max_norm / norm)
 
 
-def approached(before: Vector, wanted: Vector, largest: float) -> Vector:
-    """Return what comes nearest to the one wanted within a distance of the one before."""
-    return before + shortened(wanted - before, largest)
+def rate_limit(previous: Vector, target: Vector, max_change: float) -> Vector:
+    """Return the vector closest to the target within a maximum change from the previous one."""
+    return previous + limit_norm(target - previous, max_change)

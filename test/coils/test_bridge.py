@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.bridge import Bridge, Outcome
+from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -37,11 +37,11 @@ class Plant:
     velocity: tuple[float, float] | None = (0.005, 0.002)
     tail: NDArray[np.float64] | None = field(default_factory=lambda: TAIL.copy())
     driver: DriverState = READY
-    outcomes: list[tuple[float, Outcome]] = field(default_factory=list)
+    outputs: list[tuple[float, BridgeOutput]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Make the bridge, not active yet."""
-        self.bridge = Bridge(self.settings, ArmingLatch(), self.scene)
+        self.bridge = CoilBridge(self.settings, ArmingLatch(), self.scene)
         self.commands = self.poses = 0
         self._next_command = self._next_pose = self.time
 
@@ -51,22 +51,22 @@ class Plant:
         self.bridge.arm(self.driver)
         return self
 
-    def run(self, duration: float) -> list[Outcome]:
+    def run(self, duration: float) -> list[BridgeOutput]:
         """Let time go on; return what each step asked of the coils."""
-        begin = len(self.outcomes)
+        begin = len(self.outputs)
         for _ in range(round(duration / PERIOD)):
             self.time += PERIOD
             if self.tail is not None and self.time >= self._next_pose:
                 self.poses += 1
-                self.bridge.needle.see(self.tail, EAST, self.time, self.poses, self.time, self.time)
+                self.bridge.extrapolator.update(self.tail, EAST, self.time, self.poses, self.time, self.time)
                 self._next_pose = self.time + 1.0 / 60.0
             if self.velocity is not None and self.time >= self._next_command:
                 self.command(self.velocity)
                 self._next_command = self.time + 0.02
             if self.thread:
                 self.bridge.on_margins(self.time, True, 1.0, self.bridge.scene_version, self.time)
-            self.outcomes.append((self.time, self.bridge.step(self.time, self.time, self.driver)))
-        return [outcome for _, outcome in self.outcomes[begin:]]
+            self.outputs.append((self.time, self.bridge.step(self.time, self.time, self.driver)))
+        return [output for _, output in self.outputs[begin:]]
 
     def command(
         self,
@@ -81,22 +81,22 @@ class Plant:
         self.bridge.command(source, np.array(velocity), stamp, number or self.commands, self.time, self.time)
 
 
-def still(outcome: Outcome) -> bool:
+def still(output: BridgeOutput) -> bool:
     """Return whether no coil has a current."""
-    return not np.any(outcome.allocation.currents)
+    return not np.any(output.allocation.currents)
 
 
 def stopped_after(plant: Plant, since: float) -> float:
     """Return how long after a time the coils first were at zero, for good [s]."""
-    moving = [time for time, outcome in plant.outcomes if not still(outcome)]
+    moving = [time for time, output in plant.outputs if not still(output)]
     return max(0.0, moving[-1] + PERIOD - since)
 
 
 def test_while_all_is_well_it_drives():
-    outcomes = Plant().ready().run(1.0)
-    assert not any(still(outcome) for outcome in outcomes[4:])
-    assert outcomes[-1].reasons == ()
-    assert outcomes[-1].allocation.velocity.tolist() == pytest.approx([0.005, 0.002], rel=0.02)
+    outputs = Plant().ready().run(1.0)
+    assert not any(still(output) for output in outputs[4:])
+    assert outputs[-1].reasons == ()
+    assert outputs[-1].allocation.velocity.tolist() == pytest.approx([0.005, 0.002], rel=0.02)
 
 
 def test_no_false_stops():
@@ -117,7 +117,7 @@ def test_no_false_stops():
                     plant.command((0.004, -0.001), plant.time - age, numbers[name])
                 else:
                     stamp = plant.time - age
-                    plant.bridge.needle.see(TAIL, EAST, stamp, numbers[name], plant.time, plant.time)
+                    plant.bridge.extrapolator.update(TAIL, EAST, stamp, numbers[name], plant.time, plant.time)
                 at[name] = plant.time + float(jitter.uniform(0.04, 0.055))
         plant.bridge.on_margins(plant.time, True, 1.0, plant.bridge.scene_version, plant.time)
         assert not still(plant.bridge.step(plant.time, plant.time, READY))
@@ -127,9 +127,9 @@ def test_no_false_stops():
 def test_source_timeout_and_time_to_stop(timeout: float):
     plant = Plant(CoilBridgeSettings(command_timeout=timeout)).ready()
     plant.run(0.5)
-    plant.velocity, last = None, plant.bridge.gates["needle"].stamp
-    outcomes = plant.run(1.0)
-    assert outcomes[-1].reasons == (f"no command for {timeout:g} s",)
+    plant.velocity, last = None, plant.bridge.watchdogs["needle"].stamp
+    outputs = plant.run(1.0)
+    assert outputs[-1].reasons == (f"no command for {timeout:g} s",)
     assert timeout - 3 * PERIOD < stopped_after(plant, last) <= timeout - PERIOD + 1e-9
 
 
@@ -159,9 +159,9 @@ def test_cease_after_stop():
     plant = Plant(CoilBridgeSettings(zero_hold=0.3)).ready()
     plant.run(0.5)
     plant.velocity = None
-    outcomes = plant.run(2.0)
-    zeros = [outcome for outcome in outcomes if still(outcome)]
-    assert sum(outcome.publish for outcome in zeros) == pytest.approx(0.3 / PERIOD, abs=2)
+    outputs = plant.run(2.0)
+    zeros = [output for output in outputs if still(output)]
+    assert sum(output.publish for output in zeros) == pytest.approx(0.3 / PERIOD, abs=2)
     assert not zeros[-1].publish
     plant.velocity = (0.005, 0.0)
     assert plant.run(0.1)[-1].publish
@@ -172,9 +172,9 @@ def test_inactive_and_disarmed_pass_nothing(how_far: str):
     plant = Plant()
     if how_far == "active":
         plant.bridge.latch.activate()
-    outcomes = plant.run(1.0)
-    assert all(still(outcome) for outcome in outcomes)
-    assert outcomes[-1].reasons == ("inactive" if how_far == "inactive" else "disarmed",)
+    outputs = plant.run(1.0)
+    assert all(still(output) for output in outputs)
+    assert outputs[-1].reasons == ("inactive" if how_far == "inactive" else "disarmed",)
 
 
 def test_what_was_commanded_before_arming_does_not_count():
@@ -193,7 +193,7 @@ def test_whatever_is_pressed_works_with_the_next_step_and_stays(press: str):
     plant = Plant().ready()
     assert not still(plant.run(0.5)[-1])
     getattr(plant.bridge.latch, press)(*(["a fault"] if press == "trip" else []))
-    assert all(still(outcome) for outcome in plant.run(1.0))
+    assert all(still(output) for output in plant.run(1.0))
 
 
 @pytest.mark.parametrize("gone", [DriverState(False, "no answer", 1), DriverState(True, "", 1)])
@@ -201,13 +201,13 @@ def test_a_driver_that_was_lost_even_for_a_moment_is_a_fault_until_a_reset(gone:
     plant = Plant().ready()
     plant.run(0.5)
     plant.driver = gone
-    outcomes = plant.run(0.2)
-    assert all(still(outcome) for outcome in outcomes)
-    assert outcomes[-1].reasons[0].startswith("driver: ")
+    outputs = plant.run(0.2)
+    assert all(still(output) for output in outputs)
+    assert outputs[-1].reasons[0].startswith("driver: ")
     plant.driver = DriverState(True, "", 1)  # back by itself
-    assert all(still(outcome) for outcome in plant.run(1.0))
+    assert all(still(output) for output in plant.run(1.0))
     plant.bridge.reset(plant.driver)
-    assert all(still(outcome) for outcome in plant.run(0.1))
+    assert all(still(output) for output in plant.run(0.1))
     plant.bridge.arm(plant.driver)
     assert not still(plant.run(0.1)[-1])
 
@@ -216,21 +216,21 @@ def test_stops_are_at_once_and_starts_are_not():
     """Acceleration and slew are limited while the needle is driven; a stop may take no time."""
     settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
     plant = Plant(settings, velocity=(0.015, 0.0)).ready()
-    outcomes = plant.run(1.0)
+    outputs = plant.run(1.0)
     plant.velocity = (-0.015, 0.0)
-    outcomes += plant.run(1.0)
-    for before, after in itertools.pairwise(outcomes):
+    outputs += plant.run(1.0)
+    for before, after in itertools.pairwise(outputs):
         assert np.linalg.norm(after.filtered - before.filtered) <= 0.1 * 2 * PERIOD + 1e-12
         assert np.abs(after.allocation.currents - before.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
-    steps = [np.linalg.norm(b.filtered - a.filtered) for a, b in itertools.pairwise(outcomes[1:])]
+    steps = [np.linalg.norm(b.filtered - a.filtered) for a, b in itertools.pairwise(outputs[1:])]
     assert max(steps) == pytest.approx(0.1 * PERIOD, rel=1e-6)
-    assert not still(outcomes[-1])
+    assert not still(outputs[-1])
     plant.velocity = (0.0, 0.0)
     at_rest = plant.run(0.05)
     assert at_rest[-1].reasons == ()
     assert at_rest[-1].publish
-    assert [still(outcome) for outcome in at_rest[4:]] == [True] * (len(at_rest) - 4)
-    assert not any(0.0 < np.linalg.norm(outcome.filtered) < 0.014 for outcome in at_rest)
+    assert [still(output) for output in at_rest[4:]] == [True] * (len(at_rest) - 4)
+    assert not any(0.0 < np.linalg.norm(output.filtered) < 0.014 for output in at_rest)
 
 
 def test_after_a_stop_the_needle_starts_from_rest():
@@ -241,8 +241,8 @@ def test_after_a_stop_the_needle_starts_from_rest():
     plant.bridge.latch.disarm()
     plant.run(PERIOD)
     plant.tail = None
-    at_rest = plant.bridge.needle.pose(plant.time, plant.time)
-    later = plant.bridge.needle.pose(plant.time + 0.05, plant.time + 0.05)
+    at_rest = plant.bridge.extrapolator.pose(plant.time, plant.time)
+    later = plant.bridge.extrapolator.pose(plant.time + 0.05, plant.time + 0.05)
     assert at_rest is not None
     assert later is not None
     assert later.tail.tolist() == at_rest.tail.tolist()
@@ -258,7 +258,7 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     plant = Plant(settings, velocity=(0.015, 0.0)).ready()
     assert np.abs(plant.run(1.0)[-1].allocation.currents).max() > 3.0
     plant.time += 0.21  # until when the coils have certainly stopped
-    plant.bridge.needle.see(TAIL, EAST, plant.time, plant.poses + 1, plant.time, plant.time)
+    plant.bridge.extrapolator.update(TAIL, EAST, plant.time, plant.poses + 1, plant.time, plant.time)
     plant.command((0.015, 0.0))
     plant.bridge.on_margins(plant.time, True, 1.0, plant.bridge.scene_version, plant.time)
     after = plant.bridge.step(plant.time, plant.time, READY)
@@ -268,9 +268,9 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
 
 def test_a_silence_after_a_rest_is_told_as_any_other():
     plant = Plant(CoilBridgeSettings(zero_hold=0.3), velocity=(0.0, 0.0)).ready()
-    assert all(outcome.publish for outcome in plant.run(2.0))
+    assert all(output.publish for output in plant.run(2.0))
     plant.velocity = None
-    told = [outcome for outcome in plant.run(2.0) if outcome.publish and outcome.reasons]
+    told = [output for output in plant.run(2.0) if output.publish and output.reasons]
     assert len(told) == pytest.approx(0.3 / PERIOD, abs=2)
 
 
@@ -279,16 +279,16 @@ def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(mon
     plant.run(0.2)
     zero = plant.bridge._coils.zero()
     monkeypatch.setattr(plant.bridge, "_allocate", lambda *_: (zero, "wall"))
-    assert plant.run(PERIOD)[0].reasons == ("stopped by wall: no currents lead away",)
+    assert plant.run(PERIOD)[0].reasons == ("stopped by wall: no feasible currents",)
     monkeypatch.undo()
-    assert all(still(outcome) for outcome in plant.run(0.08))
+    assert all(still(output) for output in plant.run(0.08))
     assert not still(plant.run(0.1)[-1])
 
 
 def test_a_late_step_changes_no_more_than_two_in_time():
     plant = Plant(CoilBridgeSettings(max_acceleration=0.1), velocity=(0.015, 0.0)).ready()
     plant.run(0.02)
-    before = plant.outcomes[-1][1].filtered
+    before = plant.outputs[-1][1].filtered
     plant.time += 0.08
     plant.command((0.015, 0.0))
     after = plant.bridge.step(plant.time, plant.time, READY).filtered
@@ -297,10 +297,10 @@ def test_a_late_step_changes_no_more_than_two_in_time():
 
 def test_currents_stay_within_their_limit_and_saturation_is_said():
     plant = Plant(CoilBridgeSettings(max_current=1.5, max_speed=0.045), velocity=(0.4, 0.1)).ready()
-    outcomes = plant.run(1.0)
-    assert max(np.abs(outcome.allocation.currents).max() for outcome in outcomes) <= 1.5
-    assert outcomes[-1].allocation.saturated
-    assert np.linalg.norm(outcomes[-1].allocation.velocity) < np.linalg.norm(outcomes[-1].filtered)
+    outputs = plant.run(1.0)
+    assert max(np.abs(output.allocation.currents).max() for output in outputs) <= 1.5
+    assert outputs[-1].allocation.saturated
+    assert np.linalg.norm(outputs[-1].allocation.velocity) < np.linalg.norm(outputs[-1].filtered)
 
 
 def test_two_that_command_at_once_stop_it_until_one_is_silent():
@@ -316,7 +316,7 @@ def test_two_that_say_where_the_needle_is_stop_it():
     plant = Plant().ready()
     plant.run(0.5)
     with pytest.raises(InvalidInputError, match="2 publishers at once"):
-        plant.bridge.needle.see(-TAIL, EAST, plant.time, 7777, plant.time, plant.time)
+        plant.bridge.extrapolator.update(-TAIL, EAST, plant.time, 7777, plant.time, plant.time)
     plant.tail = None
     assert plant.run(0.05)[-1].reasons == ("several publishers of needle/measured_cp at once",)
 
@@ -346,9 +346,9 @@ def test_the_needle_never_comes_closer_than_it_may(
         poses.append((plant.time, tail, heading))
         if number > latency and number % interval == 0:
             then, old_tail, old_heading = poses[number - 1 - latency]
-            plant.bridge.needle.see(old_tail, old_heading, then, number, plant.time, plant.time)
-        outcome = plant.run(PERIOD)[0]
-        moved = needle.body_velocity(heading, outcome.allocation.velocity)
+            plant.bridge.extrapolator.update(old_tail, old_heading, then, number, plant.time, plant.time)
+        output = plant.run(PERIOD)[0]
+        moved = needle.body_velocity(heading, output.allocation.velocity)
         tail, heading = needle.moved(tail, heading, *moved, PERIOD)
         least = min(least, safety.clearance(tail, heading))
     assert least > settings.keep_out - 1e-9
@@ -363,8 +363,8 @@ def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: p
         raise FloatingPointError("no such number")
 
     monkeypatch.setattr(plant.bridge, "_allocate", broken)
-    outcomes = plant.run(0.2)
-    assert all(still(outcome) for outcome in outcomes)
+    outputs = plant.run(0.2)
+    assert all(still(output) for output in outputs)
     assert plant.bridge.latch.fault == "internal error: FloatingPointError: no such number"
 
 
@@ -413,7 +413,7 @@ def test_10000_hostile_inputs_and_not_one_current_outside_of_the_limits():
                 plant.bridge.command("needle", values[:2], stamp, number[name], plant.time, plant.time)
             else:
                 where = 0.4 * values[:2] if hostile else tail
-                plant.bridge.needle.see(where, values[2:], stamp, number[name], plant.time, plant.time)
+                plant.bridge.extrapolator.update(where, values[2:], stamp, number[name], plant.time, plant.time)
         except InvalidInputError:
             pass
         plant.bridge.on_margins(plant.time, True, 1.0, plant.bridge.scene_version, plant.time)
@@ -464,15 +464,15 @@ def test_rejected_scene_leaves_the_previous_one_in_force():
 
 def test_an_operator_takes_over_by_commanding_and_gives_back_by_silence():
     plant = Plant(velocity=(0.005, 0.0)).ready()
-    assert (plant.run(0.2)[-1].source, plant.outcomes[-1][1].overridden) == ("needle", "")
+    assert (plant.run(0.2)[-1].source, plant.outputs[-1][1].overridden) == ("needle", "")
     for k in range(20):
         plant.command((0.0, 0.004), number=9000 + k, source="operator")
         plant.commands -= 1
-        outcome = plant.run(PERIOD)[0]
-        assert (outcome.source, outcome.overridden) == ("operator", "needle")
-        assert outcome.commanded.tolist() == [0.0, 0.004]
+        output = plant.run(PERIOD)[0]
+        assert (output.source, output.overridden) == ("operator", "needle")
+        assert output.commanded.tolist() == [0.0, 0.004]
     assert plant.run(0.12)[-1].source == "needle"
-    assert plant.outcomes[-1][1].commanded.tolist() == [0.005, 0.0]
+    assert plant.outputs[-1][1].commanded.tolist() == [0.005, 0.0]
 
 
 def test_an_operator_may_take_over_from_two_that_dispute_the_needle():
@@ -497,9 +497,9 @@ def test_two_operators_at_once_stop_the_needle_whoever_else_commands():
 
 def test_without_a_prediction_it_stops_and_says_so():
     plant = Plant(thread=False).ready()
-    outcome = plant.run(0.2)[-1]
-    assert still(outcome)
-    assert (outcome.reasons, outcome.active) == (("no thread prediction yet",), ("no prediction",))
+    output = plant.run(0.2)[-1]
+    assert still(output)
+    assert (output.reasons, output.active) == (("no thread prediction yet",), ("no prediction",))
     plant.thread = True
     assert not still(plant.run(0.1)[-1])
     plant.thread = False
@@ -510,10 +510,10 @@ def test_without_a_prediction_it_stops_and_says_so():
 def test_without_a_prediction_it_may_go_on_slowly():
     settings = CoilBridgeSettings(without_prediction="slow", speed_without_prediction=0.002)
     plant = Plant(settings, thread=False, velocity=(0.01, 0.0)).ready()
-    outcome = plant.run(0.3)[-1]
-    assert outcome.reasons == ()
-    assert np.linalg.norm(outcome.filtered) == pytest.approx(0.002)
-    assert outcome.active == ("no prediction", "speed")
+    output = plant.run(0.3)[-1]
+    assert output.reasons == ()
+    assert np.linalg.norm(output.filtered) == pytest.approx(0.002)
+    assert output.active == ("no prediction", "speed")
 
 
 def test_an_invalid_prediction_leaves_the_last_valid_one_until_that_is_old():
@@ -526,7 +526,7 @@ def test_an_invalid_prediction_leaves_the_last_valid_one_until_that_is_old():
     for _ in range(4):
         plant.bridge.on_margins(plant.time, False, 1.0, plant.bridge.scene_version, plant.time)
         plant.run(0.05)
-    assert plant.outcomes[-1][1].reasons == ("no thread prediction for 0.5 s",)
+    assert plant.outputs[-1][1].reasons == ("no thread prediction for 0.5 s",)
     for slowdown in (float("nan"), -0.1, 1.5):
         with pytest.raises(InvalidInputError, match="slowdown"):
             plant.bridge.on_margins(plant.time, True, slowdown, "", plant.time)
@@ -536,20 +536,20 @@ def test_friction_slows_the_needle():
     plant = Plant(thread=False, velocity=(0.01, 0.0)).ready()
     for _ in range(40):
         plant.bridge.on_margins(plant.time, True, 0.5, plant.bridge.scene_version, plant.time)
-        outcome = plant.run(PERIOD)[0]
-    assert outcome.commanded.tolist() == [0.01, 0.0]
-    assert outcome.filtered.tolist() == pytest.approx([0.005, 0.0])
-    assert (outcome.slowdown, outcome.active) == (0.5, ("friction",))
+        output = plant.run(PERIOD)[0]
+    assert output.commanded.tolist() == [0.01, 0.0]
+    assert output.filtered.tolist() == pytest.approx([0.005, 0.0])
+    assert (output.slowdown, output.active) == (0.5, ("friction",))
 
 
 def test_model_and_bridge_on_different_scenes_for_half_a_second_stop_the_needle():
     plant = Plant(thread=False).ready()
 
-    def run(duration: float, version: str) -> Outcome:
+    def run(duration: float, version: str) -> BridgeOutput:
         for _ in range(round(duration / PERIOD)):
             plant.bridge.on_margins(plant.time, True, 1.0, version, plant.time)
             plant.run(PERIOD)
-        return plant.outcomes[-1][1]
+        return plant.outputs[-1][1]
 
     mine = plant.bridge.scene_version
     assert not still(run(0.2, mine))
@@ -564,11 +564,11 @@ def test_a_needle_that_is_commanded_to_move_and_rests_says_what_stops_it():
     plant = Plant(velocity=(0.01, 0.0)).ready()
     keep = plant.settings.keep_out
     plant.tail = np.array([Scene().dish.radius - keep - plant.settings.needle_length, 0.0])
-    for outcome in plant.run(0.5)[4:]:
-        assert still(outcome)
-        assert outcome.reasons == ("stopped by wall",)
-        assert "wall" in outcome.active
-        assert outcome.commanded.tolist() == [0.01, 0.0]
+    for output in plant.run(0.5)[4:]:
+        assert still(output)
+        assert output.reasons == ("stopped by wall",)
+        assert "wall" in output.active
+        assert output.commanded.tolist() == [0.01, 0.0]
 
 
 def test_a_pose_outside_of_the_dish_stops_the_needle_until_poses_agree_again():
@@ -579,9 +579,9 @@ def test_a_pose_outside_of_the_dish_stops_the_needle_until_poses_agree_again():
     with pytest.raises(InvalidInputError, match="from the dish's centre"):
         plant.run(0.05)
     plant.tail = None
-    outcome = plant.run(PERIOD)[0]
-    assert still(outcome)
-    assert outcome.reasons[0].startswith("needle pose not believed: its tip is 0.021 m from the dish's centre")
+    output = plant.run(PERIOD)[0]
+    assert still(output)
+    assert output.reasons[0].startswith("needle pose rejected: its tip is 0.021 m from the dish's centre")
     plant.tail, refused = inside, 0
     for _ in range(40):
         try:

@@ -1,4 +1,4 @@
-"""Armed, disarmed, emergency stop, fault: who may move the needle."""
+"""Arming state machine: armed, disarmed, emergency stop, fault."""
 
 from __future__ import annotations
 
@@ -6,61 +6,61 @@ import itertools
 
 import pytest
 
-from magnetosuture_thread.coils.latch import ArmingLatch, Condition
+from magnetosuture_thread.coils.latch import ArmingLatch, ArmingState
 from magnetosuture_thread.errors import InvalidInputError
 
 
 def armed() -> ArmingLatch:
-    """Return a latch that lets commands pass."""
+    """Return an armed latch."""
     latch = ArmingLatch()
     latch.activate()
     latch.arm("")
     return latch
 
 
-def test_it_holds_until_it_is_active_and_armed():
+def test_latch_stops_until_active_and_armed():
     latch = ArmingLatch()
-    assert (latch.holds, latch.condition) == ("inactive", Condition.INACTIVE)
+    assert (latch.stop_reason, latch.state) == ("inactive", ArmingState.INACTIVE)
     with pytest.raises(InvalidInputError, match="an inactive bridge"):
         latch.arm("")
     latch.activate()
-    assert (latch.holds, latch.condition) == ("disarmed", Condition.ACTIVE)
+    assert (latch.stop_reason, latch.state) == ("disarmed", ArmingState.ACTIVE)
     latch.arm("")
-    assert (latch.holds, latch.armed) == ("", True)
+    assert (latch.stop_reason, latch.armed) == ("", True)
     latch.disarm()
-    assert latch.holds == "disarmed"
+    assert latch.stop_reason == "disarmed"
 
 
-def test_who_is_deactivated_is_disarmed():
+def test_deactivation_disarms():
     latch = armed()
     latch.deactivate()
-    assert latch.holds == "inactive"
+    assert latch.stop_reason == "inactive"
     latch.activate()
-    assert latch.holds == "disarmed"
+    assert latch.stop_reason == "disarmed"
 
 
 @pytest.mark.parametrize("activate_first", [True, False])
-def test_an_emergency_stop_stays_until_it_is_reset_and_a_reset_does_not_arm(activate_first: bool):
+def test_emergency_stop_is_latched_until_a_reset_which_does_not_arm(activate_first: bool):
     latch = armed() if activate_first else ArmingLatch()
     latch.stop()
-    assert (latch.holds, latch.condition) == ("emergency stop", Condition.FAULT)
+    assert (latch.stop_reason, latch.state) == ("emergency stop", ArmingState.FAULT)
     for act in (lambda: latch.arm(""), latch.activate):
         with pytest.raises(InvalidInputError, match="emergency stop"):
             act()
     latch.disarm()
     latch.deactivate()
-    assert latch.holds == "emergency stop"
+    assert latch.stop_reason == "emergency stop"
     latch.reset("")
     assert not latch.armed
     latch.activate()
-    assert latch.holds == "disarmed"
+    assert latch.stop_reason == "disarmed"
 
 
-def test_the_first_fault_is_kept_and_latched():
+def test_first_fault_is_latched():
     latch = armed()
     latch.trip("driver: silent")
     latch.trip("something that followed")
-    assert (latch.holds, latch.condition, latch.armed) == ("driver: silent", Condition.FAULT, False)
+    assert (latch.stop_reason, latch.state, latch.armed) == ("driver: silent", ArmingState.FAULT, False)
     with pytest.raises(InvalidInputError, match="driver: silent"):
         latch.arm("")
 
@@ -99,5 +99,5 @@ def test_whatever_is_pressed_in_whatever_order_nothing_passes_without_an_arm_aft
             latched = (latched or press in {"stop", "trip"}) and press != "reset"
             active = press == "activate" or (active and press != "deactivate")
             allowed = press == "arm" or (allowed and press not in ends)
-            assert not (latched and latch.holds == "")
-        assert (latch.holds == "") == (allowed and active and not latched), sequence
+            assert not (latched and latch.stop_reason == "")
+        assert (latch.stop_reason == "") == (allowed and active and not latched), sequence

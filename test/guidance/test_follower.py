@@ -1,4 +1,4 @@
-"""The path follower, on a needle that does exactly as it is told, or nearly."""
+"""The path-following controller, on an ideal needle and on one with drift."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ def follower(**changes: Any) -> PathFollower:
 
 
 def run(
-    steering: PathFollower, drift: np.ndarray, seconds: float = 30.0, first: int = 0
+    controller: PathFollower, drift: np.ndarray, seconds: float = 30.0, first: int = 0
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Move a tip by what is asked and a drift; return its distance from the wish, its speeds, and the progress."""
+    """Move a tip by the commanded velocity and a drift; return distances from the setpoint, speeds and progress."""
     tip = LENGTH * EAST
     apart, speeds = [], []
-    wish = steering.follow(first / RATE, tip - LENGTH * EAST, EAST)
+    command = controller.compute_command(first / RATE, tip - LENGTH * EAST, EAST)
     for step in range(first + 1, first + int(seconds * RATE)):
-        tip = tip + (wish.velocity + drift * np.any(wish.velocity)) / RATE
-        wish = steering.follow(step / RATE, tip - LENGTH * EAST, EAST)
-        apart.append(np.linalg.norm(wish.tip - tip))
-        speeds.append(np.linalg.norm(wish.velocity))
-        if wish.progress >= 1.0:
+        tip = tip + (command.velocity + drift * np.any(command.velocity)) / RATE
+        command = controller.compute_command(step / RATE, tip - LENGTH * EAST, EAST)
+        apart.append(np.linalg.norm(command.tip - tip))
+        speeds.append(np.linalg.norm(command.velocity))
+        if command.progress >= 1.0:
             break
-    return np.array(apart), np.array(speeds), wish.progress
+    return np.array(apart), np.array(speeds), command.progress
 
 
-def test_a_needle_that_obeys_is_taken_along_the_whole_path():
+def test_ideal_needle_follows_the_whole_path():
     apart, speeds, progress = run(follower(), np.zeros(2))
     assert progress == 1.0
     assert apart.max() < 1.5e-4
     assert np.median(speeds) == pytest.approx(0.005, rel=0.05)
 
 
-def test_the_speed_rises_and_falls_within_the_acceleration():
+def test_speed_profile_respects_the_acceleration():
     _, speeds, _ = run(follower(acceleration=0.004), np.zeros(2))
     assert speeds[5] < 0.001
     assert speeds[-10] < 0.003
     assert np.abs(np.diff(speeds[:-2])).max() < 0.004 / RATE * 2.5
 
 
-def test_a_lasting_drift_is_made_up_for():
+def test_integral_term_compensates_a_constant_drift():
     """A proportional law alone would stay behind by drift / gain, here 0.125 mm."""
     drift = np.array([0.0, 0.001])
     with_integral, _, _ = run(follower(), drift)
@@ -62,64 +62,64 @@ def test_a_lasting_drift_is_made_up_for():
     assert np.median(with_integral[settled]) < 0.5 * np.median(without[settled])
 
 
-def test_at_the_end_it_asks_for_no_velocity_any_more():
-    steering = follower()
-    run(steering, np.zeros(2))
-    wish = steering.follow(40.0, np.array([0.1, 0.1]), EAST)
-    assert wish.progress == 1.0
-    assert wish.velocity.tolist() == [0.0, 0.0]
+def test_command_is_zero_at_the_end():
+    controller = follower()
+    run(controller, np.zeros(2))
+    command = controller.compute_command(40.0, np.array([0.1, 0.1]), EAST)
+    assert command.progress == 1.0
+    assert command.velocity.tolist() == [0.0, 0.0]
 
 
-def test_it_is_done_only_when_the_tip_is_there():
-    steering = follower(longest_lag=0.1)
+def test_path_is_done_only_when_the_tip_arrives():
+    controller = follower(longest_lag=0.1)
     for step in range(1200):
-        wish = steering.follow(step / RATE, np.zeros(2), EAST)
-    assert wish.progress < 1.0
-    assert np.any(wish.velocity)
+        command = controller.compute_command(step / RATE, np.zeros(2), EAST)
+    assert command.progress < 1.0
+    assert np.any(command.velocity)
     there = np.array([0.025, 0.012]) - LENGTH * EAST
-    assert steering.follow(20.0, there + np.array([0.0, 4e-4]), EAST).progress == 1.0
+    assert controller.compute_command(20.0, there + np.array([0.0, 4e-4]), EAST).progress == 1.0
 
 
-def test_nothing_moves_before_it_has_settled_and_the_path_begins_where_the_tip_is_then():
-    steering = follower(settle=1.0)
+def test_path_begins_at_the_tip_after_settling():
+    controller = follower(settle=1.0)
     for step in range(60):
-        wish = steering.follow(step / RATE, np.array([1e-5 * step, 0.0]), EAST)
-        assert wish.velocity.tolist() == [0.0, 0.0]
-        assert wish.progress == 0.0
-    steering.follow(1.0, np.array([6e-4, 0.0]), EAST)
-    wish = steering.follow(1.0 + 1 / RATE, np.array([6e-4, 0.0]), EAST)
-    assert wish.progress > 0.0
-    np.testing.assert_allclose(wish.tip, [LENGTH + 6e-4, 0.0], atol=1e-5)
+        command = controller.compute_command(step / RATE, np.array([1e-5 * step, 0.0]), EAST)
+        assert command.velocity.tolist() == [0.0, 0.0]
+        assert command.progress == 0.0
+    controller.compute_command(1.0, np.array([6e-4, 0.0]), EAST)
+    command = controller.compute_command(1.0 + 1 / RATE, np.array([6e-4, 0.0]), EAST)
+    assert command.progress > 0.0
+    np.testing.assert_allclose(command.tip, [LENGTH + 6e-4, 0.0], atol=1e-5)
 
 
-def test_the_point_waits_while_no_pose_comes():
-    steering = follower()
+def test_setpoint_waits_while_no_pose_arrives():
+    controller = follower()
     for step in range(60):
-        before = steering.follow(step / RATE, step / RATE * 0.005 * EAST, EAST)
-    after = steering.follow(61 / RATE + 5.0, 0.005 * EAST, EAST)
+        before = controller.compute_command(step / RATE, step / RATE * 0.005 * EAST, EAST)
+    after = controller.compute_command(61 / RATE + 5.0, 0.005 * EAST, EAST)
     assert after.progress - before.progress < 0.11 * 0.005 / 0.02
 
 
-def test_the_point_waits_for_a_needle_that_does_not_come_and_asks_for_no_more_than_before():
-    steering = follower(longest_lag=0.001)
+def test_setpoint_waits_for_a_blocked_needle_and_the_command_stays_bounded():
+    controller = follower(longest_lag=0.001)
     for step in range(600):
-        wish = steering.follow(step / RATE, np.zeros(2), EAST)
-    assert np.linalg.norm(wish.tip - LENGTH * EAST) < 0.0012
-    assert np.linalg.norm(wish.velocity) < 0.014
-    apart, _, progress = run(steering, np.zeros(2), first=600)
+        command = controller.compute_command(step / RATE, np.zeros(2), EAST)
+    assert np.linalg.norm(command.tip - LENGTH * EAST) < 0.0012
+    assert np.linalg.norm(command.velocity) < 0.014
+    apart, _, progress = run(controller, np.zeros(2), first=600)
     assert progress == 1.0
     assert np.median(apart) < 1.5e-4
 
 
-def test_time_that_goes_back_does_not_move_the_point_back():
-    steering = follower()
+def test_time_jump_backwards_does_not_move_the_setpoint_back():
+    controller = follower()
     for step in range(60):
-        before = steering.follow(step / RATE, step / RATE * 0.005 * EAST, EAST)
-    assert steering.follow(0.2, 0.005 * EAST, EAST).progress == before.progress
+        before = controller.compute_command(step / RATE, step / RATE * 0.005 * EAST, EAST)
+    assert controller.compute_command(0.2, 0.005 * EAST, EAST).progress == before.progress
 
 
-def test_a_curved_needle_is_followed_at_its_tip():
-    steering = follower(needle_curvature=150.0)
-    wish = steering.follow(0.0, np.zeros(2), EAST)
+def test_curved_needle_is_controlled_at_its_tip():
+    controller = follower(needle_curvature=150.0)
+    command = controller.compute_command(0.0, np.zeros(2), EAST)
     angle = 150.0 * LENGTH
-    np.testing.assert_allclose(wish.tip, [np.sin(angle) / 150.0, (1.0 - np.cos(angle)) / 150.0], atol=1e-9)
+    np.testing.assert_allclose(command.tip, [np.sin(angle) / 150.0, (1.0 - np.cos(angle)) / 150.0], atol=1e-9)

@@ -11,7 +11,7 @@ from magnetosuture_thread.guidance.path import SmoothPath
 CORNERS = np.array([[0.0, 0.0], [0.01, 0.002], [0.012, 0.01], [0.0, 0.012]])
 
 
-def test_it_goes_through_its_waypoints_and_begins_as_asked():
+def test_path_passes_its_waypoints_with_the_initial_direction():
     path = SmoothPath(CORNERS, np.array([0.0, -1.0]))
     along = np.linspace(0.0, path.length, 5000)
     points = np.array([path.point(length) for length in along])
@@ -20,7 +20,7 @@ def test_it_goes_through_its_waypoints_and_begins_as_asked():
     np.testing.assert_allclose(path.tangent(0.0), [0.0, -1.0], atol=1e-9)
 
 
-def test_its_parameter_is_the_arc_length():
+def test_path_is_parametrised_by_arc_length():
     path = SmoothPath(CORNERS)
     step = path.length / 400
     for length in np.linspace(0.0, path.length - step, 50):
@@ -29,7 +29,7 @@ def test_its_parameter_is_the_arc_length():
         assert moved / np.linalg.norm(moved) @ path.tangent(length + 0.5 * step) > 0.9999
 
 
-def test_beyond_its_ends_it_stays_there():
+def test_arc_length_is_clamped_to_the_path():
     path = SmoothPath(CORNERS)
     np.testing.assert_allclose(path.point(-1.0), CORNERS[0])
     np.testing.assert_allclose(path.point(path.length + 1.0), CORNERS[-1], atol=1e-12)
@@ -40,6 +40,6 @@ def test_beyond_its_ends_it_stays_there():
     [np.zeros((1, 2)), np.zeros((2, 2)), np.array([[0.0, 0.0], [np.nan, 1.0]]), CORNERS[[0, 1, 1, 2]]],
     ids=["one point", "no way", "not finite", "twice the same"],
 )
-def test_what_is_no_path_is_refused(points: np.ndarray):
+def test_invalid_waypoints_are_rejected(points: np.ndarray):
     with pytest.raises(InvalidInputError, match="waypoints"):
         SmoothPath(points)

@@ -29,7 +29,7 @@ READY = {"scene": SCENE, "prediction_timeout": 5.0}  # and so do the thread's ma
 def armed(graph, **parameters: Any) -> Any:
     """Return a bridge that passes commands."""
     node = graph.add(CoilBridgeNode, autostart="armed", **{**READY, **parameters})
-    graph.wait(lambda: node.station.latch.armed, "the bridge to be armed")
+    graph.wait(lambda: node.system.latch.armed, "the bridge to be armed")
     predict(graph)
     return node
 
@@ -88,7 +88,7 @@ def stage(graph) -> str:
 
 def applied(node) -> list[np.ndarray]:
     """Return what the recording driver was told."""
-    return list(node.station.driver.applied)
+    return list(node.system.driver.applied)
 
 
 def driven(node) -> bool:

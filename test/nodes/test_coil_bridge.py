@@ -216,7 +216,7 @@ def test_a_message_that_breaks_arithmetic_does_not_end_the_node(graph, monkeypat
     def broken(*_: Any) -> None:
         raise OverflowError("a check that was forgotten")
 
-    monkeypatch.setattr(node.station.bridge, "command", broken)
-    monkeypatch.setattr(node.station.bridge.needle, "see", broken)
+    monkeypatch.setattr(node.system.bridge, "command", broken)
+    monkeypatch.setattr(node.system.bridge.extrapolator, "update", broken)
     drive(graph)
     graph.wait(lambda: bool(states) and states[-1].refused == 2, "both refused")

@@ -98,11 +98,12 @@ def test_inactive_passes_nothing(graph, how_far):
     drive(graph)
     assert not arm(graph).success
     graph.wait(lambda: reasons(states).startswith(how_far), "the reason")
-    if node.station.driver is not None:
+    if node.system.driver is not None:
         assert not driven(node)
     assert press(graph, EMERGENCY_STOP).success
     graph.wait(
-        lambda: bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT, "the stop to be latched here too"
+        lambda: bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT,
+        "the stop to be latched here too",
     )
     assert press(graph, RESET).success
     assert stage(graph) == how_far
@@ -119,16 +120,16 @@ def test_the_lifecycle_there_and_back(graph):
     assert not applied(node)[-1].any()
     assert not change(graph, Transition.TRANSITION_DEACTIVATE)  # not possible now, and no end of the node
     assert not change(graph, 99)
-    first = node.station.driver
+    first = node.system.driver
     assert change(graph, Transition.TRANSITION_CLEANUP)
     assert not first.state().ready
     assert change(graph, Transition.TRANSITION_CONFIGURE)
     assert change(graph, Transition.TRANSITION_ACTIVATE)
-    assert node.station.driver is not first
-    assert not node.station.latch.armed
+    assert node.system.driver is not first
+    assert not node.system.latch.armed
     assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert stage(graph) == "finalized"
-    assert not node.station.driver.state().ready
+    assert not node.system.driver.state().ready
 
 
 def test_a_reset_never_arms_whatever_came_between(graph):
@@ -144,7 +145,7 @@ def test_a_reset_never_arms_whatever_came_between(graph):
     drive(graph)
     told = len(applied(node))
     graph.wait(lambda: len(applied(node)) > told + 30, "some steps")
-    assert not node.station.latch.armed
+    assert not node.system.latch.armed
     assert not driven(node)
 
 
@@ -152,7 +153,7 @@ def test_a_stop_calls_off_what_would_arm_by_itself(graph):
     node = graph.add(CoilBridgeNode, driver="simulated", autostart="armed", **LONG, **READY)
     assert press(graph, EMERGENCY_STOP).success
     graph.listen(topics.RIG_CURRENTS)
-    graph.wait(lambda: node.station.driver.state().ready, "the rig to be found")
+    graph.wait(lambda: node.system.driver.state().ready, "the rig to be found")
     assert press(graph, RESET).success
     states = graph.listen(topics.BRIDGE_STATE)
     graph.wait(lambda: len(states) > 3, "some states")
@@ -184,9 +185,9 @@ def test_an_error_in_a_transition_leaves_the_coils_at_zero_and_the_driver_closed
     def broken() -> None:
         raise RuntimeError("nobody foresaw this")
 
-    monkeypatch.setattr(node.station.latch, "deactivate", broken)
+    monkeypatch.setattr(node.system.latch, "deactivate", broken)
     change(graph, transition)
-    assert not node.station.driver.state().ready
+    assert not node.system.driver.state().ready
     assert not applied(node)[-1].any()
     assert "nobody foresaw this" in str(node.problem)
     assert stage(graph) in ("unconfigured", "finalized")
@@ -200,8 +201,8 @@ def test_what_was_taken_is_given_back_where_configuring_fails(graph, monkeypatch
 
     monkeypatch.setattr(node, "create_timer", broken)
     assert not change(graph, Transition.TRANSITION_CONFIGURE)
-    assert node.station.bridge is None
-    assert not node.station.driver.state().ready
+    assert node.system.bridge is None
+    assert not node.system.driver.state().ready
     monkeypatch.undo()
     assert change(graph, Transition.TRANSITION_CONFIGURE)
 
@@ -232,7 +233,7 @@ def test_without_a_rig_the_simulated_driver_is_not_armed(graph):
     graph.add(CoilBridgeNode, driver="simulated", **LONG, **READY)
     refusal = arm(graph)
     assert not refusal.success
-    assert "no rig_simulator listens" in refusal.message
+    assert "no rig_simulator subscribed" in refusal.message
     wires = graph.listen(topics.RIG_CURRENTS)
     graph.wait(lambda: arm(graph).success, "the rig to be found")
     drive(graph)

@@ -42,7 +42,7 @@ def test_every_switch_works_and_shows_the_state(
         assert said.splitlines()[0].split(maxsplit=1) == ["state", state]
     code, said = press(capsys, "deactivate")
     assert code == 1
-    assert "refuses to deactivate" in said
+    assert "rejected deactivate" in said
     assert node.stage == "unconfigured"
 
 

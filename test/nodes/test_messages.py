@@ -18,7 +18,7 @@ from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.bags.types import MESSAGES as BAG_MESSAGES
 from magnetosuture_thread.bags.types import typestore
-from magnetosuture_thread.coils.latch import Condition
+from magnetosuture_thread.coils.latch import ArmingState
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
@@ -105,7 +105,7 @@ def test_the_numbers_of_states_and_markers_are_those_of_the_messages():
     for name, number in building.CONDITIONS.items():
         assert getattr(CoilBridgeState, f"STATE_{name}") == number
     assert set(building.STATES) == {state.name for state in State}
-    assert set(building.CONDITIONS) == {condition.name for condition in Condition}
+    assert set(building.CONDITIONS) == {condition.name for condition in ArmingState}
     kinds = (Marker.LINE_STRIP, Marker.TRIANGLE_LIST, Marker.CYLINDER, Marker.TEXT_VIEW_FACING)
     assert kinds == (building.LINE_STRIP, building.TRIANGLE_LIST, building.CYLINDER, building.TEXT)
     assert (Marker.ADD, Marker.DELETEALL) == (building.ADD, building.DELETE_ALL)

@@ -25,16 +25,16 @@ def pose(seconds: float, x: float):
 
 def test_a_pose_is_answered_by_a_command_made_now_and_by_the_wish_at_the_pose(graph):
     graph.add(PathFollowerNode, settle=0.0, waypoints=[0.02, 0.0])
-    commands, wishes = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.TIP_SETPOINT)
+    commands, setpoints = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.TIP_SETPOINT)
     for index in range(30):
         graph.publish(topics.NEEDLE_POSE, pose(5.0 + index / 60, 0.0))
-        graph.wait(lambda n=index: len(commands) > n and len(wishes) > n - 1, "the answer")
+        graph.wait(lambda n=index: len(commands) > n and len(setpoints) > n - 1, "the answer")
     assert commands[-1].header.frame_id == "dish"
     assert commands[-1].twist.linear.x > 0.001
     assert abs(commands[-1].twist.linear.y) < 1e-6
     assert commands[-1].header.stamp.sec > 1000
-    assert wishes[-1].header.stamp.sec == 5
-    assert 0.007 < wishes[-1].pose.position.x < 0.01
+    assert setpoints[-1].header.stamp.sec == 5
+    assert 0.007 < setpoints[-1].pose.position.x < 0.01
 
 
 def test_without_a_pose_it_is_silent_and_a_bad_one_is_refused(graph):
@@ -71,10 +71,12 @@ def test_a_path_of_nothing_is_refused_with_the_first_pose(graph):
 
 def test_it_does_not_begin_before_anybody_takes_its_commands(graph):
     graph.add(PathFollowerNode, settle=0.0, waypoints=[0.02, 0.0])
-    wishes, diagnostics = graph.listen(topics.TIP_SETPOINT), graph.listen(topics.DIAGNOSTICS)
+    setpoints, diagnostics = graph.listen(topics.TIP_SETPOINT), graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
-    graph.wait(lambda: any(d.status[0].message == "nobody takes velocity commands" for d in diagnostics), "the reason")
-    assert wishes == []
+    graph.wait(
+        lambda: any(d.status[0].message == "no subscriber to velocity commands" for d in diagnostics), "the reason"
+    )
+    assert setpoints == []
 
 
 def test_it_waits_for_as_many_as_it_is_told(graph):
@@ -82,7 +84,7 @@ def test_it_waits_for_as_many_as_it_is_told(graph):
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     first = graph.listen(topics.NEEDLE_COMMAND)
     graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
-    few = "1 of 2 take velocity commands"
+    few = "1 of 2 subscribers to velocity commands"
     graph.wait(lambda: any(d.status[0].message == few for d in diagnostics), "the reason")
     assert first == []
     second = graph.listen_later(topics.NEEDLE_COMMAND)

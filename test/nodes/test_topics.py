@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from magnetosuture_thread.coils.sources import SourceWatch
+from magnetosuture_thread.coils.input_checks import PublisherCounter
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
@@ -75,8 +75,8 @@ def test_where_nobody_numbers_messages_the_publishers_are_counted(graph, monkeyp
 
     monkeypatch.setattr(graph.probe, "create_subscription", subscribe)
     topics.NEEDLE_COMMAND.subscribe_numbered(graph.probe, lambda message, number: taken.append(number))
-    watch = SourceWatch()
+    counter = PublisherCounter()
     for index in range(20):
         callbacks[0](None, {"publication_sequence_number": unknown})
-        watch.hear(taken[-1], 0.01 * index)
-    assert watch.count(0.2) == speaking
+        counter.update(taken[-1], 0.01 * index)
+    assert counter.count(0.2) == speaking

@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     say = sayer(make_console())
     with CoilClient() as client:
         if options.action != "state":
-            client.do(options.action)
+            client.execute(options.action)
         state = client.state()
     width = max(len(name) for name in state)
     for name, value in state.items():

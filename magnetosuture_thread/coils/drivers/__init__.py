@@ -1,4 +1,4 @@
-"""Coil drivers, a file for each."""
+"""Coil drivers, one module each."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 def make_driver(
     settings: CoilBridgeSettings, coils: int, send: Callable[[Vector], None], listeners: Callable[[], int]
 ) -> CoilDriver:
-    """Return the driver that the settings name.
+    """Create the driver named in the settings.
 
     Args:
         settings: of the bridge.
         coils: number of coils.
-        send: takes currents of shape (m,) [A] to the simulated rig.
-        listeners: tells how many simulated rigs listen.
+        send: sends currents of shape (m,) [A] to the simulated rig.
+        listeners: returns the number of simulated rigs that subscribe.
 
     Raises:
-        DriverError: its settings cannot work.
+        DriverError: its settings are invalid.
     """
     if settings.driver == "simulated":
         return SimulatedDriver(coils, send, listeners)

@@ -1,4 +1,4 @@
-"""What a coil driver must do."""
+"""Interface of coil drivers."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DriverState:
-    """What a driver knows of its power stage.
+    """State of a driver and its power stage.
 
     Attributes:
-        ready: whether currents get to the coils now.
-        problem: why not; empty while it is ready.
-        losses: how often it has ceased to be ready since it was opened. A loss that is over before anybody
-            looked must be noticed all the same: the coils went to zero meanwhile.
-        warnings: what a person should know although it goes on.
+        ready: whether currents reach the coils now.
+        problem: why not; empty while ready.
+        losses: how often it ceased to be ready since it was opened. A loss that ended between two steps must be
+            detected all the same: the coils went to zero meanwhile.
+        warnings: conditions that need attention but no stop.
         currents: measured in each coil, shape (m,) [A]; None where the driver measures none.
         voltages: of the boards' supplies [V]; empty where the driver measures none.
     """
@@ -34,29 +34,29 @@ class DriverState:
 
 
 class CoilDriver(Protocol):
-    """The interface to the coils' power stage.
+    """Interface to the power stage of the coils.
 
-    No call may wait for a device: what takes time belongs in a thread of the driver's own, and what it finds
-    in its state. Whatever happens to the device, a driver comes back by itself, and always from zero: it
-    drops what was asked of it before, and what it is asked between is not applied late.
+    No call may wait for a device: slow operations belong in a thread of the driver's own, and their results in
+    its state. After any failure of the device a driver reconnects by itself, always from zero: it drops earlier
+    currents, and does not apply later ones with a delay.
     """
 
     def open(self) -> None:
-        """Begin to connect, with all currents at zero; whether it succeeds is in the state.
+        """Start to connect, with all currents at zero; success is reported in the state.
 
         Raises:
-            DriverError: it can never succeed.
+            DriverError: the connection can never succeed.
         """
         ...
 
     def apply(self, currents: Vector) -> None:
-        """Ask for the current of each coil from now on, shape (m,) [A]; nothing is kept while not ready."""
+        """Set the current of each coil from now on, shape (m,) [A]; ignored while not ready."""
         ...
 
     def state(self) -> DriverState:
-        """Return what is known now."""
+        """Return the present state."""
         ...
 
     def close(self) -> None:
-        """Set all currents to zero and disconnect; harmless if it is not open."""
+        """Set all currents to zero and disconnect; no effect if not open."""
         ...

@@ -1,4 +1,4 @@
-"""A driver without hardware: it keeps what it was told."""
+"""Coil driver without hardware that records currents."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 
-KEPT = 10_000
+MAX_RECORDED = 10_000
 
 
 class RecordingDriver:
-    """Stands in where no hardware is configured: in tests, and while a bag is replayed.
+    """Records currents where no hardware is configured: in tests, and in replays of bags.
 
     Args:
         coils: number of coils.
@@ -25,14 +25,14 @@ class RecordingDriver:
     def __init__(self, coils: int) -> None:
         self._coils = coils
         self._open = False
-        self.applied: deque[NDArray[np.float64]] = deque(maxlen=KEPT)
+        self.applied: deque[NDArray[np.float64]] = deque(maxlen=MAX_RECORDED)
 
     def open(self) -> None:
-        """Start to accept currents."""
+        """Accept currents from now on."""
         self._open = True
 
     def apply(self, currents: NDArray[np.float64]) -> None:
-        """Keep the currents of all coils, shape (coils,) [A].
+        """Record the currents of all coils, shape (coils,) [A].
 
         Raises:
             ValueError: the number of currents is wrong.
@@ -44,11 +44,11 @@ class RecordingDriver:
         self.applied.append(currents.copy())
 
     def state(self) -> DriverState:
-        """Return that it is ready while it is open."""
+        """Return that the driver is ready while open."""
         return DriverState(self._open, "" if self._open else "not open")
 
     def close(self) -> None:
-        """Set all currents to zero and stop to accept any."""
+        """Record zero currents and accept no more."""
         if self._open:
             self.applied.append(np.zeros(self._coils))
         self._open = False

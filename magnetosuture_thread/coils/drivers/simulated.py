@@ -1,4 +1,4 @@
-"""A driver for the simulated rig: currents go out as messages."""
+"""Coil driver for the simulated rig, over messages."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Vector = NDArray[np.float64]
 
 
 class SimulatedDriver:
-    """Sends currents to whoever simulates the coils; without anybody there it is not ready.
+    """Sends currents to the simulated rig; not ready without a subscriber.
 
     Args:
         coils: number of coils.
-        send: takes currents of shape (coils,) [A] to the simulation.
-        listeners: tells how many simulations listen.
+        send: sends currents of shape (coils,) [A] to the simulation.
+        listeners: returns the number of simulations that subscribe.
     """
 
     def __init__(self, coils: int, send: Callable[[Vector], None], listeners: Callable[[], int]) -> None:
@@ -29,7 +29,7 @@ class SimulatedDriver:
         self._losses = 0
 
     def open(self) -> None:
-        """Begin to send."""
+        """Send currents from now on."""
         self._open = True
 
     def apply(self, currents: Vector) -> None:
@@ -38,14 +38,14 @@ class SimulatedDriver:
             self._send(currents)
 
     def state(self) -> DriverState:
-        """Return whether anybody listens."""
+        """Return whether there is a subscriber."""
         ready = self._open and self._listeners() > 0
         if self._ready and not ready:
             self._losses += 1
         self._ready = ready
-        return DriverState(ready, "" if ready else "no rig_simulator listens", self._losses)
+        return DriverState(ready, "" if ready else "no rig_simulator subscribed", self._losses)
 
     def close(self) -> None:
-        """Send zeros, and then no more."""
+        """Send zero currents, and no more after that."""
         self.apply(np.zeros(self._coils))
         self._open = False

@@ -25,7 +25,7 @@ def test_without_anybody_there_it_is_not_ready_and_each_loss_counts():
     listeners = [0]
     driver = SimulatedDriver(4, lambda currents: None, lambda: listeners[0])
     driver.open()
-    assert (driver.state().ready, driver.state().problem) == (False, "no rig_simulator listens")
+    assert (driver.state().ready, driver.state().problem) == (False, "no rig_simulator subscribed")
     assert driver.state().losses == 0
     for number in (1, 2):
         listeners[0] = 1

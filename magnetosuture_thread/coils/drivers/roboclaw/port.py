@@ -1,4 +1,4 @@
-"""A serial port whose exchanges take a bounded time."""
+"""Serial port with a bounded time for each exchange."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import serial
 
 
 class DeviceError(Exception):
-    """A board or its line that does not work; its text is for a person."""
+    """Failure of a board or its line, with a text for the operator."""
 
 
 class ExchangePort(serial.Serial):
-    """A port for one question and one answer at a time, that only one process can have.
+    """Exclusive serial port for one request and one answer at a time.
 
-    What is written is kept until the answer is read, so that a packet goes out in one piece: a board drops one
-    with a gap of 10 ms in it, and the maker's library writes a packet in up to five pieces.
+    Written bytes are buffered until the answer is read, so that a packet is sent in one piece: a board drops one
+    with a gap of 10 ms, and the manufacturer's library writes a packet in up to five pieces.
 
     Args:
         path: of the port.
@@ -37,30 +37,30 @@ class ExchangePort(serial.Serial):
         self.answer = bytearray()
         self._until = 0.0
         try:
-            # The lock comes before anything is changed at the port, and so does not disturb who has it.
+            # The lock comes first, so that a process that holds the port is not disturbed.
             super().__init__(path, baud_rate, timeout=answer_timeout, exclusive=True)
         except (serial.SerialException, ValueError) as error:
-            raise DeviceError(_why_not(path, error)) from error
+            raise DeviceError(_open_problem(path, error)) from error
 
     def begin(self) -> None:
-        """Begin an exchange: what came too late for the last one is not the answer to this one."""
+        """Begin an exchange; discard late bytes of the last one."""
         self.reset_input_buffer()
         self._packet.clear()
         self.answer.clear()
         self._until = time.monotonic() + self.answer_timeout
 
     def write(self, b: Any, /) -> int:
-        """Keep bytes of a packet until the answer is read."""
+        """Buffer bytes of a packet until the answer is read."""
         self._packet += b
         return len(b)
 
     def read(self, size: int = 1, /) -> bytes:
         """Send the packet if it has not been sent, and return up to `size` bytes of the answer.
 
-        The board's time begins when the packet is out, and an exchange, however many reads it has, waits for at
-        most twice that. What has come is taken even if this thread was held up and comes late for it: rclpy may
-        keep the interpreter to itself for longer than a board has, and that is no fault of the board's. For the
-        same reason a packet that is late by so much is not sent at all, as what it says may no longer be wanted.
+        The board's time begins when the packet is sent; an exchange waits for at most twice that, in any number of
+        reads. Bytes that have arrived are returned even if this thread was delayed: rclpy may hold the interpreter
+        for longer than the answer timeout, which is no fault of the board. For the same reason a packet that is
+        late by that much is not sent, as its command may be outdated.
         """
         if self._packet:
             packet = bytes(self._packet)
@@ -76,17 +76,16 @@ class ExchangePort(serial.Serial):
         return data
 
     def _send(self, packet: bytes) -> None:
-        """Give a packet to the kernel in one piece, once there is room for it.
+        """Write a packet to the kernel in one piece, once there is room.
 
-        The library's own write takes a packet that is out for one that is not, where this thread was held up on the
-        way back from the kernel.
+        The library's own write reports a sent packet as not sent if this thread was delayed after the system call.
         """
         _, room, _ = select.select([], [self], [], max(0.0, self._until - time.monotonic()))
         if not room or os.write(self.fileno(), packet) < len(packet):
             raise serial.SerialTimeoutException("no room for a packet")
 
 
-def _why_not(path: str, error: Exception) -> str:
+def _open_problem(path: str, error: Exception) -> str:
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         return f"{path} is held by another process"

@@ -43,10 +43,10 @@ class Bench:
         slow = {"max_speed": 0.005}  # with which the boards may have any timeout
         return CoilBridgeSettings(**{"roboclaw_ports": ports, "roboclaw_addresses": addresses, **slow, **changes})
 
-    def open(self, *, ready: bool = True, patience: float | None = None, **changes: Any) -> RoboClawDriver:
+    def open(self, *, ready: bool = True, apply_timeout: float | None = None, **changes: Any) -> RoboClawDriver:
         """Return an open driver, once it is ready."""
         self.stage.open()
-        driver = RoboClawDriver(self.settings(**changes), patience=patience)
+        driver = RoboClawDriver(self.settings(**changes), apply_timeout=apply_timeout)
         self.drivers.append(driver)
         driver.open()
         if ready:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.drivers.roboclaw import port as port_module
-from magnetosuture_thread.coils.drivers.roboclaw import rules
+from magnetosuture_thread.coils.drivers.roboclaw import protocol
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -135,7 +135,7 @@ def give(made: Board, *currents: float) -> None:
 
 def whole_round(made: Board) -> None:
     """Ask everything once, and the first again."""
-    for _ in range(len(rules.ROUND) + 1):
+    for _ in range(len(protocol.POLL_SEQUENCE) + 1):
         made.poll()
 
 
@@ -186,7 +186,7 @@ def test_nothing_is_tried_twice_in_a_hurry(peer, port):
 def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     peer.trickle(0.02)
     with pytest.raises(DeviceError, match="no valid answer to ReadVersion"):
-        board(port).set_up()
+        board(port).configure()
     assert len(port.answer) < 48  # which the library would wait for
 
 
@@ -244,7 +244,7 @@ def test_a_line_without_room_for_a_packet_keeps_nobody(peer, port):
 def test_every_tenth_of_a_second_gets_to_the_board(peer, patient, port, tenths: int):
     there = RoboClawBoard()
     peer.answer(simulated(there))
-    board(port, tenths).set_up()
+    board(port, tenths).configure()
     assert there.timeout == tenths
     assert there.limits == [1000, 1000]
 
@@ -254,7 +254,7 @@ def test_it_knows_what_the_board_says(peer, patient, port):
     there.duties, there.timeout = (5000, -5000), 0
     peer.answer(simulated(there))
     made = board(port)
-    made.set_up()
+    made.configure()
     assert made.version.startswith("RoboClaw simulated")
     assert made.voltage == 12.3
     assert there.duties == (0, 0)
@@ -264,7 +264,7 @@ def test_a_lost_write_is_written_again_before_it_is_a_fault(peer, patient, port)
     there = RoboClawBoard()
     peer.answer(simulated(there))
     made = board(port)
-    made.set_up()
+    made.configure()
     there.ignored.add(34)
     give(made, 3.0, 0.0)
     made.poll()  # the first of a round looks at the duties
@@ -281,7 +281,7 @@ def test_a_current_is_counted_the_way_that_its_duty_goes(peer, patient, port):
     there = RoboClawBoard()
     peer.answer(simulated(there))
     made = board(port)
-    made.set_up()
+    made.configure()
     deadline = time.monotonic() + 10.0
     while abs(made.currents[1] + 6.0) > 0.05:
         assert time.monotonic() < deadline
@@ -314,7 +314,7 @@ def test_what_a_board_forgets_is_found_within_a_round(peer, patient, port, comma
     there = RoboClawBoard()
     peer.answer(simulated(there))
     made = board(port)
-    made.set_up()
+    made.configure()
     whole_round(made)
     timeout, limits = there.timeout, list(there.limits)
     there.power_cycle()
@@ -327,7 +327,7 @@ def test_what_a_board_forgets_is_found_within_a_round(peer, patient, port, comma
 
 def spoken_to(made: Board, *currents: float, rounds: int = 5) -> tuple[str, ...]:
     """Return the warnings after some rounds of questions, with a write before each as the line does."""
-    for _ in range(rounds * len(rules.ROUND)):
+    for _ in range(rounds * len(protocol.POLL_SEQUENCE)):
         give(made, *currents)
         made.poll()
     return made.warnings
@@ -337,16 +337,16 @@ def test_a_broken_wire_is_named_until_the_currents_agree(peer, patient, port):
     there = RoboClawBoard()
     peer.answer(simulated(there, 0.005))
     made = board(port)
-    made.set_up()
+    made.configure()
     assert spoken_to(made, 4.0, -4.0) == ()
     there.broken.add(1)
     found = {spoken_to(made, 4.0, -4.0, rounds=1) for _ in range(5)}
-    assert found == {(), ("coil 1: 0.00 A measured, -4.00 A asked",)}
-    assert spoken_to(made, 5.0, -5.0) == ("coil 1: 0.00 A measured, -4.00 A asked",)  # as it was found
+    assert found == {(), ("coil 1: 0.00 A measured, -4.00 A commanded",)}
+    assert spoken_to(made, 5.0, -5.0) == ("coil 1: 0.00 A measured, -4.00 A commanded",)  # as it was found
     there.broken.clear()
     assert spoken_to(made, 4.0, -4.0) == ()
     there.broken.add(0)
-    assert spoken_to(made, 4.0, -4.0) == ("coil 0: 0.00 A measured, 4.00 A asked",)
+    assert spoken_to(made, 4.0, -4.0) == ("coil 0: 0.00 A measured, 4.00 A commanded",)
     assert spoken_to(made, 0.0, 0.0) == ()
 
 
@@ -355,7 +355,7 @@ def test_a_warm_coil_has_no_broken_wire(peer, patient, port, warmth: float):
     there = RoboClawBoard(resistance=warmth)
     peer.answer(simulated(there, 0.005))
     made = board(port)
-    made.set_up()
+    made.configure()
     assert spoken_to(made, 4.0, -4.0) == ()
     assert made.currents == pytest.approx((4.0 / warmth, -4.0 / warmth), abs=0.02)
 
@@ -363,7 +363,7 @@ def test_a_warm_coil_has_no_broken_wire(peer, patient, port, warmth: float):
 def test_a_supply_that_is_too_low_breaks_no_wire(peer, patient, port):
     peer.answer(simulated(RoboClawBoard(supply=6.0, resistance=2.0), 0.005))
     made = Board(port, 0, 128, "board 0", CoilBridgeSettings(coil_resistance=2.0), lambda: False)
-    made.set_up()
+    made.configure()
     assert spoken_to(made, 8.0, 0.0) == ("board 0: a supply of 6 V is too low for the currents",)
 
 
@@ -371,7 +371,7 @@ def test_a_slow_coil_that_is_turned_round_again_and_again_has_no_broken_wire(pee
     there = RoboClawBoard(inductance=0.05)
     peer.answer(simulated(there, 0.005))  # 10 ms for a write and a question
     made = board(port)
-    made.set_up()
+    made.configure()
     low = 0
     for at in range(300):
         give(made, *((4.0, -4.0) if at // 20 % 2 else (-4.0, 4.0)))

@@ -102,7 +102,7 @@ def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
 
 
 def test_what_stays_in_force_is_written_often_enough(bench):
-    driver = bench.open(patience=60.0, driver_timeout=0.5, **PATIENT)
+    driver = bench.open(apply_timeout=60.0, driver_timeout=0.5, **PATIENT)
     driver.apply(np.array(CURRENTS))
     bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
     since = bench.boards[0].timeline[0][0]
@@ -331,7 +331,7 @@ def tapped(board: RoboClawBoard, then: Callable[[bytes], bytes]) -> list[tuple[i
 def test_a_stop_wins_over_what_was_asked_before_it(bench, shared: bool):
     if shared:
         bench.share()
-    driver = bench.open(patience=60.0, **PATIENT)
+    driver = bench.open(apply_timeout=60.0, **PATIENT)
 
     def stop(answer: bytes) -> bytes:
         driver.apply(np.zeros(4))

@@ -13,11 +13,11 @@ import serial
 
 from magnetosuture_thread.coils.drivers.roboclaw import board as board_module
 from magnetosuture_thread.coils.drivers.roboclaw import line as line_module
-from magnetosuture_thread.coils.drivers.roboclaw.driver import CLOSING
+from magnetosuture_thread.coils.drivers.roboclaw.driver import CLOSE_TIMEOUT
 from magnetosuture_thread.coils.drivers.roboclaw.line import LineThread
-from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox, Report
+from magnetosuture_thread.coils.drivers.roboclaw.mailbox import LineReport, Mailbox
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
-from magnetosuture_thread.coils.drivers.roboclaw.rules import Vector
+from magnetosuture_thread.coils.drivers.roboclaw.protocol import Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
@@ -51,7 +51,7 @@ def left(*boards: Stub) -> LineThread:
     line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), Mailbox(4, ["connecting"], 0.1))
     port = Stub()
     vars(line)["_boards"] = dict(enumerate(boards))
-    assert not line._hurries()
+    assert not line._no_retry()
     vars(LineThread)["_leave"](line, port)
     assert port.closed
     return line
@@ -61,7 +61,7 @@ def test_a_board_that_did_not_hear_is_asked_for_zero_again():
     boards = Stub(), Stub(deaf=2), Stub()
     line = left(*boards)
     assert [board.requests for board in boards] == [1, 3, 1]
-    assert line._hurries()  # each request only once, as there are few milliseconds
+    assert line._no_retry()  # each request only once, as there are few milliseconds
 
 
 def test_a_board_that_never_hears_keeps_nobody():
@@ -123,7 +123,7 @@ def connected(clock: Clock, *boards: int, ends: bool = False) -> tuple[LineThrea
     line = LineThread(0, "/dev/none", {n: 128 + n for n in boards}, CoilBridgeSettings(), Mailbox(4, [""], 0.1))
     port = DeadPort(clock)
     if ends:
-        line.end()
+        line.stop()
     with pytest.raises(DeviceError, match=r"board 0 .*: no valid answer to ReadVersion"):
         vars(LineThread)["_connect"](line, port)
     return line, port
@@ -132,9 +132,9 @@ def connected(clock: Clock, *boards: int, ends: bool = False) -> tuple[LineThrea
 def test_a_line_that_is_ended_tries_nothing_twice(monkeypatch):
     clock = Clock(monkeypatch)
     assert connected(clock, 0, 1)[1].exchanges == 2
-    assert clock.slept == [board_module.QUIET]
+    assert clock.slept == [board_module.RETRY_DELAY]
     assert connected(clock, 0, 1, ends=True)[1].exchanges == 1
-    assert clock.slept == [board_module.QUIET]
+    assert clock.slept == [board_module.RETRY_DELAY]
 
 
 def test_a_board_has_as_long_for_an_answer_as_is_set(bench):
@@ -144,7 +144,7 @@ def test_a_board_has_as_long_for_an_answer_as_is_set(bench):
 
     def connect(port: ExchangePort) -> None:
         opened.append((port.timeout, port.answer_timeout))
-        line.end()
+        line.stop()
 
     vars(line)["_connect"] = connect
     line.start()
@@ -160,8 +160,9 @@ def test_boards_that_are_left_are_asked_for_zero_without_a_break(monkeypatch, bo
     began, before = clock.now, port.exchanges
     vars(LineThread)["_leave"](line, port)
     assert clock.slept == []  # nor is one tried twice before the other one's turn
-    assert port.exchanges - before == round(line_module.LEAVING / ANSWER_TIMEOUT)
-    assert clock.now - began < CLOSING - 2.0 * ANSWER_TIMEOUT  # which the exchange may take that goes on when it ends
+    assert port.exchanges - before == round(line_module.SHUTDOWN_TIMEOUT / ANSWER_TIMEOUT)
+    # An exchange that goes on when it ends may take twice the answer timeout.
+    assert clock.now - began < CLOSE_TIMEOUT - 2.0 * ANSWER_TIMEOUT
 
 
 class Hearing:
@@ -190,10 +191,10 @@ def test_every_attempt_at_every_board_takes_what_is_newest(stop: str, then: list
     line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), mailbox)
     now = time.monotonic()
     for number in (0, 1):
-        mailbox.ready(number, Report({}, {}, ()))
+        mailbox.set_ready(number, LineReport({}, {}, ()))
     mailbox.put(np.array([1.0, 2.0, 3.0, 4.0]), now)
-    stops = {"zeros": lambda: mailbox.put(np.zeros(4), now), "loss": lambda: mailbox.lost(1, "gone")}
-    first, second = Hearing(stops[stop]), Hearing(line.end)
+    stops = {"zeros": lambda: mailbox.put(np.zeros(4), now), "loss": lambda: mailbox.set_failed(1, "gone")}
+    first, second = Hearing(stops[stop]), Hearing(line.stop)
     vars(line)["_boards"] = {0: first, 1: second}
     vars(LineThread)["_serve"](line)
     assert first.asked == [[1.0, 2.0], then]
@@ -203,7 +204,7 @@ def test_every_attempt_at_every_board_takes_what_is_newest(stop: str, then: list
 def test_each_board_has_its_own_two_coils(monkeypatch):
     line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), Mailbox(4, [""], 60.0))
     vars(line)["_mailbox"].put(np.array([1.0, 2.0, 3.0, 4.0]), time.monotonic())
-    boards = Hearing(lambda: None), Hearing(line.end)
+    boards = Hearing(lambda: None), Hearing(line.stop)
     vars(line)["_boards"] = dict(enumerate(boards))
     vars(LineThread)["_serve"](line)
     assert [board.asked[0] for board in boards] == [[1.0, 2.0], [3.0, 4.0]]

@@ -16,7 +16,7 @@ def test_a_board_whose_power_was_gone_is_a_loss_however_soon_it_is_back(
 ):
     if shared:
         bench.share()
-    driver = bench.open(patience=60.0, roboclaw_answer_timeout=0.5)  # no loss that is only the busy machine's
+    driver = bench.open(apply_timeout=60.0, roboclaw_answer_timeout=0.5)  # no loss that is only the busy machine's
     driver.apply(np.array(currents))
     bench.wait(lambda: bench.duties(1) == (DUTIES[1] if any(currents) else (0, 0)), "the duties")
     with bench.stage.lines[-1].lock:
@@ -37,7 +37,8 @@ def test_a_broken_wire_is_a_warning_that_names_its_coil(bench):
     bench.boards[1].broken.add(0)
     with bench.held(driver, 3.0, -6.0, 4.0, 1.0):
         bench.wait(
-            lambda: driver.state().warnings == ("coil 2: 0.00 A measured, 4.00 A asked",), "the warning and no other"
+            lambda: driver.state().warnings == ("coil 2: 0.00 A measured, 4.00 A commanded",),
+            "the warning and no other",
         )
         assert driver.state().ready
         bench.boards[1].broken.clear()

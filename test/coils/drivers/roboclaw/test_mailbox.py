@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox, Report
+from magnetosuture_thread.coils.drivers.roboclaw.mailbox import LineReport, Mailbox
 
 CURRENTS = np.array([1.0, 2.0, 3.0, 4.0])
 
 
-def report(number: int, *warnings: str) -> Report:
+def report(number: int, *warnings: str) -> LineReport:
     """Return what a line with one board says."""
-    return Report({2 * number: 0.5, 2 * number + 1: -0.5}, {number: 24.0 + number}, warnings)
+    return LineReport({2 * number: 0.5, 2 * number + 1: -0.5}, {number: 24.0 + number}, warnings)
 
 
 def mailbox() -> Mailbox:
     """Return the mailbox of two lines that are ready."""
-    made = Mailbox(4, ["one", "other"], patience=0.1)
-    made.ready(1, report(1))
-    made.ready(0, report(0))
+    made = Mailbox(4, ["one", "other"], timeout=0.1)
+    made.set_ready(1, report(1))
+    made.set_ready(0, report(0))
     return made
 
 
@@ -26,21 +26,21 @@ def test_currents_are_in_force_for_the_patience():
     made = mailbox()
     made.put(CURRENTS, 1.0)
     for now in (1.0, 1.09):
-        taken = made.take(now)
+        taken = made.latest(now)
         assert taken is not None
         assert taken.tolist() == CURRENTS.tolist()
-    assert made.take(1.11) is None
-    assert made.take(1.05) is None  # they do not come back
-    assert made.state().warnings == ("no currents were asked for within 0.1 s: coils at zero",)
+    assert made.latest(1.11) is None
+    assert made.latest(1.05) is None  # they do not come back
+    assert made.state().warnings == ("no currents were commanded within 0.1 s: coils at zero",)
     made.put(CURRENTS, 2.0)
     assert made.state().warnings == ()
-    assert made.take(2.0) is not None
+    assert made.latest(2.0) is not None
 
 
 def test_zeros_that_are_not_asked_for_any_more_are_no_warning():
     made = mailbox()
     made.put(np.zeros(4), 1.0)
-    assert made.take(2.0) is None
+    assert made.latest(2.0) is None
     assert made.state().warnings == ()
 
 
@@ -49,55 +49,55 @@ def test_what_was_put_does_not_change_with_the_callers_array():
     mine = CURRENTS.copy()
     made.put(mine, 1.0)
     mine[:] = 9.0
-    taken = made.take(1.0)
+    taken = made.latest(1.0)
     assert taken is not None
     assert taken.tolist() == CURRENTS.tolist()
 
 
 def test_nothing_is_kept_until_every_line_is_ready():
-    made = Mailbox(4, ["one", "other"], patience=0.1)
+    made = Mailbox(4, ["one", "other"], timeout=0.1)
     assert made.state().problem == "one; other"
-    made.ready(0, report(0))
+    made.set_ready(0, report(0))
     made.put(CURRENTS, 1.0)
-    made.ready(1, report(1))
-    assert made.take(1.0) is None
+    made.set_ready(1, report(1))
+    assert made.latest(1.0) is None
 
 
 def test_a_loss_drops_the_currents_for_good_and_is_counted_once():
     made = mailbox()
     made.put(CURRENTS, 1.0)
-    made.lost(0, "gone")
-    assert made.take(1.0) is None
+    made.set_failed(0, "gone")
+    assert made.latest(1.0) is None
     assert made.state().losses == 1
-    made.lost(0, "still gone")
-    made.lost(1, "gone too")
+    made.set_failed(0, "still gone")
+    made.set_failed(1, "gone too")
     assert made.state().losses == 1
     assert made.state().problem == "still gone; gone too"
-    made.ready(0, report(0))
+    made.set_ready(0, report(0))
     assert not made.state().ready
-    made.ready(1, report(1))
+    made.set_ready(1, report(1))
     assert made.state().ready
-    assert made.take(1.0) is None
-    made.lost(1, "again")
+    assert made.latest(1.0) is None
+    made.set_failed(1, "again")
     assert made.state().losses == 2
 
 
 def test_everybody_is_woken_by_currents_and_by_a_loss():
     made = mailbox()
-    for event in (lambda: made.put(CURRENTS, 1.0), lambda: made.lost(0, "gone")):
-        for wake in made.wakes:
+    for event in (lambda: made.put(CURRENTS, 1.0), lambda: made.set_failed(0, "gone")):
+        for wake in made.wake_events:
             wake.clear()
         event()
-        assert all(wake.is_set() for wake in made.wakes)
+        assert all(wake.is_set() for wake in made.wake_events)
 
 
 def test_reports_are_put_together_in_the_order_of_the_coils():
     made = mailbox()
-    made.report(1, Report({2: 3.0, 3: 4.0}, {1: 12.0}, ("hot",)))
+    made.update_report(1, LineReport({2: 3.0, 3: 4.0}, {1: 12.0}, ("hot",)))
     state = made.state()
     assert state.currents is not None
     assert state.currents.tolist() == [0.5, -0.5, 3.0, 4.0]
     assert state.voltages == (24.0, 12.0)
     assert state.warnings == ("hot",)
-    made.lost(0, "gone")
+    made.set_failed(0, "gone")
     assert made.state().currents is None

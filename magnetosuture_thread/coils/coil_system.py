@@ -1,0 +1,116 @@
+"""Coil bridge, driver and arming latch as one unit, from configuration to cleanup."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
+from magnetosuture_thread.coils.drivers import CoilDriver, DriverState
+from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.coils.loop_timing import LoopTiming
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.scene import Scene
+
+UNCONFIGURED_DRIVER = DriverState(False, "unconfigured")
+
+
+class CoilSystem:
+    """Lifecycle of bridge and driver; while unconfigured there is only the latch.
+
+    Every switch takes effect with the next `step`, which the node makes at once.
+
+    Attributes:
+        latch: arming state; it outlives a configuration, as an emergency stop must.
+        bridge: None while unconfigured.
+        driver: the last that was opened.
+        output: of the last step; None while unconfigured.
+        timing: of the watchdog's loop.
+    """
+
+    def __init__(self) -> None:
+        self.latch = ArmingLatch()
+        # Loads the compiled functions, so that no step and no transition waits for a compiler.
+        CoilBridge(CoilBridgeSettings(), self.latch, Scene())
+        self.bridge: CoilBridge | None = None
+        self.driver: CoilDriver | None = None
+        self.output: BridgeOutput | None = None
+        self.timing = LoopTiming(1.0)
+        self._driver_name = "none"
+        self._auto_arm = False
+
+    @property
+    def driver_name(self) -> str:
+        """Name of the driver in use."""
+        return self._driver_name
+
+    @property
+    def driver_state(self) -> DriverState:
+        """State of the driver."""
+        return UNCONFIGURED_DRIVER if self.bridge is None or self.driver is None else self.driver.state()
+
+    def open(self, settings: CoilBridgeSettings, bridge: CoilBridge, driver: CoilDriver) -> None:
+        """Open a driver; from now on each step applies currents, zero at first."""
+        self.driver, self._driver_name = driver, settings.driver
+        driver.open()
+        self.bridge, self.timing = bridge, LoopTiming(1.0 / settings.rate)
+
+    def arm_when_ready(self) -> None:
+        """Arm automatically, once, as soon as the driver is ready; any switch or fault before cancels that."""
+        self._auto_arm = True
+
+    def close(self) -> None:
+        """Set the coils to zero and close the driver."""
+        self.bridge = self.output = None
+        self._auto_arm = False
+        self._driver_name = "none"
+        if self.driver is not None:
+            self.driver.close()
+
+    def arm(self, armed: bool) -> None:
+        """Arm, so that later commands are followed, or disarm.
+
+        Raises:
+            InvalidInputError: see `ArmingLatch.arm`; or the bridge is not configured.
+        """
+        self._auto_arm = False
+        if not armed:
+            self.latch.disarm()
+        elif self.bridge is None:
+            raise InvalidInputError("arm", "an unconfigured bridge", "an active one")
+        else:
+            self.bridge.arm(self.driver_state)
+
+    def reset(self) -> None:
+        """Clear the emergency stop and faults; the bridge stays disarmed.
+
+        Raises:
+            InvalidInputError: the driver is not ready.
+        """
+        self._auto_arm = False
+        if self.bridge is None:
+            self.latch.reset("")
+        else:
+            self.bridge.reset(self.driver_state)
+
+    def zero(self) -> None:
+        """Apply zero currents, unconditionally."""
+        if self.driver is not None and self.output is not None:
+            self.driver.apply(np.zeros_like(self.output.allocation.currents))
+
+    def step(self, now: float, arrival: float) -> BridgeOutput | None:
+        """Compute the coil currents and apply them; None while unconfigured.
+
+        Args:
+            now: time of the stamps' clock [s].
+            arrival: a monotonic time [s].
+        """
+        if self.bridge is None or self.driver is None:
+            return None
+        state = self.driver.state()
+        self._auto_arm = self._auto_arm and self.latch.ready_to_arm
+        if self._auto_arm and state.ready and self.bridge.scene is not None:
+            self.arm(True)
+        self.output = self.bridge.step(now, arrival, state)
+        self.driver.apply(self.output.allocation.currents)
+        return self.output

@@ -1,0 +1,266 @@
+"""Extrapolates the last plausible needle pose to the present by the velocities applied since."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.coils.input_checks import PublisherCounter, check_stamp
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.safety import NeedleKinematics
+
+Vector = NDArray[np.float64]
+BodyVelocity = tuple[float, float]
+"""Velocity of the tip along the chord and across it [m/s]."""
+
+ZERO_VELOCITY: BodyVelocity = (0.0, 0.0)
+TOPIC = "needle/measured_cp"
+CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
+SIGMA_COUNT = 3.0
+MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a pose's covariance
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Needle pose: tail, shape (2,) [m], and unit heading at the tail, shape (2,)."""
+
+    tail: Vector
+    heading: Vector
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Measured ends of the needle [m], their stamp [s] and uncertainty [m]."""
+
+    tail: Vector
+    tip: Vector
+    stamp: float
+    uncertainty: float
+
+
+class PoseExtrapolator:
+    """Keeps the last plausible needle pose until it is stale, and extrapolates it to the present.
+
+    A camera's pose is some hundredths of a second old. In that time the needle turns by some degrees and moves
+    closer to the wall, and the field must be aligned with its present pose. The pose is therefore extrapolated by
+    the tip velocities applied since its stamp, see `NeedleKinematics`.
+
+    After a stall longer than `min_hold` it is unknown when the coils stopped. Poses from before `max_hold`, when
+    they have certainly stopped, are then not used.
+
+    A pose with an end outside the dish, or farther from the last one than the needle can move, is rejected. After
+    that all poses are, until `CONSISTENT_POSES` consecutive ones are in the dish and consistent with each other.
+
+    Args:
+        needle: its kinematics.
+        timeout: a pose is valid for this long after its stamp and its arrival [s].
+        reach: both ends must be nearer to the dish's centre than this; the coils are beyond it [m].
+        max_speed: of both ends [m/s].
+        uncertainty: error of measured ends, in addition to a pose's own covariance [m].
+        min_hold: the coils hold their currents for at least this long without a step [s].
+        max_hold: and for at most this long [s].
+
+    Attributes:
+        dish_radius: infinite without a scene [m].
+    """
+
+    def __init__(
+        self,
+        needle: NeedleKinematics,
+        timeout: float,
+        reach: float,
+        *,
+        max_speed: float = math.inf,
+        uncertainty: float = 0.0,
+        min_hold: float = math.inf,
+        max_hold: float = math.inf,
+    ) -> None:
+        self.dish_radius = math.inf
+        self._needle, self._timeout, self._reach = needle, timeout, reach
+        self._max_speed, self._uncertainty = max_speed, uncertainty
+        self._min_hold, self._max_hold = min_hold, max_hold
+        self._publishers = PublisherCounter()
+        self._newest = -math.inf  # stamp of the last pose, accepted or not
+        self._arrival = -math.inf  # of the last accepted one
+        self._accepted: _Measured | None = None
+        self._rejection = ""
+        self._candidate: _Measured | None = None
+        self._consistent = 0  # consecutive consistent poses
+        self._unknown_until = -math.inf  # poses stamped before this time are not used
+        self._extrapolated: Pose | None = None
+        self._until = -math.inf  # time of the extrapolated pose
+        self._velocity = ZERO_VELOCITY
+        self._applied_at = -math.inf  # monotonic time at which it was applied
+        self._history: deque[tuple[float, BodyVelocity]] = deque()  # velocities, each with its start
+
+    def update(
+        self,
+        tail: Vector,
+        heading: Vector,
+        stamp: float,
+        number: int,
+        now: float,
+        arrival: float,
+        covariance: Vector | None = None,
+    ) -> None:
+        """Register a measured pose.
+
+        Args:
+            tail: shape (2,) [m].
+            heading: unit vector, shape (2,).
+            stamp: when it was measured [s].
+            number: of the message, counted by its publisher.
+            now: the same clock now [s].
+            arrival: a monotonic clock now [s].
+            covariance: of x, y and the heading's angle, shape (3, 3) [m, m, rad]; None where it is not known.
+
+        Raises:
+            InvalidInputError: the pose is not finite, too old, from the future, older than the last one, not
+                plausible, or there are several publishers.
+        """
+        publishers = self._publishers.update(number, arrival)
+        if not (np.all(np.isfinite(tail)) and np.all(np.isfinite(heading))):
+            raise InvalidInputError(f"{TOPIC}.pose", [*tail.tolist(), *heading.tolist()], "finite numbers")
+        check_stamp(TOPIC, stamp, now, self._newest, self._timeout)
+        if publishers > 1:
+            raise InvalidInputError(TOPIC, f"{publishers} publishers at once", "one")
+        if stamp < self._newest:  # time was set back
+            self._accepted = self._candidate = None
+            self._unknown_until = -math.inf
+        self._newest = stamp
+        measured = _Measured(tail, self._needle.tip(tail, heading), stamp, self._pose_uncertainty(covariance))
+        self._check_plausible(measured)
+        self._check_stall(arrival)
+        if stamp < self._unknown_until:
+            raise InvalidInputError(TOPIC, "a pose from a stall of the loop", "one after the coils have stopped")
+        self._accepted, self._arrival = measured, arrival
+        # A stamp slightly in the future, as clocks differ, counts as now.
+        self._extrapolated, self._until = Pose(tail, heading), min(stamp, now)
+        if self._history:  # before the first velocity kept the needle was at rest
+            self._until = max(self._until, min(self._history[0][0], now))
+        times = [since for since, _ in self._history][1:]
+        for (_, velocity), end in zip(self._history, times, strict=False):
+            self._extrapolate(velocity, end)
+
+    def stale_reason(self, now: float, arrival: float) -> str:
+        """Return why there is no valid pose at a time of the stamps' clock and a monotonic time [s]; empty if there is.
+
+        A pose becomes stale by its stamp or by its arrival, whichever comes first.
+        """
+        if self._publishers.count(arrival) > 1:
+            return f"several publishers of {TOPIC} at once"
+        if self._rejection:
+            return self._rejection
+        if self._accepted is None:
+            return "no needle pose yet"
+        if max(arrival - self._arrival, now - self._accepted.stamp) > self._timeout:
+            return f"no needle pose for {self._timeout:g} s"
+        return "no needle pose since the loop stalled" if self._extrapolated is None else ""
+
+    def apply_velocity(self, velocity: Vector, now: float, arrival: float) -> None:
+        """Register the tip velocity that the coils give from a time on.
+
+        The velocity is constant in the needle's frame until the next call: force and torque move with the needle.
+
+        Args:
+            velocity: shape (2,) [m/s].
+            now: time of the stamps' clock [s].
+            arrival: a monotonic time [s].
+        """
+        self._check_stall(arrival)
+        if self._history and now < self._history[-1][0]:
+            self._history.clear()  # time was set back
+        self._extrapolate(self._velocity, now)
+        self._velocity, self._applied_at = ZERO_VELOCITY, arrival
+        if velocity.any() and self._extrapolated is not None:
+            self._velocity = self._needle.body_velocity(self._extrapolated.heading, velocity)
+        self._history.append((now, self._velocity))
+        while len(self._history) > 1 and self._history[1][0] < now - self._timeout:
+            self._history.popleft()
+
+    def pose(self, now: float, arrival: float) -> Pose | None:
+        """Return the pose extrapolated to a time of the stamps' clock and a monotonic time [s]; None if it is stale."""
+        self._check_stall(arrival)
+        if self._extrapolated is None or self.stale_reason(now, arrival):
+            return None
+        self._extrapolate(self._velocity, now)
+        return self._extrapolated
+
+    def _check_plausible(self, measured: _Measured) -> None:
+        """Reject an implausible pose; see the class."""
+        problem = self._check_bounds(measured)
+        if not self._rejection:
+            problem = problem or self._check_jump(self._accepted, measured)
+            if not problem:
+                return
+            self._rejection = f"needle pose rejected: {problem[0]}, {problem[1]}"
+            self._candidate, self._consistent = None, 0
+        if problem and problem[2]:
+            self._candidate, self._consistent = None, 0
+        elif self._candidate is None or self._check_jump(self._candidate, measured):
+            self._candidate, self._consistent = measured, 1
+        else:
+            self._candidate, self._consistent = measured, self._consistent + 1
+        if self._consistent >= CONSISTENT_POSES:
+            self._rejection, self._candidate, self._consistent = "", None, 0
+            return
+        given, expected = (problem[0], problem[1]) if problem else ("a pose after a rejected one", "")
+        expected = expected or f"{CONSISTENT_POSES} consecutive consistent poses"
+        raise InvalidInputError(f"{TOPIC}.pose", given, expected)
+
+    def _check_bounds(self, measured: _Measured) -> tuple[str, str, bool] | None:
+        """Return what is wrong with an end outside the dish or beyond reach, and the expectation."""
+        limit = min(self._reach, self.dish_radius + self._uncertainty + measured.uncertainty)
+        for name, end in (("tail", measured.tail), ("tip", measured.tip)):
+            distance = math.hypot(*end)
+            if distance > limit:
+                return f"its {name} is {distance:g} m from the dish's centre", f"within {limit:g} m", True
+        return None
+
+    def _check_jump(self, last: _Measured | None, measured: _Measured) -> tuple[str, str, bool] | None:
+        """Return what is wrong with an end that moved farther than the needle can, and the expectation."""
+        if last is None:
+            return None
+        elapsed = measured.stamp - last.stamp
+        max_distance = self._max_speed * elapsed + self._uncertainty + measured.uncertainty + last.uncertainty
+        for name, end, before in (("tail", measured.tail, last.tail), ("tip", measured.tip, last.tip)):
+            distance = math.hypot(*(end - before))
+            if distance > max_distance:
+                return (
+                    f"its {name} jumped by {distance:.2g} m in {elapsed:.2g} s",
+                    f"at most {max_distance:.2g} m",
+                    False,
+                )
+        return None
+
+    def _pose_uncertainty(self, covariance: Vector | None) -> float:
+        """Return the uncertainty of both ends by a pose's covariance [m]."""
+        if covariance is None or not np.isfinite(covariance).all():
+            return 0.0
+        square = covariance[0, 0] + covariance[1, 1] + self._needle.chord**2 * covariance[2, 2]
+        return min(MAX_POSE_UNCERTAINTY, SIGMA_COUNT * math.sqrt(max(0.0, square)))
+
+    def _check_stall(self, arrival: float) -> None:
+        """Drop the pose after a stall longer than the coils certainly hold their currents."""
+        if self._velocity == ZERO_VELOCITY or arrival - self._applied_at <= self._min_hold + 1e-6:
+            return
+        self._unknown_until = self._history[-1][0] + self._max_hold if self._history else -math.inf
+        self._velocity = ZERO_VELOCITY
+        self._history.clear()
+        if self._accepted is not None and self._accepted.stamp < self._unknown_until:
+            self._extrapolated = None
+
+    def _extrapolate(self, velocity: BodyVelocity, now: float) -> None:
+        """Extrapolate the pose to a time, by velocities along the chord and across it [m/s]."""
+        ahead = now - self._until
+        if self._extrapolated is None or ahead <= 0.0:
+            return
+        self._until = now
+        if velocity != ZERO_VELOCITY:
+            self._extrapolated = Pose(
+                *self._needle.moved(self._extrapolated.tail, self._extrapolated.heading, *velocity, ahead)
+            )

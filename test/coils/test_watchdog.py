@@ -1,0 +1,123 @@
+"""Validation and timeout of velocity commands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.watchdog import CommandWatchdog
+from magnetosuture_thread.errors import InvalidInputError
+
+TIMEOUT = 0.1
+EAST = np.array([0.01, 0.0])
+
+
+def make_watchdog() -> CommandWatchdog:
+    """Return a watchdog with the timeout above."""
+    return CommandWatchdog(TIMEOUT)
+
+
+def test_no_command_is_valid_before_the_first():
+    assert make_watchdog().stale_reason(15.0, 5.0) == "no command yet"
+
+
+def test_command_is_valid_until_it_times_out():
+    watchdog = make_watchdog()
+    watchdog.update(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    assert watchdog.velocity.tolist() == EAST.tolist()
+    assert watchdog.stale_reason(10.0 + 0.0999, 0.0999) == ""
+    assert watchdog.stale_reason(10.0 + 0.1001, 0.1001) == "no command for 0.1 s"
+
+
+def test_next_valid_command_ends_the_timeout():
+    watchdog = make_watchdog()
+    watchdog.update(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    assert watchdog.stale_reason(10.0 + 3.0, 3.0)
+    watchdog.update(EAST, stamp=13.0, number=2, now=13.0, arrival=3.0)
+    assert watchdog.stale_reason(10.0 + 3.0, 3.0) == ""
+
+
+def test_transport_delay_counts_towards_the_timeout():
+    watchdog = make_watchdog()
+    watchdog.update(EAST, stamp=9.94, number=1, now=10.0, arrival=0.0)
+    assert watchdog.stale_reason(10.03, 0.03) == ""
+    assert watchdog.stale_reason(10.05, 0.05) == "no command for 0.1 s"
+
+
+def test_command_times_out_while_the_stamps_clock_stands_still():
+    watchdog = make_watchdog()
+    watchdog.update(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    assert watchdog.stale_reason(10.0, 0.09) == ""
+    assert watchdog.stale_reason(10.0, 0.11) == "no command for 0.1 s"
+
+
+def test_only_commands_after_clear_are_valid():
+    watchdog = make_watchdog()
+    watchdog.update(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
+    watchdog.clear()
+    assert watchdog.stale_reason(10.0 + 0.01, 0.01) == "no command yet"
+    watchdog.update(EAST, stamp=10.01, number=2, now=10.01, arrival=0.01)
+    assert watchdog.stale_reason(10.0 + 0.01, 0.01) == ""
+
+
+def test_command_is_stored_without_limits():
+    watchdog = make_watchdog()
+    watchdog.update(np.array([-1e308, 1e308]), stamp=1.0, number=2, now=1.0, arrival=0.0)
+    assert watchdog.velocity.tolist() == [-1e308, 1e308]
+
+
+@pytest.mark.parametrize(
+    ("velocity", "stamp", "words"),
+    [
+        ((np.nan, 0.0), 10.0, "finite numbers"),
+        ((0.0, np.inf), 10.0, "finite numbers"),
+        ((0.01, 0.0), 9.8, "at most 0.1 s"),
+        ((0.01, 0.0), 0.0, "0 is none in ROS"),
+        ((0.01, 0.0), 10.2, "at most 0.05 s"),
+        ((0.01, 0.0), 9.96, "no earlier than the last one's"),
+    ],
+)
+def test_invalid_command_is_rejected_and_does_not_extend_the_timeout(
+    velocity: tuple[float, float], stamp: float, words: str
+):
+    watchdog = make_watchdog()
+    watchdog.update(EAST, stamp=9.98, number=1, now=9.98, arrival=0.0)
+    with pytest.raises(InvalidInputError, match=words):
+        watchdog.update(np.array(velocity), stamp=stamp, number=2, now=10.0, arrival=0.02)
+    assert watchdog.velocity.tolist() == EAST.tolist()
+    assert watchdog.stale_reason(9.98 + 0.05, 0.05) == ""
+    assert watchdog.stale_reason(9.98 + 0.11, 0.11) == "no command for 0.1 s"
+
+
+def test_time_set_back_does_not_make_every_command_stale():
+    """A bag that is played again starts with earlier stamps; so does a simulation."""
+    watchdog = make_watchdog()
+    watchdog.update(EAST, stamp=100.0, number=1, now=100.0, arrival=0.0)
+    watchdog.update(EAST, stamp=5.0, number=1, now=5.0, arrival=1.0)
+    assert watchdog.stale_reason(5.0, 1.0) == ""
+
+
+def test_no_command_is_valid_before_the_clock_runs():
+    with pytest.raises(InvalidInputError, match="0 is none in ROS"):
+        make_watchdog().update(EAST, stamp=0.0, number=1, now=0.0, arrival=0.0)
+
+
+def test_two_publishers_are_a_conflict_until_one_is_silent():
+    watchdog = make_watchdog()
+    for k in range(10):
+        at = 0.02 * (k + 1)
+        watchdog.update(EAST, stamp=at, number=500 + k, now=at, arrival=at)
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        watchdog.update(-EAST, stamp=0.205, number=1, now=0.205, arrival=0.205)
+    assert watchdog.velocity.tolist() == EAST.tolist()
+    assert watchdog.stale_reason(0.206, 0.206) == "several publishers of needle/servo_cv at once"
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        watchdog.update(EAST, stamp=0.22, number=510, now=0.22, arrival=0.22)
+    for k in range(11, 40):
+        at = 0.02 * (k + 1)
+        if at < 0.7:
+            with pytest.raises(InvalidInputError, match="publishers"):
+                watchdog.update(EAST, stamp=at, number=500 + k, now=at, arrival=at)
+        elif at > 0.72:
+            watchdog.update(EAST, stamp=at, number=500 + k, now=at, arrival=at)
+            assert watchdog.stale_reason(at, at) == ""
