@@ -19,7 +19,8 @@ MESSAGES := $(wildcard msg_defs/*.* msg_defs/*/*)
 # What is imported is compiled then: the half of all modules. (pip takes this "no" for a yes.)
 INSTALL = PIP_CONSTRAINT=constraints.txt PIP_NO_COMPILE=no $(RUN)/python -m pip install -qq --disable-pip-version-check
 
-.PHONY: demo test lint colcon peers clean help packages messages
+.PHONY: demo test lint colcon peers clean help
+.PHONY: .packages .messages
 
 demo: $(READY)
 	@rm -rf $(DEMO)
@@ -56,12 +57,12 @@ $(READY): pyproject.toml constraints.txt $(MESSAGES)
 	@command -v c++ >/dev/null || { echo "no C++ compiler found; on Debian or Ubuntu: apt install build-essential python3-dev" >&2; exit 1; }
 	@rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
-	@$(MAKE) --no-print-directory --jobs=2 packages messages
+	@$(MAKE) --no-print-directory --jobs=2 .packages .messages
 	@touch $@
 
-packages:
+.packages:
 	$(RUN)/python .ci/requirements.py $(EXTRAS) >$(VENV)/requirements.txt
 	$(INSTALL) --requirement $(VENV)/requirements.txt
 
-messages:
+.messages:
 	$(INSTALL) --no-deps --editable .

@@ -54,7 +54,7 @@ class TimeSeries:
         """
         for name in values.keys() - self._columns.keys():
             if not name.startswith(MARGIN):
-                raise KeyError(f"no such column: {name}")
+                raise KeyError(f"no such columns: {name}")
             self._columns[name] = array("d", [float("nan")] * len(self._times))
         self._times.append(time)
         for name, column in self._columns.items():

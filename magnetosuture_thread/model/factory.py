@@ -11,10 +11,18 @@ from magnetosuture_thread.model.formulations import Formulation, PaperFormulatio
 from magnetosuture_thread.model.program import Solver
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver, QpsolversSolver
 from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.scene import Scene
 
 FORMULATIONS = (RodFormulation.name, PaperFormulation.name)
 SOLVERS = (BandedSolver.name, OsqpSolver.name)
 """Those that need no other package; besides, any that qpsolvers knows."""
+
+
+def surroundings_of(scene: Scene | None, reach: float) -> Surroundings:
+    """Return a scene's obstacles and wall for the barriers, which see as far as a reach [m]; none of no scene."""
+    if scene is None:
+        return Surroundings((), reach)
+    return Surroundings(scene.obstacles, reach, wall_radius=scene.dish.radius)
 
 
 def make_solver(name: str, tolerance: float) -> Solver:

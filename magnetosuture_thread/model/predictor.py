@@ -16,7 +16,7 @@ from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Surroundings
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.factory import make_formulation, make_solver
+from magnetosuture_thread.model.factory import make_formulation, make_solver, surroundings_of
 from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
@@ -367,13 +367,6 @@ class ThreadPredictor:
             converged=converged,
             judge=judge,
         )
-
-
-def surroundings_of(scene: Scene | None, reach: float) -> Surroundings:
-    """Return a scene's obstacles and wall for the barriers, which see as far as a reach [m]; none of no scene."""
-    if scene is None:
-        return Surroundings((), reach)
-    return Surroundings(scene.obstacles, reach, wall_radius=scene.dish.radius)
 
 
 def _check_node(field: str, node: int, thread: Thread) -> None:

@@ -31,7 +31,7 @@ def prediction(nanoseconds: int, points: np.ndarray) -> Message:
     """Return a predicted thread."""
     return Message(
         header=header(nanoseconds),
-        vertices=[Message(x=x, y=y) for x, y in points],
+        positions=[Message(x=x, y=y) for x, y in points],
         strain=[0.0, -0.002, 0.001, 0.0],
         residual=1e-8,
         step_time=0.004,
@@ -40,16 +40,20 @@ def prediction(nanoseconds: int, points: np.ndarray) -> Message:
 
 def margins(nanoseconds: int, clearance: float, valid: bool = True) -> Message:
     """Return margins of one obstacle row for node 3 and one connectivity row for node 1."""
-    segment = Message(kind=0, node=1, obstacle=-1, clearance=1e-9)
-    post = Message(kind=2, node=3, obstacle=0, clearance=clearance)
     return Message(
         header=header(nanoseconds),
         valid=valid,
-        kind=[0, 2],
+        scene_version="",
+        barrier_names=["connectivity", "obstacle"],
+        barrier=[0, 1],
         node=[1, 3],
+        obstacle=[-1, 0],
+        value=[1e-9, clearance],
         clearance=[1e-9, clearance],
-        least=[segment, post],
         contact_nodes=[3] if clearance <= 0.0 else [],
+        friction_state=1,
+        friction_nodes=[],
+        slowdown=1.0,
     )
 
 
