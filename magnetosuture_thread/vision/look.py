@@ -20,6 +20,7 @@ from magnetosuture_thread.vision.thread.centreline import find_centreline
 
 LONGEST = 1.05  # of the thread's length, after which the walk ends
 WALL_PX = 4.0  # before which the walk ends
+SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
 
 
@@ -130,16 +131,19 @@ def tracked(
     reach = 0.5 * diameter / view.metres_per_pixel - WALL_PX
     longest = LONGEST * settings.thread_length / view.metres_per_pixel
     walk = find_centreline(picture, needle, longest, local.centre_px, reach)
-    heading = view.directions_to_dish(needle.direction_px)
+    heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
+    covariance = _in_dish(needle, view)
+    if not settings.metres_per_pixel:  # A wrong scale shifts what is far from the dish's centre.
+        covariance[:2, :2] += SCALE_ERROR**2 * np.outer(tail, tail)
     return Track(
         state=State.TRACKED,
         reason="",
         confidence=needle.confidence,
-        tail=local.to_dish(needle.tail_px),
+        tail=tail,
         tip=local.to_dish(needle.tip_px),
         heading=heading,
         curvature=-needle.curvature_px / view.metres_per_pixel,
-        covariance=_in_dish(needle, view),
+        covariance=covariance,
         centreline=local.to_dish(walk),
         view=view,
     )

@@ -13,7 +13,8 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.coverage import Light, box_around, covered
 from magnetosuture_thread.rig.camera.scene import SILICONE, Lighting, Look, Scene
 
-RIM_DEPTHS = ((0.22e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))  # beyond the radius, width [m]; depth
+# Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
+RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
 DROP_SHADOW_PX = np.array([3.0, 4.0])
 LAMP_PX = (-0.5, -0.86)  # direction towards the lamp, in the image
 GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]

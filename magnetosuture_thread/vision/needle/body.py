@@ -162,10 +162,10 @@ def _ends(strip: Strip, last: float, body: float, width: float) -> tuple[float, 
 def _body_axis(strip: Strip, tail: float, tip: float, body: float) -> tuple[Arc, float, np.ndarray] | None:
     """Fit the axis to the body alone.
 
-    Left out are the taper, as a point may be ground to one side, and where the thread widens the body.
+    Left out are the taper, as a point may be ground to one side, and the edge on whose side a thread widens the body.
     """
     high = tail + (1.0 - TAPER) * (tip - tail) - 1.0
-    return fit_axis(strip, tail + TAIL_ROWS, high, (FULL * body, body + THREAD_PX), tail)
+    return fit_axis(strip, tail + TAIL_ROWS, high, (FULL * body, body + THREAD_PX), tail, 0.5 * body)
 
 
 def _along_body(
