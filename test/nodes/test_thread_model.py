@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
+from magnetosuture_msgs.msg import SafetyMargins
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
 from rclpy.serialization import serialize_message
@@ -67,9 +67,9 @@ def test_the_thread_starts_where_it_is_seen_and_follows(graph):
     assert margins[-1].valid
     assert margins[-1].contact_state == SafetyMargins.CONTACT_FREE
     assert len(margins[-1].value) == 50
-    assert [least.kind for least in margins[-1].least] == [
-        BarrierMargin.KIND_CONNECTIVITY,
-        BarrierMargin.KIND_COMPRESSION,
+    assert [least.barrier for least in margins[-1].minimum] == [
+        "connectivity",
+        "compression",
     ]
     assert markers[-1].markers[0].type == Marker.LINE_STRIP
     assert len(markers[-1].markers[0].points) == 26
@@ -157,7 +157,7 @@ def test_shapes_give_margins_and_contact(graph):
     graph.wait(lambda: bool(margins), "margins")
     assert margins[0].contact_state == SafetyMargins.CONTACT_TOUCHING
     assert list(margins[0].contact_nodes) == [12]
-    least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_OBSTACLE)
+    least = next(entry for entry in margins[0].minimum if entry.barrier == "obstacle")
     assert least.obstacle == 0
     assert least.node == 12
     assert least.clearance == pytest.approx(1e-6, abs=1e-9)
@@ -171,7 +171,7 @@ def test_a_polygon_gives_margins(graph):
     margins = graph.listen(topics.MARGINS)
     graph.publish(topics.NEEDLE_POSE, pose(1.0))
     graph.wait(lambda: bool(margins), "margins")
-    least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_OBSTACLE)
+    least = next(entry for entry in margins[0].minimum if entry.barrier == "obstacle")
     assert least.clearance == pytest.approx(1e-3 - 30e-6, abs=1e-9)
 
 
@@ -181,7 +181,7 @@ def test_the_wall_of_the_dish_has_a_row_in_the_margins(graph):
     margins = graph.listen(topics.MARGINS)
     graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.003))
     graph.wait(lambda: bool(margins), "margins")
-    least = next(entry for entry in margins[0].least if entry.kind == BarrierMargin.KIND_WALL)
+    least = next(entry for entry in margins[0].minimum if entry.barrier == "wall")
     assert (least.node, least.obstacle) == (25, -1)
     assert least.clearance == pytest.approx(0.0175 - 0.016 - 30e-6, abs=1e-6)
 
@@ -194,10 +194,10 @@ def test_the_papers_formulation_runs_in_the_graph(graph):
     graph.wait(lambda: len(predicted) == 3 and len(margins) == 3, "predictions")
     assert predicted[-1].formulation == "paper"
     assert margins[-1].valid
-    assert {least.kind for least in margins[-1].least} == {
-        BarrierMargin.KIND_CONNECTIVITY,
-        BarrierMargin.KIND_ENHANCED_CONNECTIVITY,
-        BarrierMargin.KIND_STIFFNESS,
+    assert {least.barrier for least in margins[-1].minimum} == {
+        "connectivity",
+        "enhanced_connectivity",
+        "stiffness",
     }
 
 
@@ -318,7 +318,7 @@ def test_an_unproven_solution_gives_no_margin(graph):
     invalid = next(m for m in margins if not m.valid)
     assert "residual" in invalid.reason
     assert invalid.contact_state == SafetyMargins.CONTACT_UNKNOWN
-    assert not invalid.least
+    assert not invalid.minimum
     assert len(predicted) == 1
 
 

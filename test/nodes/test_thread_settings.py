@@ -173,7 +173,8 @@ def test_a_scene_counts_from_the_next_pose_on(graph):
     bench.show(2)
     bench.place(scene_with())
     bench.show(2)
-    assert not any(kind == 2 for kind in bench.margins[-1].kind)
+    names = bench.margins[-1].barrier_names
+    assert not any(names[row] == "obstacle" for row in bench.margins[-1].barrier)
     assert bench.refusals() == 0
 
 
