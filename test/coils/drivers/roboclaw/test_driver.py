@@ -381,8 +381,8 @@ def test_closing_waits_for_no_line_longer_than_it_promises(bench, monkeypatch):
     now, calls = 100.0, []
 
     class Endless:
-        def end(self) -> None:
-            calls.append("end")
+        def stop(self) -> None:
+            calls.append("stop")
 
         def join(self, timeout: float) -> None:
             nonlocal now
@@ -394,7 +394,7 @@ def test_closing_waits_for_no_line_longer_than_it_promises(bench, monkeypatch):
     monkeypatch.setattr(driver_module, "time", SimpleNamespace(monotonic=lambda: now))
     driver.close()
     assert now - 100.0 == pytest.approx(0.3)
-    assert calls == ["end", "end", "join", "join"]
+    assert calls == ["stop", "stop", "join", "join"]
 
 
 def test_closing_ends_the_thread_where_nobody_answers(bench):
