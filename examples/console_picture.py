@@ -73,10 +73,10 @@ class Pilot:
             self.page.wait_for_timeout(LOOK)
 
     def begin(self) -> None:
-        """Take steering and arm, when the needle is seen and the thread predicted."""
+        """Take control and arm, when the needle is seen and the thread predicted."""
         self.until(lambda: self.shown("image") == "yes" and self.shown("tip"), "a camera image and the needle")
         self.until(lambda: self.shown("friction") in ("free", "sliding", "stuck"), "a prediction")
-        self.page.click("#take")
+        self.page.click("#control")
         self.page.click("#arm")
         self.until(lambda: self.page.inner_text("#coils") == "armed", "the coils to be armed")
 
@@ -156,7 +156,7 @@ def main() -> None:
         pilot.at_speed(SPEED)
         pilot.follow(PATH)
         pilot.follow(AROUND)
-        pilot.until(lambda: "Slowed to" in page.inner_text("#why"), "the needle to be slowed by friction")
+        pilot.until(lambda: "Slowed to" in page.inner_text("#status"), "the needle to be slowed by friction")
         page.screenshot(path=PICTURE)
         pilot.press()
         browser.close()

@@ -111,7 +111,7 @@ def measure_page(
         url = server.says(r"open (http\S+)")
         server.says(r"(runs; the coils)")
         with _page(browser, url) as page, _heard(domain) as heard:
-            _click(page, "#take")
+            _click(page, "#control")
             _click(page, "#arm")
             page.evaluate(LISTEN)
             began, before = time.monotonic(), _stats(page)

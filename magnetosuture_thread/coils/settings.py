@@ -46,41 +46,26 @@ class CoilBridgeSettings(Configuration):
         200.0, "of the loop that checks limits and timeouts and sends currents", unit="Hz", minimum=10.0, maximum=1000.0
     )
     realtime_priority: int = quantity(
-        10,
-        "real-time priority of the process, where the system permits it; 0 requests none",
-        minimum=0,
-        maximum=99,
+        10, "real-time priority of the process, where permitted; 0 for none", minimum=0, maximum=99
     )
     command_timeout: float = quantity(
         0.1, "the coils go to zero after this long without a new velocity command", unit="s", minimum=0.01, maximum=1.0
     )
     pose_timeout: float = quantity(
-        0.2,
-        "the coils go to zero after this long without a new needle pose, on which the currents depend",
-        unit="s",
-        minimum=0.01,
-        maximum=1.0,
+        0.2, "the coils go to zero after this long without a new needle pose", unit="s", minimum=0.01, maximum=1.0
     )
     zero_hold: float = quantity(
         1.0, "after a stop, zero currents are published for this long", unit="s", minimum=0.1, maximum=60.0
     )
     max_speed: float = quantity(0.02, "maximum speed of the needle's tip", unit="m/s", minimum=1e-5, maximum=0.5)
     max_acceleration: float = quantity(
-        0.5,
-        "maximum acceleration of the needle's tip; a stop is not limited",
-        unit="m/s^2",
-        minimum=1e-3,
-        maximum=100.0,
+        0.5, "maximum acceleration of the tip; a stop is not limited", unit="m/s^2", minimum=1e-3, maximum=100.0
     )
     max_current: float = quantity(
         10.0, "maximum current in a coil, in either direction", unit="A", minimum=0.01, maximum=100.0
     )
     max_current_slew: float = quantity(
-        1000.0,
-        "maximum slew rate of a coil's current; a stop is not limited",
-        unit="A/s",
-        minimum=1.0,
-        maximum=1e6,
+        1000.0, "maximum slew rate of a current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
     )
 
     scene: str = shared("scene")
@@ -119,18 +104,13 @@ class CoilBridgeSettings(Configuration):
     )
 
     calibration: str = quantity(
-        "",
-        "file of the coils' calibration, from the working directory; it replaces the coil parameters",
+        "", "file of the coils' calibration, from the working directory; it replaces the coil parameters"
     )
     coil_model: str = quantity(
         "loops", "field model of a coil: a current loop, or a dipole at its centre", choices=("loops", "dipoles")
     )
     field_per_current: float = quantity(
-        1.2e-3,
-        "field of one coil at the dish's centre, for each ampere in it",
-        unit="T/A",
-        minimum=1e-6,
-        maximum=1.0,
+        1.2e-3, "field of one coil at the dish's centre, for each ampere in it", unit="T/A", minimum=1e-6, maximum=1.0
     )
     coil_distance: float = quantity(
         0.05, "from the dish's centre to the middle of a coil", unit="m", minimum=0.01, maximum=1.0
@@ -146,14 +126,10 @@ class CoilBridgeSettings(Configuration):
         8.8e-4, "magnetic moment of the straight needle", unit="A m^2", minimum=1e-6, maximum=1.0
     )
     needle_drag: float = quantity(
-        0.0255,
-        "drag force along the needle at 1 m/s, with that of the thread",
-        unit="N s/m",
-        minimum=1e-5,
-        maximum=10.0,
+        0.0255, "drag along the needle at 1 m/s, the thread's included", unit="N s/m", minimum=1e-5, maximum=10.0
     )
     needle_drag_across: float = quantity(
-        0.033, "drag force across the needle at 1 m/s", unit="N s/m", minimum=1e-5, maximum=10.0
+        0.033, "drag across the needle at 1 m/s", unit="N s/m", minimum=1e-5, maximum=10.0
     )
     needle_turning_drag: float = quantity(
         1.6e-7, "drag torque of the needle at 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2

@@ -1,7 +1,7 @@
-"""Who may watch and who may command: addresses, tokens, and where a request comes from.
+"""Access control of the page: addresses, tokens, and the Host and Origin of requests.
 
-A page of another site that runs in the operator's browser can open a WebSocket to this server (it then names
-its own origin), or have its own name resolve to this machine (it then names itself as the host). Both are refused.
+A page of another site in the operator's browser can open a WebSocket to this server (its Origin is then its own),
+or have its own name resolve to this machine (its Host is then its own). Both are rejected.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ def new_token() -> str:
 
 
 def same_token(given: object, token: str) -> bool:
-    """Return whether a token was given, in a time that does not tell how much of it is right."""
+    """Return whether a token is correct, by a comparison in constant time."""
     return (
         isinstance(given, str) and bool(token) and hmac.compare_digest(given.encode(errors="replace"), token.encode())
     )
 
 
 def page_url(address: str, port: int, token: str) -> str:
-    """Return what a person opens; the token stands in the fragment, which a browser sends to nobody."""
+    """Return the URL of the page; the token is in the fragment, which browsers do not send."""
     return f"http://{_bracketed(address)}:{port}/#token={quote(token, safe='')}"
 
 
@@ -46,10 +46,10 @@ def _bracketed(address: str) -> str:
 
 
 def host_refusal(host: str, address: str, port: int) -> str:
-    """Say why a request for this host is refused; empty if it is not.
+    """Return why a request for this host is rejected; empty if it is accepted.
 
-    A name that anybody can let point here is refused: on this machine alone only its own names are good, and
-    elsewhere only the address that is bound, or any address in figures where all are.
+    Names that others can point to this machine are rejected: a loopback server accepts only loopback names, others
+    only the bound address, or any numeric address if all are bound.
 
     Args:
         host: the request's Host header.
@@ -62,20 +62,20 @@ def host_refusal(host: str, address: str, port: int) -> str:
     name, given = parts
     if given != port:
         return f"Host: got port {given}, expected {port}"
-    good = (
+    accepted = (
         name == address.lower()
         or (is_loopback(name) and is_loopback(address))
-        or (is_any(address) and _in_figures(name))
+        or (is_any(address) and _is_numeric(name))
     )
-    return "" if good else f"Host: got {name[:80]!r}, expected {address}"
+    return "" if accepted else f"Host: got {name[:80]!r}, expected {address}"
 
 
 def origin_refusal(origin: str, host: str) -> str:
-    """Say why a WebSocket that a page asks for is refused; empty if it is not.
+    """Return why a WebSocket of this origin is rejected; empty if it is accepted.
 
     Args:
-        origin: the request's Origin header; empty where there is none, as from a program that is no browser.
-        host: the request's Host header, which has been found good.
+        origin: the request's Origin header; empty for programs other than browsers.
+        host: the request's Host header, already accepted.
     """
     if not origin or origin.lower() == f"http://{host.lower()}":
         return ""
@@ -95,10 +95,10 @@ def _host_and_port(host: str) -> tuple[str, int] | None:
 
 def is_any(address: str) -> bool:
     """Return whether an address stands for all of this machine."""
-    return address != "localhost" and _in_figures(address) and ipaddress.ip_address(address).is_unspecified
+    return address != "localhost" and _is_numeric(address) and ipaddress.ip_address(address).is_unspecified
 
 
-def _in_figures(name: str) -> bool:
+def _is_numeric(name: str) -> bool:
     if name == "localhost":
         return True
     try:

@@ -1,4 +1,4 @@
-"""One page that is connected: hears what it says, tells it the newest."""
+"""Connection of one page: dispatches its messages, and sends replies, states and camera frames."""
 
 from __future__ import annotations
 
@@ -9,33 +9,44 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from magnetosuture_thread.console.access import same_token
-from magnetosuture_thread.console.duties import Duties
-from magnetosuture_thread.console.lateness import Lateness
+from magnetosuture_thread.console.client_messages import (
+    Acknowledge,
+    AcquireControl,
+    BridgeAction,
+    ClientMessage,
+    EndJog,
+    Hello,
+    Jog,
+    ReleaseControl,
+    Visibility,
+    parse_client_message,
+)
+from magnetosuture_thread.console.dead_man import DelayEstimator
+from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.console.outbox import Message, Outbox
+from magnetosuture_thread.console.requests import RequestHandler
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.console.steering import Steering
-from magnetosuture_thread.console.words import Act, Got, HandBack, Hello, Hold, Release, Take, Visible, Word, read_word
 from magnetosuture_thread.errors import InvalidInputError
 
-HELLO_WITHIN = 5.0  # of the connection [s]
-SEND_WITHIN = 2.0  # before a page that takes nothing is cut off [s]
-LATE_FOR = 1.0  # before a page whose words all come late has to connect again [s]
-MOST_WORDS = 400  # a second; of what is beyond, only an emergency stop is obeyed
-FLOOD = 2000  # of those beyond, in all, after which the connection is closed
-STOP = Act("stop")
+HELLO_TIMEOUT = 5.0  # after the connection [s]
+SEND_TIMEOUT = 2.0  # after which a page that does not receive is disconnected [s]
+MAX_LATE_TIME = 1.0  # after which a page whose messages are all late must reconnect [s]
+MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
+MAX_EXCESS_MESSAGES = 2000  # beyond that rate, in total, after which the connection is closed
+EMERGENCY_STOP = BridgeAction("stop")
 
 
 class Client:
-    """A connected page.
+    """Server side of a connected page.
 
     Args:
         number: of the connection, from 1.
         socket: the prepared WebSocket.
-        request: that it came by.
+        request: of the connection.
         settings: of the console.
-        token: that lets command.
-        steering: who steers, and what is held.
-        duties: what else can be asked for.
+        token: that permits commands.
+        jog: control lease and jog commands.
+        requests: handler of all other requests.
     """
 
     def __init__(
@@ -45,133 +56,134 @@ class Client:
         request: web.Request,
         settings: ConsoleSettings,
         token: str,
-        steering: Steering,
-        duties: Duties,
+        jog: JogController,
+        requests: RequestHandler,
     ) -> None:
         self.number = number
         self._socket = socket
         self._request = request
         self._settings = settings
         self._token = token
-        self._steering = steering
-        self._duties = duties
+        self._jog = jog
+        self._requests = requests
         self._outbox = Outbox()
         self._wake = asyncio.Event()
-        self._commands = False
-        self._lateness = Lateness()
-        self._in_time = 0.0  # when the last word came that was not late
-        self._second, self._words, self._excess = 0, 0, 0
+        self._can_command = False
+        self._delay = DelayEstimator()
+        self._last_in_time = 0.0  # arrival of the last message that was not late
+        self._second, self._message_count, self._excess = 0, 0, 0
 
-    def tell(self, what: str, message: Message) -> None:
-        """Let the page have the newest `state` or `frame` when it can take it."""
-        self._outbox.put(what, message)
+    def send_latest(self, kind: str, message: Message) -> None:
+        """Send the latest `state` or `frame` when the page can receive it."""
+        self._outbox.put(kind, message)
         self._wake.set()
 
     async def serve(self) -> None:
-        """Hear the page until it is gone; whatever ends the connection, the needle is told to rest."""
+        """Handle messages until the page disconnects; the needle is stopped in any case."""
         sending = None
         try:
-            if not await self._greet():
+            if not await self._handshake():
                 return
             sending = asyncio.create_task(self._send_all())
             async for message in self._socket:
-                await self._hear(message.type, message.data)
+                await self._on_message(message.type, message.data)
         finally:
-            self._steering.hand_back(self.number)
+            self._jog.release_control(self.number)
             if sending is not None:
                 sending.cancel()
                 await asyncio.gather(sending, return_exceptions=True)
 
-    async def leave(self) -> None:
-        """End the connection as the server goes."""
-        await self._socket.close(code=1001, message=b"the server ends")
+    async def close(self) -> None:
+        """Close the connection when the server stops."""
+        await self._socket.close(code=1001, message=b"the server stops")
 
-    async def _greet(self) -> bool:
+    async def _handshake(self) -> bool:
         try:
-            message = await self._socket.receive(timeout=HELLO_WITHIN)
-            word = self._read(message.type, message.data)
+            message = await self._socket.receive(timeout=HELLO_TIMEOUT)
+            parsed = self._read(message.type, message.data)
         except (asyncio.TimeoutError, InvalidInputError):
-            word = None
-        if not isinstance(word, Hello):
+            parsed = None
+        if not isinstance(parsed, Hello):
             await self._socket.close(code=1008, message=b"expected hello first")
             return False
-        self._commands = same_token(word.token, self._token)
+        self._can_command = same_token(parsed.token, self._token)
         settings = self._settings
-        self._answer(
+        self._reply(
             "welcome",
-            you=self.number,
-            commands=self._commands,
-            refusal="the token is wrong" if word.token and not self._commands else "",
+            client=self.number,
+            can_command=self._can_command,
+            refusal="the token is wrong" if parsed.token and not self._can_command else "",
             speed=settings.speed,
             max_speed=settings.max_speed,
         )
         return True
 
-    def _read(self, kind: WSMsgType, data: Any) -> Word:
+    def _read(self, kind: WSMsgType, data: Any) -> ClientMessage:
         if kind is not WSMsgType.TEXT:
             raise InvalidInputError("message", kind.name.lower(), "text")
-        return read_word(data, self._settings.max_speed)
+        return parse_client_message(data, self._settings.max_speed)
 
-    async def _hear(self, kind: WSMsgType, data: Any) -> None:
+    async def _on_message(self, kind: WSMsgType, data: Any) -> None:
         now = asyncio.get_running_loop().time()
-        self._steering.hear(self.number)
+        self._jog.keep_alive(self.number)
         try:
-            crowded = self._count(now)
-            word = self._read(kind, data)
-            if crowded and word != STOP:
-                raise InvalidInputError("messages", f"{self._words} in a second", f"at most {MOST_WORDS}")
-            if isinstance(word, Got):
-                self._outbox.got(word.what)
+            exceeded = self._count_message(now)
+            parsed = self._read(kind, data)
+            if exceeded and parsed != EMERGENCY_STOP:
+                raise InvalidInputError("messages", f"{self._message_count} in a second", f"at most {MAX_MESSAGE_RATE}")
+            if isinstance(parsed, Acknowledge):
+                self._outbox.acknowledge(parsed.kind)
                 self._wake.set()
-            elif not self._commands:
-                if not isinstance(word, Visible):
+            elif not self._can_command:
+                if not isinstance(parsed, Visibility):
                     raise InvalidInputError("token", "none", "the one in the console's address: this page only watches")
             else:
-                await self._obey(word, now)
+                await self._dispatch(parsed, now)
         except InvalidInputError as error:
-            self._steering.interrupt(self.number)
-            self._answer("error", text=str(error))
-            if self._excess > FLOOD:
+            self._jog.interrupt(self.number)
+            self._reply("error", text=str(error))
+            if self._excess > MAX_EXCESS_MESSAGES:
                 await self._socket.close(code=1008, message=b"too many messages")
 
-    async def _obey(self, word: Word, now: float) -> None:
-        if isinstance(word, Hold):
-            await self._hold(word, now)
-        elif isinstance(word, Release):
-            self._steering.release(self.number)
-        elif isinstance(word, Take):
-            self._answer("done", what="take", refusal=self._steering.take(self.number))
-        elif isinstance(word, HandBack):
-            self._steering.hand_back(self.number)
-        elif isinstance(word, Visible):
-            self._steering.show(self.number, word.seen)
-        elif not isinstance(word, (Hello, Got)):
-            self._duties.begin(
-                self.number, word, lambda what, refusal: self._answer("done", what=what, refusal=refusal)
+    async def _dispatch(self, message: ClientMessage, now: float) -> None:
+        if isinstance(message, Jog):
+            await self._on_jog(message, now)
+        elif isinstance(message, EndJog):
+            self._jog.end_jog(self.number)
+        elif isinstance(message, AcquireControl):
+            refusal = self._jog.acquire_control(self.number)
+            self._reply("result", request=message.TYPE, refusal=refusal)
+        elif isinstance(message, ReleaseControl):
+            self._jog.release_control(self.number)
+        elif isinstance(message, Visibility):
+            self._jog.set_visible(self.number, message.visible)
+        elif not isinstance(message, (Hello, Acknowledge)):
+            self._requests.start(
+                self.number, message, lambda name, refusal: self._reply("result", request=name, refusal=refusal)
             )
 
-    async def _hold(self, word: Hold, now: float) -> None:
-        late = self._lateness.of(word.sent, now)
-        if late <= self._settings.hold_timeout:
-            self._in_time = now
-            if not self._steering.hold(self.number, word.velocity):
-                self._answer("error", text="hold: this page does not steer; take steering first")
+    async def _on_jog(self, message: Jog, now: float) -> None:
+        delay = self._delay.update(message.sent, now)
+        if delay <= self._settings.hold_timeout:
+            self._last_in_time = now
+            if not self._jog.jog(self.number, message.velocity):
+                self._reply("error", text="jog: this page does not have control; take control first")
             return
-        self._steering.interrupt(self.number)
-        self._answer("error", text=f"hold: came {late:.2f} s late, expected at most {self._settings.hold_timeout:g} s")
-        if now - self._in_time > LATE_FOR:
-            await self._socket.close(code=1008, message=b"every word comes late")
+        self._jog.interrupt(self.number)
+        self._reply("error", text=f"jog: {delay:.2f} s late, expected at most {self._settings.hold_timeout:g} s")
+        if now - self._last_in_time > MAX_LATE_TIME:
+            await self._socket.close(code=1008, message=b"all messages are late")
 
-    def _count(self, now: float) -> bool:
-        """Count a message; return whether it is one too many."""
+    def _count_message(self, now: float) -> bool:
+        """Count a message; return whether it exceeds the maximum rate."""
         second = int(now)
-        self._second, self._words = second, self._words + 1 if second == self._second else 1
-        crowded = self._words > MOST_WORDS
-        self._excess += crowded
-        return crowded
+        self._second, self._message_count = second, self._message_count + 1 if second == self._second else 1
+        exceeded = self._message_count > MAX_MESSAGE_RATE
+        self._excess += exceeded
+        return exceeded
 
-    def _answer(self, kind: str, **fields: Any) -> None:
-        self._outbox.answer(json.dumps({"type": kind, **fields}))
+    def _reply(self, kind: str, **fields: Any) -> None:
+        self._outbox.reply(json.dumps({"type": kind, **fields}))
         self._wake.set()
 
     async def _send_all(self) -> None:
@@ -180,7 +192,7 @@ class Client:
                 await self._wake.wait()
                 self._wake.clear()
                 while (message := self._outbox.next()) is not None:
-                    await asyncio.wait_for(self._send(message), SEND_WITHIN)
+                    await asyncio.wait_for(self._send(message), SEND_TIMEOUT)
         except (asyncio.TimeoutError, ConnectionError):
             transport = self._request.transport
             if transport is not None:

@@ -1,21 +1,21 @@
-"""What the operator's page needs of a running graph and of whoever runs it.
+"""Interfaces of the operator page to a running graph and to its host.
 
-SI units and plain JSON types throughout. `Graph.state` returns, where every part may be None until something was heard:
+SI units and plain JSON types throughout. `Graph.state` returns, where every part is None until its first message:
 
     {
       "time": float,                   # the graph's time [s]
       "needle_length": float, "needle_curvature": float,   # of the console's settings
       "scene": {"version": str, "dish_diameter": m, "dish_depth": m,
-                "shapes": [{"name": str, "kind": "tissue|instrument|wall", "label": [x, y],   # where its name can stand
+                "shapes": [{"name": str, "kind": "tissue|instrument|wall", "label": [x, y],   # position of its name
                             "disc": [x, y, r]}   # or, in place of the disc,
                            | {..., "outline": [[x, y], ...], "holes": [[[x, y], ...], ...]}]} | None,
       "needle": {"tail": [x, y], "heading": rad, "age": s} | None,
       "tracker": {"state": "tracked|lost|searching", "reason": str, "confidence": float,
                   "view": {"centre": [u, v], "scale": m_per_px, "rotation": rad} | None} | None,
-      "seen": [[x, y], ...],           # the seen centreline, may be empty
+      "measured": [[x, y], ...],       # the measured centreline, may be empty
       "predicted": {"vertices": [[x, y], ...], "residual": float, "step_time": float, "status": str, "age": s} | None,
       "margins": {"valid": bool, "reason": str,
-                  "clearance": [float | None, ...],   # of each node, least over wall and shapes; None: none near
+                  "clearance": [float | None, ...],   # of each node, minimum over wall and shapes; None: none near
                   "least": {"connectivity": m, "compression": m, "obstacle": m, ...},   # of the kinds present
                   "contact": [node, ...],
                   "friction": {"state": "unknown|free|pulled|resting", "nodes": [int], "slowdown": float}} | None,
@@ -30,10 +30,10 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
 
 `Host.state` returns
 
-    {"mode": "simulated|graph|replay", "scenario": str, "scenarios": [str], "can_pause": bool, "paused": bool,
+    {"mode": "simulated|graph|replay", "setup": str, "setups": [str], "can_pause": bool, "paused": bool,
      "can_record": bool,
      "recording": str,   # the path, empty if nothing is recorded
-     "busy": str,        # what is under way, empty if nothing
+     "busy": str,        # operation in progress, empty if none
      "simulated": bool}
 """
 
@@ -43,36 +43,36 @@ from typing import Any, Protocol
 
 
 class Graph(Protocol):
-    """What the page needs of a running graph. All calls are made from one asyncio loop's thread."""
+    """Interface to a running graph. All calls come from the thread of one asyncio loop."""
 
-    def steer(self, velocity: tuple[float, float]) -> None:
-        """Publish the operator's wish now, stamped now.
+    def publish_velocity(self, velocity: tuple[float, float]) -> None:
+        """Publish an operator velocity command, stamped now.
 
         Args:
             velocity: of the needle's tip in the dish plane [m/s].
         """
 
-    async def act(self, action: str) -> str:
-        """Do one of arm, disarm, stop and reset; return an empty text, or the refusal."""
+    async def execute_action(self, action: str) -> str:
+        """Execute arm, disarm, stop or reset; return an empty text, or the reason of a refusal."""
 
     def state(self) -> dict[str, Any]:
-        """Return what is known now, as a new dictionary; cheap enough for 30 calls a second."""
+        """Return the present state as a new dictionary; fast enough for 30 calls a second."""
 
     def frame(self) -> tuple[int, bytes] | None:
-        """Return number and JPEG or PNG bytes of the newest camera frame; the number rises."""
+        """Return number and JPEG or PNG bytes of the latest camera frame; the number increases."""
 
 
 class Host(Protocol):
-    """Who runs the graph: what can be chosen, paused and recorded. None of it may be possible."""
+    """Interface to the host of the graph, which may offer setups, pause and recording."""
 
     def state(self) -> dict[str, Any]:
-        """Return what runs and what is possible now."""
+        """Return what is running and which requests are possible."""
 
-    async def choose(self, scenario: str) -> str:
-        """Run another scenario; return an empty text, or the refusal."""
+    async def select_setup(self, setup: str) -> str:
+        """Run another setup; return an empty text, or the reason of a refusal."""
 
-    async def pause(self, still: bool) -> str:
-        """Let time stand still, or go on; return an empty text, or the refusal."""
+    async def set_paused(self, paused: bool) -> str:
+        """Pause or resume time; return an empty text, or the reason of a refusal."""
 
-    async def record(self, on: bool) -> str:
-        """Begin or end a recording; return an empty text, or the refusal."""
+    async def set_recording(self, recording: bool) -> str:
+        """Start or end a recording; return an empty text, or the reason of a refusal."""

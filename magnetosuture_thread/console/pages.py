@@ -1,11 +1,11 @@
-"""The files of the page, and the headers that keep everything else out of it."""
+"""Static files of the page, and their security headers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.resources import files
 
-KINDS = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+CONTENT_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -21,11 +21,11 @@ HEADERS = {
 
 @dataclass(frozen=True)
 class PageFile:
-    """A file as it is served.
+    """A static file.
 
     Attributes:
-        content_type: what it is.
-        body: what is in it.
+        content_type: MIME type.
+        body: content.
     """
 
     content_type: str
@@ -36,7 +36,7 @@ def page_files() -> dict[str, PageFile]:
     """Return the files of the page by the path of their URL; `/` is the page itself."""
     result = {}
     for entry in files("magnetosuture_thread.console").joinpath("page").iterdir():
-        kind = KINDS.get(entry.name[entry.name.rfind(".") :])
+        kind = CONTENT_TYPES.get(entry.name[entry.name.rfind(".") :])
         if kind is not None:
             result[f"/{entry.name}"] = PageFile(kind, entry.read_bytes())
     result["/"] = result.pop("/index.html")

@@ -1,4 +1,4 @@
-"""Who serves the operator's page: on a graph that runs, or around a simulated rig."""
+"""Hosts of the operator page: on a running graph, or around a simulated rig."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE, SLOWER_BRIDGE, STA
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console_graph import ConsoleGraph
 from magnetosuture_thread.nodes.console_host import RIG, GraphHost
-from magnetosuture_thread.nodes.console_tap import SAID, ConsoleTap
+from magnetosuture_thread.nodes.console_tap import RECORDED_TOPICS, ConsoleTap
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.setups import Setup, read_setup
 
@@ -29,10 +29,10 @@ SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:aut
 
 
 class RecordingHost(GraphHost):
-    """A graph that others run, of which bags are recorded.
+    """Host of a running graph that records bags.
 
     Args:
-        graph: that is looked at.
+        graph: to serve.
         setup: with which.
         recordings: folder that gets a bag for each recording.
         say: called with a line for a person.
@@ -53,7 +53,7 @@ class RecordingHost(GraphHost):
         recording = "" if self._recording is None else str(self._recording.output)
         return {
             **super().state(),
-            "scenario": self.setup.name,
+            "setup": self.setup.name,
             "can_record": True,
             "recording": recording,
             "busy": self.busy,
@@ -64,34 +64,34 @@ class RecordingHost(GraphHost):
         """Return the notes of a recording."""
         text = self.setup.path.read_text(encoding="utf-8")
         notes = {"setup": self.setup.name, SCENARIO_NOTE: text}
-        if self.graph.says(RIG):
-            notes["simulated"] = f"the whole rig, steered by a person, scenario {self.setup.name}"
+        if self.graph.is_active(RIG):
+            notes["simulated"] = f"the whole rig, jogged by an operator, setup {self.setup.name}"
         return notes
 
     def start(self) -> None:
         """Start what this runs; here nothing."""
 
-    async def record(self, on: bool) -> str:
-        """Begin or end a recording; return an empty text, or why it cannot be."""
-        if on == (self._recording is not None):
+    async def set_recording(self, recording: bool) -> str:
+        """Start or end a recording; return an empty text, or the reason of a refusal."""
+        if recording == (self._recording is not None):
             return ""
-        if not on:
+        if not recording:
             return await self._end_recording()
         if self.busy:
             return self.busy
         raw = self.graph.settings.image_transport == "raw"
-        taken = [topic for topic in SAID if topic is not topics.IMAGE or raw]
+        taken = [topic for topic in RECORDED_TOPICS if topic is not topics.IMAGE or raw]
         channels = [topic.channel for topic in taken]
-        recording = BagRecording(new_name(self._recordings, self.setup.name), self.notes, channels)
-        self._recording = recording
+        bag = BagRecording(new_name(self._recordings, self.setup.name), self.notes, channels)
+        self._recording = bag
         try:
-            await recording.begin()
+            await bag.begin()
         except MagnetosutureError as error:
             self._recording = None
             return str(error)
-        self._tap = ConsoleTap(self.graph.node, taken, None, recording.take)
+        self._tap = ConsoleTap(self.graph.node, taken, None, bag.take)
         self._tapping = asyncio.create_task(self._tap.run())
-        self.say(f"recording to {recording.output}")
+        self.say(f"recording to {bag.output}")
         return ""
 
     async def watch(self) -> None:
@@ -129,12 +129,12 @@ class RecordingHost(GraphHost):
 
 
 class SimulatedHost(RecordingHost):
-    """The whole graph around a simulated rig, as processes of this one; any set-up can be chosen.
+    """Host that starts the whole graph around a simulated rig; any setup can be selected.
 
     Args:
-        graph: that is looked at.
-        scenario: name or path of the set-up to begin with.
-        scenarios: the set-ups that can be chosen.
+        graph: to serve.
+        setup: name or path of the initial setup.
+        setups: that can be selected.
         environment: for the nodes.
         logs: folder for what each node prints.
         recordings: folder that gets a bag for each recording.
@@ -146,24 +146,24 @@ class SimulatedHost(RecordingHost):
     def __init__(
         self,
         graph: ConsoleGraph,
-        scenario: str,
-        scenarios: Sequence[str],
+        setup: str,
+        setups: Sequence[str],
         environment: Mapping[str, str],
         logs: Path,
         recordings: Path,
         say: Say,
     ) -> None:
-        super().__init__(graph, read_setup(scenario), recordings, say)
-        self._scenario, self._scenarios = scenario, tuple(scenarios)
+        super().__init__(graph, read_setup(setup), recordings, say)
+        self._setup_name, self._setups = setup, tuple(setups)
         self._environment, self._logs = dict(environment), logs
         self._nodes: NodeProcesses | None = None
         self._since = 0.0
         self._changing = False
-        self._hold(f"starting {self.setup.name}")
+        self._block(f"starting {self.setup.name}")
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
-        return {**super().state(), "scenario": self._scenario, "scenarios": list(self._scenarios), "simulated": True}
+        return {**super().state(), "setup": self._setup_name, "setups": list(self._setups), "simulated": True}
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has said something of itself."""
@@ -173,44 +173,44 @@ class SimulatedHost(RecordingHost):
         self._nodes = NodeProcesses(processes, arguments, self._environment, self._logs).__enter__()
         self._since = time.monotonic()
 
-    async def choose(self, scenario: str) -> str:
-        """End the nodes and start those of another scenario, or of the same; return a refusal."""
+    async def select_setup(self, setup: str) -> str:
+        """Stop the nodes and start those of a setup; return the reason of a refusal."""
         if self.busy:
             return self.busy
-        if scenario not in self._scenarios:
-            return f"scenario: got {scenario!r}, expected one of {', '.join(self._scenarios)}"
+        if setup not in self._setups:
+            return f"setup: got {setup!r}, expected one of {', '.join(self._setups)}"
         try:
-            setup = read_setup(scenario)
-            version = setup.scene.version  # read while the old nodes still run: they stay if it cannot be
+            selected = read_setup(setup)
+            version = selected.scene.version  # read while the old nodes still run: they stay if it cannot be
         except MagnetosutureError as error:
             return str(error)
-        self._hold(f"starting {setup.name}")
+        self._block(f"starting {selected.name}")
         self._changing = True  # the nodes that are still there are not those to wait for
         try:
             await self._end_recording()
             await self._end_nodes()
         finally:
             self._changing = False
-        self.setup, self._scenario, self.paused = setup, scenario, False
-        self.graph.begin(served_as(setup.console, self.graph.settings))
+        self.setup, self._setup_name, self.paused = selected, setup, False
+        self.graph.begin(served_as(selected.console, self.graph.settings))
         self.start()
-        self.say(f"starting {setup.name}, scene {version}")
+        self.say(f"starting {selected.name}, scene {version}")
         return ""
 
     async def watch(self) -> None:
-        """Let the operator in once all nodes are there; raise `GraphError` if one has ended."""
+        """Permit commands once all nodes are ready; raise `GraphError` if one has ended."""
         await super().watch()
         if self._changing or self._nodes is None:
             return
         self._nodes.check()
         if not self.busy:
             return
-        missing = [name for name in (SCENE_SERVER, RIG, *NODES) if not self.graph.says(name)]
+        missing = [name for name in (SCENE_SERVER, RIG, *NODES) if not self.graph.is_active(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
             # Only now: while it compiles for the first time, others shall not wait for it.
             self.say(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
-            self._hold("")
+            self._block("")
             self.say(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > START_TIMEOUT:
             unheard = ", ".join(missing) or "a bridge that is ready"
@@ -221,10 +221,10 @@ class SimulatedHost(RecordingHost):
         await super().close()
         await self._end_nodes()
 
-    def _hold(self, why: str) -> None:
-        """Let nothing be steered, and the needle rest, for a reason; or let the operator in again."""
-        self.graph.steer((0.0, 0.0))
-        self.busy = self.graph.held = why
+    def _block(self, reason: str) -> None:
+        """Stop the needle and block commands for a reason; an empty one permits them again."""
+        self.graph.publish_velocity((0.0, 0.0))
+        self.busy = self.graph.blocked = reason
 
     async def _end_nodes(self) -> None:
         nodes, self._nodes = self._nodes, None

@@ -1,4 +1,4 @@
-"""Who serves the operator's page on a replayed bag."""
+"""Host of the operator page on a replayed bag."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.nodes.replay import LiveReplay
 from magnetosuture_thread.nodes.replay_time import Timeline
 
-ONLY_WATCHED = "this is a replay: nothing steers it or switches it on"
+REPLAY_BLOCKED = "this is a replay: nothing can be jogged or armed"
 
 
 class ReplayHost(RecordingHost):
-    """A bag that is played through the nodes over and over; nothing moves by it.
+    """Host that plays a bag through the nodes in a loop; commands are blocked.
 
     Args:
-        graph: that is looked at.
+        graph: to serve.
         playing: the bag.
         domain: the graph's ROS domain.
         environment: for the nodes.
@@ -34,13 +34,7 @@ class ReplayHost(RecordingHost):
     mode = "replay"
 
     def __init__(
-        self,
-        graph: ConsoleGraph,
-        playing: Playing,
-        domain: int,
-        environment: Mapping[str, str],
-        logs: Path,
-        say: Say,
+        self, graph: ConsoleGraph, playing: Playing, domain: int, environment: Mapping[str, str], logs: Path, say: Say
     ) -> None:
         super().__init__(graph, playing.given.setup, Path(), say)
         self._playing, self._domain = playing, domain
@@ -50,13 +44,13 @@ class ReplayHost(RecordingHost):
         self._problem: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="replay")
         self.busy = f"starting the nodes for {playing.given.recording.path}"
-        graph.held = ONLY_WATCHED
+        graph.blocked = REPLAY_BLOCKED
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
         recording = self._playing.given.recording
         simulated = bool(recording.notes.get("simulated", ""))
-        return {**super().state(), "scenario": str(recording.path), "can_record": False, "simulated": simulated}
+        return {**super().state(), "setup": str(recording.path), "can_record": False, "simulated": simulated}
 
     def start(self) -> None:
         """Start the nodes, and play the bag once they are there."""
@@ -64,8 +58,8 @@ class ReplayHost(RecordingHost):
         self._nodes = NodeProcesses(self._playing.processes, arguments, self._environment, self._logs).__enter__()
         self._thread.start()
 
-    async def record(self, on: bool) -> str:
-        """Refuse: what the nodes make of a bag is recorded by another command."""
+    async def set_recording(self, recording: bool) -> str:
+        """Refuse: another command records a replay."""
         return "what comes of a bag is recorded by `magnetosuture replay BAG --output DIR`"
 
     async def watch(self) -> None:

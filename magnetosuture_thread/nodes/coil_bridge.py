@@ -18,12 +18,12 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.bridge_services import BridgeServices
 from magnetosuture_thread.nodes.coil_report import CoilReport
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.nodes.scheduling import take_priority
-from magnetosuture_thread.nodes.switches import Switches
 from magnetosuture_thread.scene import Scene
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
@@ -50,7 +50,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source))
-        Switches(self, self.arm, self.stop, self.reset)
+        BridgeServices(self, self.arm, self.stop, self.reset)
         self.start()
         if self.settings is not None and self.settings.autostart == "armed":
             self.system.arm_when_ready()

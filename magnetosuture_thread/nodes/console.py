@@ -1,4 +1,4 @@
-"""The console node: the operator's page, served on the graph of its ROS domain."""
+"""Console node: serves the operator page on the graph of its ROS domain."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from magnetosuture_thread.nodes.parameters import declare
 
 
 async def serve(node: Node, settings: ConsoleSettings) -> None:
-    """Serve the page until this process is asked to end; the needle is told to rest first."""
-    loop, asked = asyncio.get_running_loop(), asyncio.Event()
+    """Serve the page until the process is terminated; the needle is stopped first."""
+    loop, terminated = asyncio.get_running_loop(), asyncio.Event()
     for which in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(which, asked.set)
+        loop.add_signal_handler(which, terminated.set)
     graph = ConsoleGraph(node, settings)
     server = ConsoleServer(settings, graph, GraphHost(graph))
     url = await server.start()
@@ -33,11 +33,11 @@ async def serve(node: Node, settings: ConsoleSettings) -> None:
     health = Health(node)
     health.ok(f"serving on {settings.address}")
     try:
-        while not asked.is_set():
-            graph.now()  # of which the report is stamped
+        while not terminated.is_set():
+            graph.now()  # sets the clock for the stamp
             health.publish()
             try:
-                await asyncio.wait_for(asked.wait(), PERIOD)
+                await asyncio.wait_for(terminated.wait(), PERIOD)
             except asyncio.TimeoutError:
                 continue
     finally:
@@ -45,11 +45,11 @@ async def serve(node: Node, settings: ConsoleSettings) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program; return 0 when it was asked to end, 1 when it could not start."""
+    """Run the node as a program; return 0 when it was terminated, 1 when it could not start."""
     node = None
     try:
         init(arguments, signal_handler_options=SignalHandlerOptions.NO)
-        # No executor spins it, so nobody would answer who asks for its parameters.
+        # Without an executor its parameter services could not answer.
         node = rclpy.create_node(NAME, **node_options(NAME, {"start_parameter_services": False}))
         asyncio.run(serve(node, declare(node, ConsoleSettings)))
     except (MagnetosutureError, ParameterException, OSError) as error:

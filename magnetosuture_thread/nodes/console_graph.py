@@ -1,4 +1,4 @@
-"""The operator's page's side of a running graph: what is steered, and what is seen."""
+"""Operator page's connection to a running graph: commands out, states in."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from sensor_msgs.msg import CompressedImage, Image
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.nodes import console_messages, topics
 from magnetosuture_thread.nodes.console_inbox import Inbox, Latest
-from magnetosuture_thread.nodes.console_switches import ACTIONS, ConsoleSwitches
+from magnetosuture_thread.nodes.console_services import ACTIONS, ConsoleServices
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.vision.images import unpack_image
 
-SILENT = 3.0  # s, after which a node that says nothing of itself any more is silent
-SEEN_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
-REPORTS = 100  # on /diagnostics, that may wait to be looked at
+NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
+MEASURED_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
+MAX_DIAGNOSTICS = 100  # queued messages of /diagnostics
 JPEG_QUALITY = 80
 READERS = {
     "tracker": (topics.TRACKER_STATE, console_messages.tracker, 0.0),
     "needle": (topics.NEEDLE_POSE, console_messages.needle, 0.0),
-    "seen": (topics.SEEN_THREAD, console_messages.seen, SEEN_PERIOD),
+    "measured": (topics.SEEN_THREAD, console_messages.seen, MEASURED_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, console_messages.predicted, 0.0),
     "margins": (topics.MARGINS, console_messages.margins, 0.0),
     "scene": (topics.SCENE, console_messages.scene, 0.0),
     "filter": (topics.FILTER_STATE, console_messages.filter_state, 0.0),
     "bridge": (topics.BRIDGE_STATE, console_messages.bridge, 0.0),
 }
-AT_REST = {
+ZERO_FILTER_STATE = {
     "source": "",
     "commanded": [0.0, 0.0],
     "filtered": [0.0, 0.0],
@@ -44,13 +44,13 @@ AT_REST = {
     "overridden": "",
     "age": 0.0,
 }
-AGED = ("needle", "predicted", "filter", "bridge")
+AGED_PARTS = ("needle", "predicted", "filter", "bridge")
 
 
 class ConsoleGraph:
-    """A running graph as `console.graph.Graph` wants it.
+    """Implementation of `console.graph.Graph` over ROS.
 
-    Nothing runs between two calls: messages wait in the middleware until somebody looks.
+    Nothing runs between two calls: messages are queued in the middleware.
 
     Args:
         node: in the graph; no executor spins it. With `use_sim_time` its time is that of /clock.
@@ -59,7 +59,7 @@ class ConsoleGraph:
     Attributes:
         node: as given.
         settings: in force.
-        held: why nothing may be steered or switched on now; empty if it may.
+        blocked: why commands are blocked now; empty if they are not.
 
     Raises:
         ConfigurationError: the settings' scene cannot be read.
@@ -67,18 +67,18 @@ class ConsoleGraph:
 
     def __init__(self, node: Node, settings: ConsoleSettings) -> None:
         self.node = node
-        self.held = ""
-        self.switches = ConsoleSwitches(node)
+        self.blocked = ""
+        self.services = ConsoleServices(node)
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
         self._open(settings, _file_scene(settings))
 
     def begin(self, settings: ConsoleSettings) -> None:
-        """Begin anew: forget all that was heard, for a graph whose nodes were started anew.
+        """Restart: drop all states, for a graph whose nodes were restarted.
 
         Raises:
-            ConfigurationError: the settings' scene cannot be read; nothing has changed.
+            ConfigurationError: the settings' scene cannot be read; nothing is changed.
         """
         scene = _file_scene(settings)
         for latest in self._latest.values():
@@ -87,33 +87,33 @@ class ConsoleGraph:
         self._reports.close()
         self._open(settings, scene)
 
-    def steer(self, velocity: tuple[float, float]) -> None:
-        """Publish the operator's wish now; while the graph is held, nothing."""
-        if not self.held:
+    def publish_velocity(self, velocity: tuple[float, float]) -> None:
+        """Publish an operator velocity command; nothing while commands are blocked."""
+        if not self.blocked:
             self._commands.publish(MESSAGES.twist_message(self.now().to_msg(), np.asarray(velocity, dtype=float)))
 
-    async def act(self, action: str) -> str:
-        """Arm, disarm, stop or reset; return an empty text, or the refusal.
+    async def execute_action(self, action: str) -> str:
+        """Arm, disarm, stop or reset; return an empty text, or the reason of a refusal.
 
-        The emergency stop is pressed before anything else is done, whatever holds the graph.
+        The emergency stop is never blocked.
         """
         if action not in ACTIONS:
             return f"action: got {action!r}, expected one of {', '.join(ACTIONS)}"
-        if self.held and action != "stop":
-            return self.held
-        return await self.switches.act(action)
+        if self.blocked and action != "stop":
+            return self.blocked
+        return await self.services.execute_action(action)
 
     def state(self) -> dict[str, Any]:
-        """Return what is known now; see `console.graph`."""
+        """Return the present state; see `console.graph`."""
         for latest in self._latest.values():
-            latest.look()
+            latest.poll()
         settings = self.settings
         parts: dict[str, Any] = {
-            name: latest.aged() if name in AGED else latest.value or ([] if name == "seen" else None)
+            name: latest.aged() if name in AGED_PARTS else latest.value or ([] if name == "measured" else None)
             for name, latest in self._latest.items()
         }
-        if self.held:
-            parts["filter"] = {**AT_REST, "reason": self.held}
+        if self.blocked:
+            parts["filter"] = {**ZERO_FILTER_STATE, "reason": self.blocked}
         return {
             "time": self.now().nanoseconds * 1e-9,
             "needle_length": settings.needle_length,
@@ -124,46 +124,46 @@ class ConsoleGraph:
         }
 
     def nodes(self) -> dict[str, dict[str, Any]]:
-        """Return what each node said of itself last, and how long ago."""
+        """Return the last diagnostics of each node, and their age."""
         for report, arrived in self._reports.read():
             for status in report.status:
-                self._said[status.name.split(":")[0]] = (console_messages.node_state(status), arrived)
+                self._diagnostics[status.name.split(":")[0]] = (console_messages.node_state(status), arrived)
         return dict(self._aged_nodes())
 
-    def says(self, name: str) -> bool:
-        """Return whether a node says something of itself now."""
-        return any(said == name and about["level"] != "silent" for said, about in self.nodes().items())
+    def is_active(self, name: str) -> bool:
+        """Return whether a node publishes diagnostics now."""
+        return any(node == name and about["level"] != "silent" for node, about in self.nodes().items())
 
     def frame(self) -> tuple[int, bytes] | None:
-        """Return number and JPEG or PNG bytes of the newest camera frame; a raw one is encoded only here."""
-        if self._camera.look():
+        """Return number and JPEG or PNG bytes of the latest camera frame; a raw one is encoded here."""
+        if self._camera.poll():
             self._number += 1
         return None if self._camera.value is None else (self._number, self._camera.value)
 
     def now(self) -> Time:
         """Return the graph's time."""
         clock = self.node.get_clock()
-        for told, _ in self._clock.read() if self._clock is not None else ():
-            clock.set_ros_time_override(Time.from_msg(told.clock, clock_type=clock.clock_type))
+        for message, _ in self._clock.read() if self._clock is not None else ():
+            clock.set_ros_time_override(Time.from_msg(message.clock, clock_type=clock.clock_type))
         return clock.now()
 
     def _open(self, settings: ConsoleSettings, scene: dict[str, Any] | None) -> None:
         self.settings, self._scene = settings, scene
         self._latest = {name: Latest(self.node, *reader) for name, reader in READERS.items()}
-        self._reports = Inbox(self.node, topics.DIAGNOSTICS, REPORTS)
-        self._said: dict[str, tuple[dict[str, Any], int]] = {}
+        self._reports = Inbox(self.node, topics.DIAGNOSTICS, MAX_DIAGNOSTICS)
+        self._diagnostics: dict[str, tuple[dict[str, Any], int]] = {}
         raw = settings.image_transport == "raw"
         image, read = (topics.IMAGE, _encoded) if raw else (topics.COMPRESSED_IMAGE, _compressed)
         self._camera = Latest(self.node, image, read)
 
     def _aged_nodes(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        for name, (said, arrived) in sorted(self._said.items()):
+        for name, (status, arrived) in sorted(self._diagnostics.items()):
             age = max(0.0, time.time() - arrived * 1e-9)
-            yield name, {**said, "level": "silent" if age > SILENT else said["level"], "age": age}
+            yield name, {**status, "level": "silent" if age > NODE_TIMEOUT else status["level"], "age": age}
 
 
 def _file_scene(settings: ConsoleSettings) -> dict[str, Any] | None:
-    """Return the scene to show until one is heard; None where the settings name none."""
+    """Return the scene to show until one is received; None where the settings name none."""
     return console_messages.shown_scene(read_scene(settings.scene)) if settings.scene else None
 
 

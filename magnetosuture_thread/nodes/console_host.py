@@ -1,4 +1,4 @@
-"""Who serves the page on a graph that others run, and how a process joins a graph for it."""
+"""Host of the operator page on a graph that is already running, and the node that joins the graph."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RIG = "rig_simulator"
 
 @contextmanager
 def joined(*, domain: int | None = None, simulated_clock: bool = False) -> Iterator[Node]:
-    """Give a node in a graph, that no executor spins.
+    """Create a node in a graph, without an executor.
 
     Args:
         domain: the graph's ROS domain; the one that the environment names if None.
@@ -30,7 +30,7 @@ def joined(*, domain: int | None = None, simulated_clock: bool = False) -> Itera
     context = Context()
     rclpy.init(context=context, domain_id=domain, args=[], signal_handler_options=SignalHandlerOptions.NO)
     clock = [Parameter("use_sim_time", value=simulated_clock)]
-    # Nobody would answer who asks for its parameters.
+    # Without an executor its parameter services could not answer.
     node = rclpy.create_node(NAME, context=context, parameter_overrides=clock, start_parameter_services=False)
     try:
         yield node
@@ -40,10 +40,10 @@ def joined(*, domain: int | None = None, simulated_clock: bool = False) -> Itera
 
 
 class GraphHost:
-    """A graph that others run: nothing can be chosen, and time stands still only where its nodes can let it.
+    """Host of a graph that is already running: setups cannot be selected, and time pauses only if its nodes can.
 
     Args:
-        graph: that is looked at.
+        graph: to serve.
     """
 
     mode = "graph"
@@ -53,40 +53,40 @@ class GraphHost:
         self.paused = False
 
     def state(self) -> dict[str, Any]:
-        """Return what runs and what is possible now; see `console.graph`."""
-        if self.paused and not self._pause():
+        """Return what is running and which requests are possible; see `console.graph`."""
+        if self.paused and not self._pause_service():
             self.paused = False
         return {
             "mode": self.mode,
-            "scenario": "",
-            "scenarios": [],
-            "can_pause": bool(self._pause()),
+            "setup": "",
+            "setups": [],
+            "can_pause": bool(self._pause_service()),
             "paused": self.paused,
             "can_record": False,
             "recording": "",
             "busy": "",
-            "simulated": self.graph.says(RIG),
+            "simulated": self.graph.is_active(RIG),
         }
 
-    async def choose(self, scenario: str) -> str:
-        """Refuse: who runs the graph chooses."""
-        return f"scenario: got {scenario!r}, expected none, as this graph is run by others"
+    async def select_setup(self, setup: str) -> str:
+        """Refuse: this graph is not started from the page."""
+        return f"setup: got {setup!r}, expected none, as this graph is not started from the page"
 
-    async def pause(self, still: bool) -> str:
-        """Let time stand still, or go on, where a node of the graph can do so; return the refusal if none can."""
-        name = self._pause()
+    async def set_paused(self, paused: bool) -> str:
+        """Pause or resume time if a node of the graph can; return the reason of a refusal."""
+        name = self._pause_service()
         if not name:
-            return "nothing in this graph can let time stand still"
-        refusal = await self.graph.switches.pause(name, still)
+            return "no node of this graph can pause time"
+        refusal = await self.graph.services.set_paused(name, paused)
         if not refusal:
-            self.paused = still
+            self.paused = paused
         return refusal
 
-    async def record(self, on: bool) -> str:
-        """Refuse: bags are written by whoever runs the graph."""
+    async def set_recording(self, recording: bool) -> str:
+        """Refuse: this node records no bags."""
         return "the node console writes no bags; `magnetosuture console --graph` does"
 
-    def _pause(self) -> str:
-        """Return the service that lets time stand still here; an empty text if there is none."""
-        ready = (name for name in (PAUSE_REPLAY, PAUSE_RIG) if self.graph.switches.ready(name))
+    def _pause_service(self) -> str:
+        """Return the service that pauses time; empty if there is none."""
+        ready = (name for name in (PAUSE_REPLAY, PAUSE_RIG) if self.graph.services.ready(name))
         return next(ready, "")

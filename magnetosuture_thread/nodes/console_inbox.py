@@ -1,4 +1,4 @@
-"""Takes messages where somebody looks at them, without an executor."""
+"""Subscriptions that are polled, without an executor."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from magnetosuture_thread.nodes.topics import Topic
 
 
 class Inbox:
-    """The messages of a topic that have come and nobody has looked at.
+    """Queue of the messages of a topic since the last poll.
 
-    rclpy's waiting for hundreds of messages a second would cost as much as the nodes that say them; here they wait
-    in the middleware, which keeps the newest and knows when each came.
+    Waiting for hundreds of messages a second in rclpy would cost as much as the nodes that send them. Here they are
+    queued in the middleware, which keeps the latest and their time of arrival.
 
     Args:
         node: that subscribes.
-        topic: to take.
-        depth: messages that may wait; of more, the oldest are lost.
+        topic: to subscribe.
+        depth: of the queue; beyond it, the oldest messages are lost.
     """
 
     def __init__(self, node: Node, topic: Topic, depth: int) -> None:
@@ -37,7 +37,7 @@ class Inbox:
         self._subscription = node.create_subscription(topic.message, topic.name, _never, quality, raw=True)
 
     def take(self) -> Iterator[tuple[bytes, int]]:
-        """Give the messages that wait: their CDR bytes, and when they came [ns]."""
+        """Yield the queued messages: their CDR bytes, and their time of arrival [ns]."""
         subscription = self._subscription
         with subscription.handle:
             while (found := subscription.handle.take_message(subscription.msg_type, True)) is not None:
@@ -45,7 +45,7 @@ class Inbox:
                 yield bytes(data), info["received_timestamp"]
 
     def read(self) -> Iterator[tuple[Any, int]]:
-        """Give the messages that wait, and when they came [ns]; those that cannot be read are passed over."""
+        """Yield the queued messages, and their time of arrival [ns]; invalid ones are skipped."""
         for data, arrived in self.take():
             try:
                 yield decoded(self.topic, data), arrived
@@ -53,35 +53,35 @@ class Inbox:
                 continue
 
     def close(self) -> None:
-        """Take no more."""
+        """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
 
 
 class Latest:
-    """What the newest message of a topic says.
+    """Content of the latest message of a topic.
 
     Args:
         node: that subscribes.
-        topic: to take.
-        read: makes what is kept of a message; an `InvalidInputError` leaves what was kept before.
-        period: between two messages that are read, at the least [s].
+        topic: to subscribe.
+        read: converts a message; an `InvalidInputError` keeps the previous value.
+        period: minimum between two messages that are read [s].
 
     Attributes:
-        value: what the newest message says that was read; None before the first.
+        value: content of the latest message that was read; None before the first.
     """
 
     def __init__(self, node: Node, topic: Topic, read: Callable[[Any], Any], period: float = 0.0) -> None:
         self._inbox = Inbox(node, topic, 1)
         self._read = read
         self._period = period
-        self._again = 0.0
+        self._next_read = 0.0
         self._arrived = 0
         self.value: Any = None
 
-    def look(self) -> bool:
-        """Read the newest message, if one has come; return whether there is something new."""
+    def poll(self) -> bool:
+        """Read the latest message, if there is one; return whether there is a new value."""
         now = time.monotonic()
-        if now < self._again:
+        if now < self._next_read:
             return False
         waiting = list(self._inbox.take())
         if not waiting:
@@ -91,22 +91,22 @@ class Latest:
             self.value = self._read(decoded(self._inbox.topic, data))
         except InvalidInputError:
             return False
-        self._arrived, self._again = arrived, now + self._period
+        self._arrived, self._next_read = arrived, now + self._period
         return True
 
     @property
     def age(self) -> float:
-        """Return how long ago the message came [s]."""
+        """Return the age of the message [s]."""
         return max(0.0, time.time() - self._arrived * 1e-9)
 
     def aged(self) -> dict[str, Any] | None:
-        """Return a copy of what the newest message says, with its age."""
+        """Return a copy of the latest content, with its age."""
         return None if self.value is None else {**self.value, "age": self.age}
 
     def close(self) -> None:
-        """Take no more."""
+        """Unsubscribe."""
         self._inbox.close()
 
 
 def _never(data: bytes) -> None:
-    """Stand in for a callback: no executor calls any."""
+    """Unused callback: there is no executor."""

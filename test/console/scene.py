@@ -1,4 +1,4 @@
-"""A graph and a host that the console is tested with: they keep what they are told and show a scene like a hernia's."""
+"""Test doubles of graph and host: they record calls, and show a scene like a hernia's."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "confidence": 0.97,
             "view": {"centre": list(VIEW.centre_px), "scale": VIEW.metres_per_pixel, "rotation": VIEW.rotation},
         },
-        "seen": thread(120, 4e-5).tolist(),
+        "measured": thread(120, 4e-5).tolist(),
         "predicted": {
             "vertices": line.tolist(),
             "residual": 1e-9,
@@ -172,15 +172,15 @@ class RecordingGraph:
         """The last command, None before the first."""
         return self.commands[-1][1] if self.commands else None
 
-    def steer(self, velocity: tuple[float, float]) -> None:
+    def publish_velocity(self, velocity: tuple[float, float]) -> None:
         """Keep a command."""
         self.commands.append((time.monotonic(), velocity))
         if self.shown["filter"]:
             factor = self.shown["filter"]["slowdown"]
             self.shown["filter"].update(commanded=list(velocity), filtered=[entry * factor for entry in velocity])
 
-    async def act(self, action: str) -> str:
-        """Keep what is asked of the bridge, and be what it then is."""
+    async def execute_action(self, action: str) -> str:
+        """Record an action, and change the state of the bridge."""
         self.actions.append(action)
         await asyncio.sleep(0)
         if self.refusal:
@@ -208,11 +208,11 @@ class RecordingHost:
     """Keeps what it is told."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[str, object]] = []
+        self.requests: list[tuple[str, object]] = []
         self.shown: dict[str, Any] = {
             "mode": "simulated",
-            "scenario": "hernia_ring",
-            "scenarios": ["hernia_ring", "petri_35mm_polyamide"],
+            "setup": "hernia_ring",
+            "setups": ["hernia_ring", "petri_35mm_polyamide"],
             "can_pause": True,
             "paused": False,
             "can_record": True,
@@ -225,22 +225,22 @@ class RecordingHost:
         """Return what is shown now."""
         return dict(self.shown)
 
-    async def choose(self, scenario: str) -> str:
-        """Keep the scenario; refuse one that is not there."""
-        self.asked.append(("choose", scenario))
-        if scenario not in self.shown["scenarios"]:
-            return f"no scenario {scenario}"
-        self.shown["scenario"] = scenario
+    async def select_setup(self, setup: str) -> str:
+        """Record the setup; refuse an unknown one."""
+        self.requests.append(("select_setup", setup))
+        if setup not in self.shown["setups"]:
+            return f"no setup {setup}"
+        self.shown["setup"] = setup
         return ""
 
-    async def pause(self, still: bool) -> str:
-        """Keep that time stands still, or goes on."""
-        self.asked.append(("pause", still))
-        self.shown["paused"] = still
+    async def set_paused(self, paused: bool) -> str:
+        """Record pause and resume."""
+        self.requests.append(("pause", paused))
+        self.shown["paused"] = paused
         return ""
 
-    async def record(self, on: bool) -> str:
-        """Keep that something is recorded, or not any more."""
-        self.asked.append(("record", on))
-        self.shown["recording"] = "output/console/take_1" if on else ""
+    async def set_recording(self, recording: bool) -> str:
+        """Record start and end of a recording."""
+        self.requests.append(("record", recording))
+        self.shown["recording"] = "output/console/take_1" if recording else ""
         return ""

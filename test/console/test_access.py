@@ -12,7 +12,7 @@ from magnetosuture_thread.console.access import (
     page_url,
     same_token,
 )
-from magnetosuture_thread.console.outbox import AHEAD, Outbox
+from magnetosuture_thread.console.outbox import MAX_UNACKNOWLEDGED, Outbox
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 
@@ -104,28 +104,28 @@ def test_a_page_that_is_behind_gets_the_newest_only():
         outbox.put("state", str(number))
         if (message := outbox.next()) is not None:
             sent.append(message)
-    assert sent == [str(number) for number in range(AHEAD)]
-    outbox.got("state")
+    assert sent == [str(number) for number in range(MAX_UNACKNOWLEDGED)]
+    outbox.acknowledge("state")
     assert outbox.next() == "99"
     assert outbox.next() is None
 
 
 def test_frames_do_not_wait_for_states_and_answers_come_first():
     outbox = Outbox()
-    for number in range(AHEAD + 1):
+    for number in range(MAX_UNACKNOWLEDGED + 1):
         outbox.put("state", str(number))
         outbox.next()
     outbox.put("frame", b"picture")
-    outbox.answer("first")
-    outbox.answer("second")
+    outbox.reply("first")
+    outbox.reply("second")
     assert [outbox.next() for _ in range(4)] == ["first", "second", b"picture", None]
 
 
 def test_got_what_was_not_sent_lets_no_more_through():
     outbox = Outbox()
     for _ in range(10):
-        outbox.got("state")
-    for number in range(AHEAD + 2):
+        outbox.acknowledge("state")
+    for number in range(MAX_UNACKNOWLEDGED + 2):
         outbox.put("state", str(number))
         outbox.next()
     assert outbox.next() is None

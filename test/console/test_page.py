@@ -15,14 +15,14 @@ from magnetosuture_thread.geometry.arc import needle_axis
 from test.console.conftest import ServedConsole
 from test.console.scene import picture, state, thread
 
-SLOWEST = 15.0  # [s]
+WAIT_TIMEOUT = 15.0  # [s]
 REST = (0.0, 0.0)
 LAPTOP: ViewportSize = {"width": 1366, "height": 768}
 
 
 def until(page: Page, condition: Callable[[], Any]) -> Any:
     """Wait until a condition holds, the browser going on meanwhile, and return what it gave."""
-    end = time.monotonic() + SLOWEST
+    end = time.monotonic() + WAIT_TIMEOUT
     while not (result := condition()):
         assert time.monotonic() < end, "the condition has not come true"
         page.wait_for_timeout(10)
@@ -54,10 +54,10 @@ class Operator:
         """Return one of the page's counts."""
         return int(self.page.evaluate(f"window.console_stats.{name}"))
 
-    def take(self) -> None:
-        """Take steering."""
-        self.page.click("#take")
-        expect(self.page.locator("#steers")).to_have_text("you steer")
+    def take_control(self) -> None:
+        """Take control."""
+        self.page.click("#control")
+        expect(self.page.locator("#holder")).to_have_text("you have control")
 
     def last(self, velocity: tuple[float, float]) -> None:
         """Wait until this is the last command."""
@@ -136,7 +136,7 @@ def test_the_page_loads_and_draws_every_state(operator: Operator):
     operator.served.graph.picture = (1, picture())
     expect(operator.page.locator("#dish")).to_have_attribute("data-image", "yes")
     expect(operator.page.locator("#simulated")).to_be_visible()
-    expect(operator.page.locator("#headline")).to_have_text("The needle rests: nobody steers")
+    expect(operator.page.locator("#headline")).to_have_text("At rest: no page has control")
     drawn, states = operator.stats("drawn"), operator.stats("states")
     operator.until(lambda: operator.stats("drawn") > drawn + 5)
     assert operator.stats("states") > states
@@ -152,8 +152,8 @@ KEYS = [
 ]
 
 
-def test_keys_steer_while_they_are_held(operator: Operator):
-    operator.take()
+def test_keys_jog_while_they_are_held(operator: Operator):
+    operator.take_control()
     for keys, direction in KEYS:
         for key in keys:
             operator.page.keyboard.down(key)
@@ -165,7 +165,7 @@ def test_keys_steer_while_they_are_held(operator: Operator):
 
 
 def test_the_slider_sets_the_speed_and_takes_its_own_arrow_keys(operator: Operator):
-    operator.take()
+    operator.take_control()
     operator.page.focus("#speed")
     for _ in range(10):
         operator.page.keyboard.press("ArrowRight")
@@ -176,8 +176,8 @@ def test_the_slider_sets_the_speed_and_takes_its_own_arrow_keys(operator: Operat
     operator.last((0.0, 0.004))
 
 
-def test_a_gamepads_stick_steers_once_it_has_been_let_go(operator: Operator):
-    operator.take()
+def test_gamepad_stick_jogs_after_it_was_centred(operator: Operator):
+    operator.take_control()
     pad = "navigator.getGamepads = () => [{{connected: true, axes: [{}, {}]}}]"
     operator.page.evaluate(pad.format(0.0, -1.0))
     operator.nothing_more()  # it was pushed already when it came
@@ -192,8 +192,8 @@ def test_a_gamepads_stick_steers_once_it_has_been_let_go(operator: Operator):
     operator.nothing_more()
 
 
-def test_the_mouse_leads_the_needle_on_a_leash(operator: Operator):
-    operator.take()
+def test_dragging_from_the_needle_jogs(operator: Operator):
+    operator.take_control()
     needle = operator.served.graph.shown["needle"]
     tip = needle_axis(thread()[0], needle["heading"], 0.007, 0.0, np.array([1.0]))[0][0]
     box = operator.page.locator("#dish").bounding_box()
@@ -220,8 +220,8 @@ def test_the_mouse_leads_the_needle_on_a_leash(operator: Operator):
     assert operator.served.graph.last == REST
 
 
-def test_a_key_that_is_held_as_focus_goes_has_to_be_pressed_anew(operator: Operator):
-    operator.take()
+def test_key_held_while_focus_is_lost_must_be_pressed_again(operator: Operator):
+    operator.take_control()
     for lost in ("blur", "offline", "pagehide"):
         operator.page.keyboard.down("ArrowRight")
         operator.last((0.003, 0.0))
@@ -237,8 +237,8 @@ def test_a_key_that_is_held_as_focus_goes_has_to_be_pressed_anew(operator: Opera
     operator.page.context.set_offline(False)
 
 
-def test_a_hidden_tab_stops_the_needle_and_may_be_relieved(operator: Operator):
-    operator.take()
+def test_hidden_tab_stops_the_needle_and_loses_control(operator: Operator):
+    operator.take_control()
     operator.page.keyboard.down("ArrowRight")
     operator.last((0.003, 0.0))
     hide = "Object.defineProperty(document, '{}', {{value: {}, configurable: true}})"
@@ -246,20 +246,20 @@ def test_a_hidden_tab_stops_the_needle_and_may_be_relieved(operator: Operator):
     operator.page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
     operator.last(REST)
     assert operator.served.graph.velocities.count(REST) == 1
-    operator.until(lambda: operator.served.server._steering.available)
+    operator.until(lambda: operator.served.server._jog.available)
 
 
 def test_space_stops_everything_wherever_the_focus_is(operator: Operator):
-    operator.take()
+    operator.take_control()
     operator.page.keyboard.down("ArrowRight")
     operator.last((0.003, 0.0))
-    operator.page.focus("#take")
+    operator.page.focus("#control")
     operator.page.keyboard.press("Space")
     operator.until(lambda: operator.served.graph.actions == ["stop"])
     assert operator.served.graph.last == REST
     expect(operator.page.locator("#headline")).to_have_text("Emergency stop is pressed")
     expect(operator.page.locator("#coils")).to_have_text("emergency stop")
-    expect(operator.page.locator("#steers")).to_have_text("you steer")  # the button in focus was not pressed
+    expect(operator.page.locator("#holder")).to_have_text("you have control")  # the button in focus was not pressed
     count = len(operator.served.graph.commands)
     operator.page.click("#reset")
     operator.page.click("#arm")
@@ -271,28 +271,28 @@ def test_space_stops_everything_wherever_the_focus_is(operator: Operator):
     operator.last((0.003, 0.0))
 
 
-def test_a_torn_connection_stops_the_needle_and_steering_is_not_resumed(operator: Operator):
-    operator.take()
+def test_lost_connection_stops_the_needle_and_control_is_not_resumed(operator: Operator):
+    operator.take_control()
     operator.page.keyboard.down("ArrowRight")
     operator.last((0.003, 0.0))
     operator.served.tear()
     operator.last(REST)
     expect(operator.page.locator("#link")).to_contain_text("Connected as page 2")
-    expect(operator.page.locator("#steers")).to_have_text("nobody steers")
-    operator.take()
+    expect(operator.page.locator("#holder")).to_have_text("no page has control")
+    operator.take_control()
     operator.nothing_more()
     operator.page.keyboard.up("ArrowRight")
     operator.page.keyboard.down("ArrowRight")
     operator.last((0.003, 0.0))
 
 
-def test_a_server_that_is_gone_is_said(operator: Operator):
-    operator.take()
+def test_lost_server_is_shown(operator: Operator):
+    operator.take_control()
     operator.served.run(operator.served.server.stop())
     expect(operator.page.locator("#headline")).to_contain_text("Not connected")
-    expect(operator.page.locator("#take")).to_be_disabled()
+    expect(operator.page.locator("#control")).to_be_disabled()
     operator.page.keyboard.press("Space")
-    expect(operator.page.locator("#notice")).to_contain_text("the emergency stop did not go out")
+    expect(operator.page.locator("#notice")).to_contain_text("the emergency stop was not sent")
     expect(operator.page.locator("#dish")).to_have_attribute("data-friction", "old")
     operator.complaints.clear()  # the browser says of each try that nobody is there
 
@@ -306,7 +306,7 @@ def test_colours_tell_the_friction(operator: Operator):
     seen = []
     for count in (1, 4, 8):
         graph.shown = state("sliding", count)
-        expect(operator.page.locator("#friction")).to_contain_text(f"pulled: {count} node")
+        expect(operator.page.locator("#friction")).to_contain_text(f"sliding: {count} node")
         expect(operator.page.locator("#friction")).to_contain_text(f"{0.9**count:.2f}")
         seen.append(operator.drawn("sliding"))
         operator.until(lambda: seen[-1] in operator.colours_at(at))
@@ -333,31 +333,31 @@ def test_nodes_are_coloured_by_their_clearance(operator: Operator):
     assert "#12a150" in operator.colours_at(points[2], 1)
 
 
-def test_a_second_page_watches_and_takes_over_when_it_is_handed_back(browser: Browser, operator: Operator):
-    operator.take()
+def test_second_page_takes_control_after_its_release(browser: Browser, operator: Operator):
+    operator.take_control()
     context = browser.new_context(viewport=LAPTOP)
     other = Operator(context.new_page(), operator.served)
-    expect(other.page.locator("#steers")).to_have_text("page 1 steers")
-    expect(other.page.locator("#take")).to_be_disabled()
+    expect(other.page.locator("#holder")).to_have_text("page 1 has control")
+    expect(other.page.locator("#control")).to_be_disabled()
     expect(other.page.locator("#stop")).to_be_enabled()
     other.page.keyboard.down("ArrowRight")
     seen = other.stats("states")
     other.until(lambda: other.stats("states") > seen + 5)
     assert operator.served.graph.commands == []
     other.page.keyboard.up("ArrowRight")
-    operator.page.click("#take")
-    other.take()
-    expect(operator.page.locator("#steers")).to_have_text("page 2 steers")
+    operator.page.click("#control")
+    other.take_control()
+    expect(operator.page.locator("#holder")).to_have_text("page 2 has control")
     assert other.complaints == []
     context.close()
-    expect(operator.page.locator("#steers")).to_have_text("nobody steers")
+    expect(operator.page.locator("#holder")).to_have_text("no page has control")
 
 
 def test_without_the_token_every_control_is_off(browser: Browser, served: ServedConsole):
     context = browser.new_context(viewport=LAPTOP)
     watcher = Operator(context.new_page(), served, token=False)
-    expect(watcher.page.locator("#how")).to_contain_text("only watches")
-    for control in ("stop", "arm", "disarm", "reset", "take", "pause", "record", "scenario"):
+    expect(watcher.page.locator("#hint")).to_contain_text("only watches")
+    for control in ("stop", "arm", "disarm", "reset", "control", "pause", "record", "setup"):
         expect(watcher.page.locator(f"#{control}")).to_be_disabled()
     watcher.page.keyboard.press("Space")
     expect(watcher.page.locator("#notice")).to_contain_text("only watches")
@@ -366,24 +366,28 @@ def test_without_the_token_every_control_is_off(browser: Browser, served: Served
     context.close()
 
 
-def test_scenario_pause_and_record_reach_the_host(operator: Operator):
+def test_setup_pause_and_record_reach_the_host(operator: Operator):
     expect(operator.page.locator("#pause")).to_be_disabled()
-    operator.take()
-    operator.page.select_option("#scenario", "petri_35mm_polyamide")
-    operator.until(lambda: operator.served.host.shown["scenario"] == "petri_35mm_polyamide")
+    operator.take_control()
+    operator.page.select_option("#setup", "petri_35mm_polyamide")
+    operator.until(lambda: operator.served.host.shown["setup"] == "petri_35mm_polyamide")
     operator.page.click("#pause")
-    expect(operator.page.locator("#headline")).to_have_text("Paused: time stands still")
+    expect(operator.page.locator("#headline")).to_have_text("Paused")
     operator.page.click("#pause")
     operator.page.click("#record")
     expect(operator.page.locator("#recording")).to_contain_text("output/console/take_1")
     operator.page.click("#record")
-    operator.until(lambda: len(operator.served.host.asked) == 5)
-    assert operator.served.host.asked == [
-        ("choose", "petri_35mm_polyamide"), ("pause", True), ("pause", False), ("record", True), ("record", False),
-    ]  # fmt: skip
+    operator.until(lambda: len(operator.served.host.requests) == 5)
+    assert operator.served.host.requests == [
+        ("select_setup", "petri_35mm_polyamide"),
+        ("pause", True),
+        ("pause", False),
+        ("record", True),
+        ("record", False),
+    ]
 
 
-WHY = [
+HEADLINES = [
     ("bridge", {"armed": False, "reasons": ["disarmed"]}, "Disarmed: press Arm"),
     ("bridge", {"state": "inactive"}, "Coil bridge is inactive"),
     ("bridge", {"state": "fault", "armed": False, "reasons": ["coil 2 is stuck"]}, "Fault: coil 2 is stuck"),
@@ -391,33 +395,33 @@ WHY = [
     ("bridge", {"age": 4.0}, "Coil bridge silent for 4"),
     ("tracker", {"state": "lost", "reason": "no needle in sight"}, "Needle lost: no needle in sight"),
     ("needle", {"age": 2.0}, "No needle pose for 2"),
-    ("filter", {"commanded": [0.003, 0.0], "reason": "no prediction"}, "The needle rests: no prediction"),
-    ("filter", {"commanded": [0.003, 0.0], "active": ["ring"]}, "The needle rests: held by ring"),
+    ("filter", {"commanded": [0.003, 0.0], "reason": "no prediction"}, "At rest: no prediction"),
+    ("filter", {"commanded": [0.003, 0.0], "active": ["ring"]}, "At rest: stopped by ring"),
     ("bridge", {"filtered": [0.003, 0.0], "applied": [0.0021, 0.0]}, "Moving at 2.1 mm/s"),
 ]
 
 
-def test_the_page_says_why_the_needle_rests(operator: Operator):
+def test_headline_shows_why_the_needle_rests(operator: Operator):
     headline = operator.page.locator("#headline")
-    for part, changes, said in WHY:
+    for part, changes, said in HEADLINES:
         operator.served.graph.shown = state()
         operator.served.graph.shown[part].update(changes)
         expect(headline).to_contain_text(said)
 
 
-def test_what_is_silent_and_what_was_never_heard_is_said(operator: Operator):
+def test_silent_and_missing_nodes_are_shown(operator: Operator):
     shown = operator.served.graph.shown
     shown["nodes"]["thread_model"]["age"] = 9.0
     row = operator.page.locator("#nodes li", has_text="thread model")
     expect(row).to_contain_text("silent")
-    expect(row).to_contain_text("nothing for 9")
+    expect(row).to_contain_text("no data for 9")
     expect(row).to_have_class("stale")
     for part in ("needle", "tracker", "predicted", "margins", "filter", "bridge"):
         shown[part] = None
-    shown.update(seen=[], obstacles=[], nodes={})
-    expect(operator.page.locator("#headline")).to_have_text("Nothing heard from the coil bridge yet")
-    expect(operator.page.locator("#friction")).to_have_text("nothing predicted yet")
-    expect(operator.page.locator("#seeing")).to_contain_text("No camera image yet")
+    shown.update(measured=[], obstacles=[], nodes={})
+    expect(operator.page.locator("#headline")).to_have_text("No data from the coil bridge yet")
+    expect(operator.page.locator("#friction")).to_have_text("no prediction yet")
+    expect(operator.page.locator("#vision")).to_contain_text("No camera image yet")
 
 
 def test_nothing_is_cut_off(operator: Operator):

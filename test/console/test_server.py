@@ -1,4 +1,4 @@
-"""The server, with a client that is no browser and may lie: who gets in, what is told, what is refused."""
+"""The server, with a client that may be hostile: access, states and rejected messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from test.console.scene import RecordingGraph, RecordingHost, picture
-from test.console.visitor import EAST, NORTH, REST, SLOWEST, TOKEN, Console, Page, run, until
+from test.console.visitor import EAST, NORTH, REST, TOKEN, WAIT_TIMEOUT, Console, Page, run, until
 
 
 def test_the_page_is_served_whole_and_lets_nothing_else_in():
@@ -87,22 +87,22 @@ def test_a_port_that_is_taken_is_said():
 def test_without_the_token_one_watches_and_nothing_else(token: str):
     async def test(here: Console) -> None:
         page = await here.page(token)
-        assert page.of("welcome")[0]["commands"] is False
-        await page.say(type="take")
-        await page.hold(1, 0)
+        assert page.of("welcome")[0]["can_command"] is False
+        await page.send(type="acquire_control")
+        await page.jog(1, 0)
         for word in (
-            {"type": "act", "action": "stop"},
-            {"type": "act", "action": "arm"},
-            {"type": "choose", "scenario": "hernia_ring"},
-            {"type": "pause", "still": True},
-            {"type": "record", "on": True},
+            {"type": "bridge_action", "action": "stop"},
+            {"type": "bridge_action", "action": "arm"},
+            {"type": "select_setup", "setup": "hernia_ring"},
+            {"type": "pause", "paused": True},
+            {"type": "record", "recording": True},
             {"type": "hello", "token": TOKEN},
         ):
-            await page.say(**word)
+            await page.send(**word)
         await until(lambda: len(page.of("error")) == 8 and page.lease)
         assert page.lease["holder"] is None
         assert page.of("state")[-1]["graph"]["needle"]
-        assert (here.graph.commands, here.graph.actions, here.host.asked) == ([], [], [])
+        assert (here.graph.commands, here.graph.actions, here.host.requests) == ([], [], [])
 
     run(test)
 
@@ -110,8 +110,8 @@ def test_without_the_token_one_watches_and_nothing_else(token: str):
 def test_who_says_nothing_first_or_something_else_is_cut_off():
     async def test(here: Console) -> None:
         socket = await here.connect()
-        await socket.send_str('{"type": "take"}')
-        assert (await socket.receive(timeout=SLOWEST)).type is aiohttp.WSMsgType.CLOSE
+        await socket.send_str('{"type": "acquire_control"}')
+        assert (await socket.receive(timeout=WAIT_TIMEOUT)).type is aiohttp.WSMsgType.CLOSE
 
     run(test)
 
@@ -119,26 +119,26 @@ def test_who_says_nothing_first_or_something_else_is_cut_off():
 def test_a_refusal_is_told():
     async def test(here: Console) -> None:
         page = await here.page()
-        await page.take()
+        await page.acquire_control()
         here.graph.refusal = "arm: got emergency stop, expected a reset before"
-        await page.say(type="act", action="arm")
-        await page.say(type="choose", scenario="nowhere")
-        await until(lambda: len(page.of("done")) == 3)
-        refusals = {entry["what"]: entry["refusal"] for entry in page.of("done")}
-        assert refusals == {"take": "", "arm": here.graph.refusal, "choose": "no scenario nowhere"}
+        await page.send(type="bridge_action", action="arm")
+        await page.send(type="select_setup", setup="nowhere")
+        await until(lambda: len(page.of("result")) == 3)
+        refusals = {entry["request"]: entry["refusal"] for entry in page.of("result")}
+        assert refusals == {"acquire_control": "", "arm": here.graph.refusal, "select_setup": "no setup nowhere"}
 
     run(test)
 
 
-def test_the_host_is_told_what_the_one_who_steers_asks_for():
+def test_requests_of_the_page_with_control_reach_the_host():
     async def test(here: Console) -> None:
         page = await here.page()
-        await page.take()
-        await page.say(type="choose", scenario="petri_35mm_polyamide")
-        await page.say(type="pause", still=True)
-        await page.say(type="record", on=True)
-        await until(lambda: len(here.host.asked) == 3)
-        assert here.host.asked == [("choose", "petri_35mm_polyamide"), ("pause", True), ("record", True)]
+        await page.acquire_control()
+        await page.send(type="select_setup", setup="petri_35mm_polyamide")
+        await page.send(type="pause", paused=True)
+        await page.send(type="record", recording=True)
+        await until(lambda: len(here.host.requests) == 3)
+        assert here.host.requests == [("select_setup", "petri_35mm_polyamide"), ("pause", True), ("record", True)]
         await until(lambda: page.of("state")[-1]["host"]["recording"] != "")
 
     run(test)
@@ -147,18 +147,18 @@ def test_the_host_is_told_what_the_one_who_steers_asks_for():
 @pytest.mark.parametrize(
     "hostile",
     [
-        "", "nonsense", "[" * 3000, '{"type": "hold", "direction": [NaN, 0], "speed": 1, "sent": 1}',
-        '{"type": "hold", "direction": [1e999, 0], "speed": 1, "sent": 1}', '{"type": "hold", "direction": "left"}',
-        json.dumps({"type": "release", "ballast": "x" * 5000}), b"\x00\x01\x02",
+        "", "nonsense", "[" * 3000, '{"type": "jog", "direction": [NaN, 0], "speed": 1, "sent": 1}',
+        '{"type": "jog", "direction": [1e999, 0], "speed": 1, "sent": 1}', '{"type": "jog", "direction": "left"}',
+        json.dumps({"type": "end_jog", "ballast": "x" * 5000}), b"\x00\x01\x02",
     ],
 )  # fmt: skip
-def test_a_hostile_message_is_refused_and_counts_as_a_release(hostile: str | bytes):
+def test_hostile_message_is_rejected_and_interrupts_the_jog(hostile: str | bytes):
     async def test(here: Console) -> None:
-        page = await here.steering()
+        page = await here.jogging_page()
         await (page.socket.send_bytes if isinstance(hostile, bytes) else page.socket.send_str)(hostile)
         await until(lambda: page.of("error"))
         assert here.graph.last == REST
-        await page.hold(0, 1)
+        await page.jog(0, 1)
         await until(lambda: here.graph.last == NORTH)
 
     run(test, hold_timeout=1.0)
@@ -166,7 +166,7 @@ def test_a_hostile_message_is_refused_and_counts_as_a_release(hostile: str | byt
 
 def test_a_huge_message_ends_the_connection_and_the_movement():
     async def test(here: Console) -> None:
-        page = await here.steering()
+        page = await here.jogging_page()
         with contextlib.suppress(ConnectionError):
             await page.socket.send_str("x" * 10_000_000)
         await until(lambda: here.graph.last == REST)
@@ -179,9 +179,9 @@ def test_a_huge_message_ends_the_connection_and_the_movement():
 def test_a_flood_of_messages_is_refused():
     async def test(here: Console) -> None:
         page = await here.page()
-        await page.take()
+        await page.acquire_control()
         for _ in range(1500):
-            await page.say(type="release")
+            await page.send(type="end_jog")
         await until(lambda: any("in a second" in entry["text"] for entry in page.of("error")))
 
     run(test)
@@ -190,26 +190,26 @@ def test_a_flood_of_messages_is_refused():
 def test_an_emergency_stop_comes_through_a_flood_which_ends_the_connection():
     async def test(here: Console) -> None:
         page = await here.page()
-        await page.take()
+        await page.acquire_control()
         for _ in range(1200):
-            await page.say(type="release")
-        await page.say(type="act", action="stop")
+            await page.send(type="end_jog")
+        await page.send(type="bridge_action", action="stop")
         await until(lambda: here.graph.actions == ["stop"])
         with contextlib.suppress(ConnectionError):
             for _ in range(20_000):
                 if page.socket.closed:
                     break
-                await page.say(type="release")
+                await page.send(type="end_jog")
         await until(lambda: page.socket.closed and not here.server._clients)
 
     run(test)
 
 
-def test_a_page_that_says_nothing_of_what_it_got_gets_two_states_and_no_more():
+def test_page_without_acknowledgements_gets_two_states():
     async def test(here: Console) -> None:
         slow = Page(await here.connect())
         slow.answers = False
-        await slow.say(type="hello", token="")
+        await slow.send(type="hello", token="")
         quick = await here.page()
         for number in range(1, 30):
             here.graph.picture = (number, picture())
@@ -218,7 +218,7 @@ def test_a_page_that_says_nothing_of_what_it_got_gets_two_states_and_no_more():
         assert len(slow.of("state")) == 2
         assert len(slow.frames) == 2
         slow.answers = True
-        await slow.say(type="got", what="frame")
+        await slow.send(type="acknowledge", kind="frame")
         await until(lambda: len(slow.frames) == 3)
         assert int.from_bytes(slow.frames[-1][:8], "big") == 29
 
@@ -230,11 +230,11 @@ def test_a_page_that_stops_reading_does_not_delay_the_others():
         stuck = await here.page()
         stuck.socket._conn.transport.pause_reading()
         quick = await here.page()
-        await quick.take()
+        await quick.acquire_control()
         for number in range(1, 200):
             here.graph.picture = (number, picture() * 20)
             await asyncio.sleep(0)
-        await quick.hold(1, 0)
+        await quick.jog(1, 0)
         await until(lambda: here.graph.last == EAST)
         states = len(quick.of("state"))
         await until(lambda: len(quick.of("state")) > states + 10)
@@ -268,9 +268,9 @@ def test_numbers_that_are_not_finite_reach_the_page_as_null():
     run(test)
 
 
-def test_the_end_of_the_server_steers_to_rest_first():
+def test_stopping_the_server_stops_the_needle_first():
     async def test(here: Console) -> None:
-        page = await here.steering()
+        page = await here.jogging_page()
         stopping = asyncio.create_task(here.server.stop())
         await asyncio.sleep(0)
         assert here.graph.last == REST  # before any connection has ended
@@ -281,7 +281,7 @@ def test_the_end_of_the_server_steers_to_rest_first():
     run(test, hold_timeout=1.0)
 
 
-def test_what_ends_the_telling_is_raised_at_the_end():
+def test_what_ends_the_broadcast_task_is_raised_at_the_end():
     class Broken(RecordingGraph):
         def state(self) -> dict[str, Any]:
             raise RuntimeError("no state")
@@ -291,7 +291,7 @@ def test_what_ends_the_telling_is_raised_at_the_end():
         url = (await server.start()).split("#")[0]
         async with aiohttp.ClientSession() as session:
             socket = await session.ws_connect(url + "socket")
-            await until(lambda: server._telling is not None and server._telling.done())
+            await until(lambda: server._broadcast_task is not None and server._broadcast_task.done())
             with pytest.raises(RuntimeError, match="no state"):
                 await server.stop()
             await socket.close()

@@ -16,14 +16,14 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from test.console.scene import RecordingGraph, RecordingHost
 
 TOKEN = "a-token-of-the-tests"
-SLOWEST = 10.0  # [s]
+WAIT_TIMEOUT = 10.0  # [s]
 REST = (0.0, 0.0)
 EAST, NORTH = (0.003, 0.0), (0.0, 0.003)  # what a page asks for that holds a direction [m/s]
 
 
 async def until(condition: Callable[[], Any]) -> Any:
     """Wait until a condition holds, and return what it gave."""
-    end = time.monotonic() + SLOWEST
+    end = time.monotonic() + WAIT_TIMEOUT
     while not (result := condition()):
         assert time.monotonic() < end, "the condition has not come true"
         await asyncio.sleep(0.002)
@@ -31,11 +31,11 @@ async def until(condition: Callable[[], Any]) -> Any:
 
 
 class Page:
-    """A connected client, and what it was told."""
+    """A connected client, and the messages that it received."""
 
     def __init__(self, socket: Any) -> None:
         self.socket = socket  # an aiohttp.ClientWebSocketResponse
-        self.told: list[dict[str, Any]] = []
+        self.received: list[dict[str, Any]] = []
         self.frames: list[bytes] = []
         self.number = 0
         self.answers = True
@@ -48,28 +48,28 @@ class Page:
                 self.frames.append(message.data)
                 what = "frame"
             else:
-                self.told.append(json.loads(message.data))
-                if self.told[-1]["type"] != "state":
+                self.received.append(json.loads(message.data))
+                if self.received[-1]["type"] != "state":
                     continue
             if self.answers:
                 with contextlib.suppress(ConnectionError):
-                    await self.say(type="got", what=what)
+                    await self.send(type="acknowledge", kind=what)
 
-    async def say(self, **word: Any) -> None:
+    async def send(self, **message: Any) -> None:
         """Send a message."""
-        await self.socket.send_str(json.dumps(word))
+        await self.socket.send_str(json.dumps(message))
 
-    async def hold(self, x: float, y: float, speed: float = 0.003, sent: float | None = None) -> None:
-        """Say that a direction is held, now."""
-        await self.say(type="hold", direction=[x, y], speed=speed, sent=time.monotonic() if sent is None else sent)
+    async def jog(self, x: float, y: float, speed: float = 0.003, sent: float | None = None) -> None:
+        """Send a jog message."""
+        await self.send(type="jog", direction=[x, y], speed=speed, sent=time.monotonic() if sent is None else sent)
 
     def tear(self) -> None:
         """End the TCP connection without a word."""
         self.socket._conn.transport.abort()
 
     def of(self, kind: str) -> list[dict[str, Any]]:
-        """Return what was told of a kind."""
-        return [message for message in self.told if message["type"] == kind]
+        """Return the received messages of a type."""
+        return [message for message in self.received if message["type"] == kind]
 
     async def pictures(self, count: int) -> None:
         """Wait until so many frames have come."""
@@ -77,13 +77,13 @@ class Page:
 
     @property
     def lease(self) -> dict[str, Any]:
-        """Who steers, as last told."""
+        """The control lease of the last state."""
         states = self.of("state")
         return states[-1]["lease"] if states else {}
 
-    async def take(self) -> None:
-        """Take steering, and see that everybody is told."""
-        await self.say(type="take")
+    async def acquire_control(self) -> None:
+        """Acquire control, and wait for the state that shows it."""
+        await self.send(type="acquire_control")
         await until(lambda: self.lease.get("holder") == self.number)
 
 
@@ -106,15 +106,15 @@ class Console:
     async def page(self, token: str = TOKEN, **options: Any) -> Page:
         """Connect a page and greet."""
         page = Page(await self.connect(**options))
-        await page.say(type="hello", token=token)
-        page.number = (await until(lambda: page.of("welcome")))[0]["you"]
+        await page.send(type="hello", token=token)
+        page.number = (await until(lambda: page.of("welcome")))[0]["client"]
         return page
 
-    async def steering(self) -> Page:
-        """Connect a page that steers to the east."""
+    async def jogging_page(self) -> Page:
+        """Connect a page that jogs to the east."""
         page = await self.page()
-        await page.take()
-        await page.hold(1, 0)
+        await page.acquire_control()
+        await page.jog(1, 0)
         await until(lambda: self.graph.last == EAST)
         return page
 

@@ -99,17 +99,17 @@ class Page:
         self.graph: dict[str, Any] = {}
         self.host: dict[str, Any] = {}
 
-    async def say(self, kind: str, **fields: Any) -> None:
-        """Say a word."""
-        await self._socket.send_str(json.dumps({"type": kind, **fields}))
+    async def send(self, message_type: str, **fields: Any) -> None:
+        """Send a message."""
+        await self._socket.send_str(json.dumps({"type": message_type, **fields}))
 
-    async def ask(self, kind: str, **fields: Any) -> str:
+    async def ask(self, message_type: str, **fields: Any) -> str:
         """Ask for something and return the refusal, empty if it was done."""
-        await self.say(kind, **fields)
+        await self.send(message_type, **fields)
         try:
             answer = await asyncio.wait_for(self._answers.get(), WAIT)
         except asyncio.TimeoutError:
-            raise AssertionError(f"no answer to {kind} {fields}; {self.errors[-5:]}") from None
+            raise AssertionError(f"no answer to {message_type} {fields}; {self.errors[-5:]}") from None
         return str(answer["refusal"])
 
     def hold(self, direction: tuple[float, float], speed: float) -> None:
@@ -117,7 +117,7 @@ class Page:
 
         async def again_and_again() -> None:
             while True:
-                await self.say("hold", direction=list(direction), speed=speed, sent=time.monotonic())
+                await self.send("jog", direction=list(direction), speed=speed, sent=time.monotonic())
                 await asyncio.sleep(0.02)
 
         self._held = asyncio.create_task(again_and_again())
@@ -127,7 +127,7 @@ class Page:
         if self._held is not None:
             self._held.cancel()
             await asyncio.gather(self._held, return_exceptions=True)
-        await self.say("release")
+        await self.send("end_jog")
 
     async def until(self, condition: Callable[[], Any], what: str) -> None:
         """Wait until the page is told something."""
@@ -143,14 +143,14 @@ class Page:
         async for message in self._socket:
             if message.type is aiohttp.WSMsgType.BINARY:
                 self.frames += 1
-                await self.say("got", what="frame")
+                await self.send("acknowledge", kind="frame")
                 continue
             told = json.loads(message.data)
             if told["type"] == "state":
                 self.graph, self.host = told["graph"], told["host"]
                 self.busy.add(self.host["busy"])
-                await self.say("got", what="state")
-            elif told["type"] == "done":
+                await self.send("acknowledge", kind="state")
+            elif told["type"] == "result":
                 self._answers.put_nowait(told)
             elif told["type"] == "error":
                 self.errors.append(told["text"])
@@ -163,7 +163,7 @@ async def opened(url: str) -> Any:
     address, token = url.split("/#token=")
     async with aiohttp.ClientSession() as session, session.ws_connect(f"{address}/socket") as socket:
         page = Page(socket)
-        await page.say("hello", token=token)
+        await page.send("hello", token=token)
         listening = asyncio.create_task(page.listen())
         try:
             yield page
@@ -196,28 +196,28 @@ async def steer_and_stop(page: Page, currents: Inbox, recordings: Path) -> None:
     await page.until(lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "the graph")
     assert page.host["mode"] == "simulated"
     assert page.host["simulated"]
-    assert OTHER in page.host["scenarios"]
+    assert OTHER in page.host["setups"]
     assert not page.graph["bridge"]["armed"]
-    assert await page.ask("take") == ""
-    assert await page.ask("record", on=True) == ""
+    assert await page.ask("acquire_control") == ""
+    assert await page.ask("record", recording=True) == ""
     await page.until(lambda: page.host["recording"], "the recording")
-    assert await page.ask("act", action="arm") == ""
+    assert await page.ask("bridge_action", action="arm") == ""
     before = tail(page)
     page.hold((1.0, 0.0), 0.005)
     await page.until(lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
     assert abs(tail(page)[1] - before[1]) < 1e-3
     await page.until(lambda: any(page.graph["bridge"]["current"]), "currents")
     assert page.graph["filter"]["commanded"] == [0.005, 0.0]
-    assert await page.ask("pause", still=True) == ""
+    assert await page.ask("pause", paused=True) == ""
     await page.until(lambda: page.host["paused"] and page.graph["needle"]["age"] > 0.5, "no poses any more")
     await page.until(lambda: not any(page.graph["bridge"]["current"]), "no currents without poses")
     await page.let_go()
-    assert await page.ask("pause", still=False) == ""
+    assert await page.ask("pause", paused=False) == ""
     await page.until(lambda: page.graph["needle"]["age"] < 0.5, "poses again")
     await page.let_go()  # what was held before counts no more
     page.hold((1.0, 0.0), 0.003)
     await page.until(lambda: any(page.graph["bridge"]["current"]), "currents again")
-    assert await page.ask("act", action="stop") == ""
+    assert await page.ask("bridge_action", action="stop") == ""
     await page.until(lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
     await page.let_go()
     list(currents.take())
@@ -229,12 +229,12 @@ async def steer_and_stop(page: Page, currents: Inbox, recordings: Path) -> None:
 
     await page.until(enough, "currents on the wire")
     assert not any(any(one.current) for one in heard)
-    assert await page.ask("record", on=False) == ""
+    assert await page.ask("record", recording=False) == ""
     check(next(recordings.iterdir()))
-    assert "expected one of" in await page.ask("choose", scenario="../../etc/passwd.yaml")
+    assert "expected one of" in await page.ask("select_setup", setup="../../etc/passwd.yaml")
     await record_a_second(page)
-    assert await page.ask("choose", scenario=OTHER) == ""
-    await page.until(lambda: page.host["scenario"] == OTHER, "the other scenario to begin")
+    assert await page.ask("select_setup", setup=OTHER) == ""
+    await page.until(lambda: page.host["setup"] == OTHER, "the other scenario to begin")
     assert not page.host["recording"]
     await page.until(lambda: not page.host["busy"] and page.graph["predicted"], "the other scenario")
     assert f"starting {OTHER}" in page.busy
@@ -245,7 +245,7 @@ async def steer_and_stop(page: Page, currents: Inbox, recordings: Path) -> None:
 
 async def record_a_second(page: Page) -> None:
     """Begin a recording, and let it run for a second of the graph's time."""
-    assert await page.ask("record", on=True) == ""
+    assert await page.ask("record", recording=True) == ""
     began = page.graph["time"]
     await page.until(lambda: page.host["recording"] and page.graph["time"] > began + 1.0, "a second")
 
@@ -254,7 +254,7 @@ def check(path: Path) -> Bag:
     """Check that a recording is whole and holds what was steered."""
     bag = Bag(path)
     assert bag.damage is None
-    assert "steered by a person" in bag.notes["simulated"]
+    assert "jogged by an operator" in bag.notes["simulated"]
     assert "thread_model" in bag.notes["scenario"]
     for name in ("/operator/servo_cv", "/needle/filter_state", "/camera/image_raw/compressed", "/scene"):
         assert bag.counts[name] > 0, name
@@ -294,17 +294,17 @@ def test_a_person_watches_a_bag():
             assert page.host["mode"] == "replay"
             assert page.host["can_pause"]
             assert not page.host["can_record"]
-            assert await page.ask("take") == ""
-            assert "nothing steers it" in await page.ask("act", action="arm")
-            assert "nothing steers it" in page.graph["filter"]["reason"]
+            assert await page.ask("acquire_control") == ""
+            assert "nothing can be jogged" in await page.ask("bridge_action", action="arm")
+            assert "nothing can be jogged" in page.graph["filter"]["reason"]
             before = page.graph["time"]
             await page.until(lambda: page.graph["time"] > before, "time to go on")
-            assert await page.ask("pause", still=True) == ""
+            assert await page.ask("pause", paused=True) == ""
             await page.until(lambda: page.graph["predicted"]["age"] > 0.5, "time to stand still")
             still = page.graph["time"]
             await page.until(lambda: page.graph["predicted"]["age"] > 1.0, "time to stand still for longer")
             assert page.graph["time"] == still
-            assert await page.ask("pause", still=False) == ""
+            assert await page.ask("pause", paused=False) == ""
             await page.until(lambda: page.graph["time"] > still, "time to go on again")
 
     with running("--replay", str(EXAMPLE)) as console:
@@ -320,12 +320,12 @@ def test_a_graph_that_runs_is_joined_and_recorded(tmp_path: Path):
             assert page.host["mode"] == "graph"
             assert not page.host["simulated"]
             assert not page.host["can_pause"]
-            assert await page.ask("take") == ""
-            assert "run by others" in await page.ask("choose", scenario=OTHER)
-            assert await page.ask("record", on=True) == ""
-            assert await page.ask("act", action="arm") == ""
+            assert await page.ask("acquire_control") == ""
+            assert "not started from the page" in await page.ask("select_setup", setup=OTHER)
+            assert await page.ask("record", recording=True) == ""
+            assert await page.ask("bridge_action", action="arm") == ""
             await page.until(lambda: page.graph["bridge"]["armed"], "the bridge to be armed")
-            assert await page.ask("act", action="stop") == ""
+            assert await page.ask("bridge_action", action="stop") == ""
             await page.until(lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
 
     with reserved_domain() as domain:

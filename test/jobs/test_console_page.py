@@ -142,7 +142,7 @@ def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path)
 
     pilot.at_speed(SPEED)
     pilot.follow(PATH)
-    pilot.follow(AROUND, lambda: pilot.shown("friction") == "sliding" and "Slowed to" in page.inner_text("#why"))
+    pilot.follow(AROUND, lambda: pilot.shown("friction") == "sliding" and "Slowed to" in page.inner_text("#status"))
     count, red, green, blue = bench.colour_of_thread()
     assert count > 50
     assert red > green > blue  # orange

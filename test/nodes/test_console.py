@@ -22,7 +22,7 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.jobs.console_hosts import SimulatedHost
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.nodes import console_graph, console_switches, topics
+from magnetosuture_thread.nodes import console_graph, console_services, topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console_graph import ConsoleGraph
 from magnetosuture_thread.nodes.console_host import GraphHost, joined
@@ -51,7 +51,7 @@ def console(node: Node) -> ConsoleGraph:
 
 def act(console: ConsoleGraph, action: str) -> str:
     """Press a switch."""
-    return asyncio.run(console.act(action))
+    return asyncio.run(console.execute_action(action))
 
 
 def bridge(console: ConsoleGraph) -> dict:
@@ -74,7 +74,7 @@ def test_a_wish_is_published_at_once_with_a_stamp_of_now(graph, console):
     before = graph.probe.get_clock().now().nanoseconds
 
     def heard() -> bool:
-        console.steer((0.003, -0.001))
+        console.publish_velocity((0.003, -0.001))
         return bool(wishes)
 
     graph.wait(heard, "the wish")
@@ -105,9 +105,9 @@ def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
 
 def test_a_stop_waits_for_no_other_action_and_ends_one_that_waits(graph, console):
     async def both() -> tuple[str, str]:
-        arming = asyncio.create_task(console.act("arm"))  # nobody is there to answer
+        arming = asyncio.create_task(console.execute_action("arm"))  # nobody is there to answer
         await asyncio.sleep(0)
-        stopping = asyncio.create_task(console.act("stop"))
+        stopping = asyncio.create_task(console.execute_action("stop"))
         await asyncio.sleep(0.05)
         assert arming.done()
         assert not stopping.done()
@@ -115,34 +115,34 @@ def test_a_stop_waits_for_no_other_action_and_ends_one_that_waits(graph, console
         return await arming, await stopping
 
     armed, stopped = asyncio.run(both())
-    assert "meanwhile" in armed
+    assert "later action" in armed
     assert stopped == ""
     graph.wait(lambda: bridge(console).get("emergency_stopped", False), "the emergency stop")
     assert not bridge(console)["armed"]
 
 
 def test_a_switch_that_nobody_offers_is_refused_in_words(console, monkeypatch):
-    monkeypatch.setattr(console_switches, "TIMEOUT", 0.1)
-    assert act(console, "arm") == "nobody offers coils/arm within 0.1 s"
+    monkeypatch.setattr(console_services, "TIMEOUT", 0.1)
+    assert act(console, "arm") == "no service coils/arm within 0.1 s"
 
 
-def test_a_held_graph_is_told_nothing_but_a_stop(graph, console):
+def test_blocked_graph_accepts_only_a_stop(graph, console):
     graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
     wishes = graph.listen(topics.OPERATOR_COMMAND)
 
     def heard(speed: float) -> bool:
-        console.steer((speed, 0.0))
+        console.publish_velocity((speed, 0.0))
         return bool(wishes) and wishes[-1].twist.linear.x == speed
 
     graph.wait(lambda: heard(0.001), "a wish")
-    console.held = "starting petri"
+    console.blocked = "starting petri"
     assert act(console, "arm") == "starting petri"
-    console.steer((0.003, 0.0))
+    console.publish_velocity((0.003, 0.0))
     assert console.state()["filter"]["reason"] == "starting petri"
-    console.held = ""
+    console.blocked = ""
     graph.wait(lambda: heard(0.002), "another wish")
     assert {wish.twist.linear.x for wish in wishes} == {0.001, 0.002}
-    console.held = "starting petri"
+    console.blocked = "starting petri"
     assert act(console, "stop") == ""
     graph.wait(lambda: bridge(console).get("emergency_stopped", False), "the emergency stop")
 
@@ -157,19 +157,19 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     margins = no_margins(stamp, "no pose")
     tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
-    tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["seen"], "the seen thread")
+    tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["measured"], "the seen thread")
     tell(graph, topics.MARGINS, margins, lambda: console.state()["margins"], "the margins")
     state = console.state()
     assert state["needle"]["tail"] == [0.003, -0.004]
     assert state["needle"]["heading"] == pytest.approx(np.pi / 2)
     assert 0.0 <= state["needle"]["age"] < 60.0
-    assert state["seen"] == [[0.0, 0.0], [0.001, 0.0]]
+    assert state["measured"] == [[0.0, 0.0], [0.001, 0.0]]
     assert state["margins"]["reason"] == "no pose"
     assert state["scene"]["dish_diameter"] == 0.035
     assert [shape["disc"] for shape in state["scene"]["shapes"]] == [[0.0077, 0.0039, 0.0015]]
     console.begin(ConsoleSettings(scene="dish_150mm"))
     state = console.state()
-    assert (state["needle"], state["seen"]) == (None, [])
+    assert (state["needle"], state["measured"]) == (None, [])
     graph.wait(lambda: len(console.state()["scene"]["shapes"]) == 1, "what is said once and for all")
 
 
@@ -191,11 +191,11 @@ def test_a_node_that_says_no_more_is_silent(graph, console, monkeypatch):
     graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")
     assert console.nodes()["coil_bridge"]["level"] == "ok"
     assert console.nodes()["coil_bridge"]["values"]["driver"] == "recording"
-    assert console.says("coil_bridge")
-    monkeypatch.setattr(console_graph, "SILENT", 0.3)
+    assert console.is_active("coil_bridge")
+    monkeypatch.setattr(console_graph, "NODE_TIMEOUT", 0.3)
     graph.remove(node)
     graph.wait(lambda: console.nodes()["coil_bridge"]["level"] == "silent", "silence")
-    assert not console.says("coil_bridge")
+    assert not console.is_active("coil_bridge")
 
 
 @pytest.mark.parametrize("transport", ["compressed", "raw"])
@@ -228,7 +228,7 @@ def test_with_a_simulated_clock_wishes_are_stamped_by_it(graph):
         graph.wait(lambda: console.state()["time"] > 1.0, "/clock")
 
         def heard() -> bool:
-            console.steer((0.001, 0.0))
+            console.publish_velocity((0.001, 0.0))
             return bool(wishes)
 
         graph.wait(heard, "a wish")
@@ -238,17 +238,17 @@ def test_with_a_simulated_clock_wishes_are_stamped_by_it(graph):
 def test_a_rig_is_paused_where_there_is_one(graph, console):
     host = GraphHost(console)
     assert not host.state()["can_pause"]
-    assert "nothing in this graph" in asyncio.run(host.pause(True))
+    assert "no node of this graph" in asyncio.run(host.set_paused(True))
     rig = graph.add(RigSimulatorNode, **SMALL)
     graph.wait(lambda: host.state()["can_pause"] and host.state()["simulated"], "the rig")
-    assert asyncio.run(host.pause(True)) == ""
+    assert asyncio.run(host.set_paused(True)) == ""
     assert host.state()["paused"]
     assert rig.time.paused
-    assert asyncio.run(host.pause(False)) == ""
+    assert asyncio.run(host.set_paused(False)) == ""
     assert not host.state()["paused"]
     assert not rig.time.paused
-    assert "run by others" in asyncio.run(host.choose("petri_150mm_silk"))
-    assert "--graph" in asyncio.run(host.record(True))
+    assert "not started from the page" in asyncio.run(host.select_setup("petri_150mm_silk"))
+    assert "--graph" in asyncio.run(host.set_recording(True))
 
 
 def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: Path):
@@ -261,10 +261,10 @@ def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: 
         (tmp_path / f"{name}.yaml").write_text(text)
     paths = {name: str(tmp_path / f"{name}.yaml") for name in unusable}
     host = SimulatedHost(console, "hernia_ring", list(paths.values()), {}, tmp_path, tmp_path, lambda words: None)
-    host._hold("")  # as once all its nodes are there
+    host._block("")  # as once all its nodes are there
     for name, (_, words) in unusable.items():
-        assert words in asyncio.run(host.choose(paths[name]))
-        assert host.state()["scenario"] == "hernia_ring"
+        assert words in asyncio.run(host.select_setup(paths[name]))
+        assert host.state()["setup"] == "hernia_ring"
         assert host.busy == ""
 
 
@@ -275,7 +275,7 @@ def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_t
     tap = ConsoleTap(node, [topics.SCENE, topics.CURRENTS], None, lambda *message: taken.append(message))
 
     def taken_both() -> bool:
-        tap.look()
+        tap.poll()
         return {topic for topic, _, _ in taken} == {"/scene", "/coils/currents"}
 
     try:

@@ -3,7 +3,7 @@
 export const FREE = "#12a150";
 export const STUCK = "#2f6bff";
 export const GREY = "#7d8790";
-export const SEEN = "rgba(47, 123, 255, 0.40)";
+export const MEASURED = "rgba(47, 123, 255, 0.40)";
 export const VELOCITY = "#7a3fc0";
 export const NEAR = "#d1122f";
 export const MIDDLING = "#f08c00";

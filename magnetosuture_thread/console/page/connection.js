@@ -1,12 +1,12 @@
-// The WebSocket to the server: connects again after a drop, more and more patiently; steering is never resumed.
+// WebSocket to the server: reconnects with backoff; control is never resumed.
 
-const FIRST_WAIT = 250; // [ms]
-const LONGEST_WAIT = 4000;
+const MIN_RECONNECT_DELAY = 250; // [ms]
+const MAX_RECONNECT_DELAY = 4000;
 
 export class Connection {
   constructor(handlers) {
     this.handlers = handlers;
-    this.wait = FIRST_WAIT;
+    this.delay = MIN_RECONNECT_DELAY;
     this.socket = null;
     this.token = new URLSearchParams(location.hash.slice(1)).get("token") ?? "";
     this.timer = 0;
@@ -22,16 +22,16 @@ export class Connection {
       this.handlers.opened();
     };
     socket.onmessage = ({ data }) => {
-      this.wait = FIRST_WAIT;
-      if (typeof data === "string") this.handlers.said(JSON.parse(data));
+      this.delay = MIN_RECONNECT_DELAY;
+      if (typeof data === "string") this.handlers.received(JSON.parse(data));
       else this.handlers.frame(data);
     };
     socket.onclose = ({ reason }) => {
       if (this.socket !== socket) return;
       this.socket = null;
-      this.timer = setTimeout(() => this.open(), this.wait);
+      this.timer = setTimeout(() => this.open(), this.delay);
       this.handlers.closed(reason);
-      this.wait = Math.min(2 * this.wait, LONGEST_WAIT);
+      this.delay = Math.min(2 * this.delay, MAX_RECONNECT_DELAY);
     };
   }
 
@@ -39,7 +39,7 @@ export class Connection {
     return this.socket !== null && this.socket.readyState === WebSocket.OPEN;
   }
 
-  // Send a message; return whether it went out.
+  // Send a message; return whether it was sent.
   send(message) {
     if (!this.isOpen) return false;
     this.socket.send(JSON.stringify(message));

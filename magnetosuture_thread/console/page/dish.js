@@ -2,7 +2,7 @@
 // data-friction (free, sliding, stuck, unknown, invalid, old, none), data-colour of the predicted thread,
 // data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
-import { GREY, MIDDLING, SEEN, VELOCITY, nodeLook, onGround, threadLook } from "./colours.js";
+import { GREY, MIDDLING, MEASURED, VELOCITY, nodeLook, onGround, threadLook } from "./colours.js";
 import { Placement, needleArc } from "./geometry.js";
 import { drawShapes } from "./shapes.js";
 
@@ -28,7 +28,7 @@ export class Dish {
     return needleArc(graph.needle, graph.needle_length, graph.needle_curvature).map((point) => this.placement.at(point));
   }
 
-  draw(graph, { since, leash, maxSpeed }) {
+  draw(graph, { since, drag, maxSpeed }) {
     const { canvas, context } = this;
     const ratio = devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -51,12 +51,12 @@ export class Dish {
     const look = threadLook(graph?.predicted, graph?.margins, since);
     const tip = graph?.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop().join(",") : "";
     if (graph) {
-      this.#line(graph.seen ?? [], 12, SEEN);
+      this.#line(graph.measured ?? [], 12, MEASURED);
       this.#drawPredicted(graph, look);
       this.#drawNeedle(graph, since);
       this.#drawVelocities(graph, since, maxSpeed);
     }
-    if (leash) this.#drawLeash(leash);
+    if (drag) this.#drawDrag(drag);
     this.#drawScaleBar(width, height);
     Object.assign(canvas.dataset, {
       friction: look.state, colour: look.colour, image: shown ? "yes" : "no", tip,
@@ -204,7 +204,7 @@ export class Dish {
     this.#head(to, Math.atan2(down, right), 8 + width, this.velocity);
   }
 
-  #drawLeash({ from, to }) {
+  #drawDrag({ from, to }) {
     const { context } = this;
     context.setLineDash([2, 5]);
     context.beginPath();

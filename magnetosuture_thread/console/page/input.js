@@ -1,68 +1,68 @@
-// What the operator holds: keys, a gamepad's stick, or the mouse on a leash. All of it is dropped at once when the page
-// loses focus, is hidden, or the mouse leaves; what was held then has to be pressed anew.
+// Jog input: keys, a gamepad's stick, or dragging from the needle. All of it is cleared when the page loses focus, is
+// hidden, or the mouse leaves; keys that were held then must be pressed again.
 
 const KEYS = {
   ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0],
   KeyW: [0, 1], KeyS: [0, -1], KeyA: [-1, 0], KeyD: [1, 0],
 };
 const DEAD_ZONE = 0.15; // of a stick
-const LEASH = 90; // [px] a longer one is not faster
-const SHORTEST_LEASH = 8; // [px]
-const GRIP = 36; // [px] from the needle
+const MAX_DRAG = 90; // [px] a longer drag is not faster
+const MIN_DRAG = 8; // [px]
+const GRIP_RADIUS = 36; // [px] around the needle
 
 const typing = (target) => target instanceof Element && target.closest("input, select, textarea") !== null;
 
 export class Input {
-  // changed() is called when something else is held; stop() when Space is pressed; needle() gives points in pixels of the page.
+  // changed() is called when the input changes, stop() when Space is pressed; needle() returns points in pixels of the page.
   constructor(canvas, { changed, stop, needle }) {
     this.pressed = new Set();
-    this.pointer = null; // [px] while the leash is held
+    this.pointer = null; // [px] during a drag
     this.stick = [0, 0];
-    this.stickRested = false; // a stick must have been let go once before it steers
+    this.stickCentred = false; // a stick must be centred once before it jogs
     this.changed = changed;
     this.needle = needle;
     addEventListener("keydown", (event) => this.#down(event, stop), true);
     addEventListener("keyup", (event) => this.#up(event), true);
-    addEventListener("blur", () => this.drop());
-    addEventListener("pagehide", () => this.drop());
-    addEventListener("offline", () => this.drop());
-    addEventListener("gamepaddisconnected", () => this.drop());
-    document.addEventListener("visibilitychange", () => document.hidden && this.drop());
-    canvas.addEventListener("pointerdown", (event) => this.#grip(event));
-    canvas.addEventListener("pointermove", (event) => this.#pull(event));
-    for (const end of ["pointerup", "pointerleave", "pointercancel"]) canvas.addEventListener(end, () => this.#letGo());
+    addEventListener("blur", () => this.clear());
+    addEventListener("pagehide", () => this.clear());
+    addEventListener("offline", () => this.clear());
+    addEventListener("gamepaddisconnected", () => this.clear());
+    document.addEventListener("visibilitychange", () => document.hidden && this.clear());
+    canvas.addEventListener("pointerdown", (event) => this.#startDrag(event));
+    canvas.addEventListener("pointermove", (event) => this.#updateDrag(event));
+    for (const end of ["pointerup", "pointerleave", "pointercancel"]) canvas.addEventListener(end, () => this.#endDrag());
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   }
 
-  drop() {
+  clear() {
     this.pressed.clear();
     this.pointer = null;
     this.stick = [0, 0];
-    this.stickRested = false;
+    this.stickCentred = false;
     this.changed();
   }
 
-  // Look at the gamepad, which tells nothing by itself.
+  // Poll the gamepad, which sends no events.
   poll() {
     if (!document.hasFocus() || document.hidden) return;
     const pad = [...(navigator.getGamepads?.() ?? [])].find((entry) => entry?.connected && entry.axes.length >= 2);
     const [x, y] = pad ? [pad.axes[0], -pad.axes[1]] : [0, 0];
     const size = Math.hypot(x, y);
     if (!pad) {
-      this.stickRested = false;
+      this.stickCentred = false;
       this.stick = [0, 0];
     } else if (size <= DEAD_ZONE) {
-      this.stickRested = true;
+      this.stickCentred = true;
       this.stick = [0, 0];
-    } else if (this.stickRested) {
+    } else if (this.stickCentred) {
       const share = Math.min(1, (size - DEAD_ZONE) / (1 - DEAD_ZONE)) / size;
       this.stick = [x * share, y * share];
     }
   }
 
-  // Direction that is held, no longer than 1.
+  // Jog direction, of length 1 at most.
   direction() {
-    if (this.pointer) return this.leash()?.direction ?? [0, 0];
+    if (this.pointer) return this.drag()?.direction ?? [0, 0];
     let [x, y] = [0, 0];
     for (const code of this.pressed) {
       x += Math.sign(KEYS[code][0]);
@@ -73,14 +73,14 @@ export class Input {
     return this.stick;
   }
 
-  // The leash from the needle's tip to the mouse [px], and the direction that it asks for; null without one.
-  leash() {
+  // The drag from the needle's tip to the mouse [px], and its jog direction; null without one.
+  drag() {
     const points = this.pointer ? this.needle() : null;
     if (!points) return null;
     const tip = points[points.length - 1];
     const [right, down] = [this.pointer[0] - tip[0], this.pointer[1] - tip[1]];
     const size = Math.hypot(right, down);
-    const share = size < SHORTEST_LEASH ? 0 : Math.min(1, size / LEASH) / size;
+    const share = size < MIN_DRAG ? 0 : Math.min(1, size / MAX_DRAG) / size;
     return { from: tip, to: this.pointer, direction: [right * share, -down * share] };
   }
 
@@ -102,22 +102,22 @@ export class Input {
     if (this.pressed.delete(event.code)) this.changed();
   }
 
-  #grip(event) {
+  #startDrag(event) {
     const at = [event.offsetX, event.offsetY];
     const points = this.needle();
-    const near = points?.some(([x, y]) => Math.hypot(x - at[0], y - at[1]) <= GRIP);
+    const near = points?.some(([x, y]) => Math.hypot(x - at[0], y - at[1]) <= GRIP_RADIUS);
     if (event.button !== 0 || !near) return;
     this.pointer = at;
     this.changed();
   }
 
-  #pull(event) {
+  #updateDrag(event) {
     if (!this.pointer) return;
-    if (!(event.buttons & 1)) this.#letGo();
+    if (!(event.buttons & 1)) this.#endDrag();
     else this.pointer = [event.offsetX, event.offsetY];
   }
 
-  #letGo() {
+  #endDrag() {
     if (!this.pointer) return;
     this.pointer = null;
     this.changed();

@@ -1,17 +1,17 @@
-// The operator's page: ties the connection, what is held, the drawing and the panel together.
+// Operator page: connects the WebSocket, the jog input, the drawing and the panel.
 
 import { Connection } from "./connection.js";
 import { Dish } from "./dish.js";
 import { Input } from "./input.js";
 import { showPanel } from "./panel.js";
 import { Plots } from "./plots.js";
-import { SILENT } from "./why.js";
+import { SILENCE_TIMEOUT } from "./status.js";
 
-const BEAT = 30; // [ms] between two words while something is held
-const PANEL = 100; // [ms] between two looks at the panel
-const PLOTS = 250; // [ms] between two drawings of the plots
-const BETWEEN = 0.06; // [s] after a state; without the next, a camera frame is drawn by itself
-const NOTICE = 7000; // [ms]
+const JOG_PERIOD = 30; // [ms] between two jog messages
+const PANEL_PERIOD = 100; // [ms]
+const PLOT_PERIOD = 250; // [ms]
+const FRAME_DELAY = 0.06; // [s] after a state, after which a camera frame is drawn without waiting for the next
+const NOTICE_TIME = 7000; // [ms]
 
 const stats = { fps: 0, drawn: 0, states: 0, frames: 0, errors: 0 };
 window.console_stats = stats;
@@ -22,49 +22,49 @@ const find = (id) => document.getElementById(id);
 const clock = () => performance.now() / 1000;
 
 const state = {
-  link: "connecting", problem: "", graph: null, host: null, lease: null, heard: 0, me: null, commands: false,
-  speed: 0.003, maxSpeed: 0.01, adjusted: false, sending: false, stopped: false,
+  link: "connecting", problem: "", graph: null, host: null, lease: null, received: 0, client: null, canCommand: false,
+  speed: 0.003, maxSpeed: 0.01, adjusted: false, jogging: false, stopped: false,
 };
 const dish = new Dish(find("dish"));
 const plots = new Plots(document);
 const input = new Input(find("dish"), {
-  changed: () => beat(), stop: () => emergencyStop(), needle: () => dish.needlePoints(state.graph),
+  changed: () => sendJog(), stop: () => emergencyStop(), needle: () => dish.needlePoints(state.graph),
 });
-const connection = new Connection({ opened, closed, said, frame });
+const connection = new Connection({ opened, closed, received, frame });
 
-const since = () => (state.graph ? clock() - state.heard : 0);
-const mine = () => state.link === "open" && state.commands && state.me !== null && state.lease?.holder === state.me;
+const since = () => (state.graph ? clock() - state.received : 0);
+const hasControl = () => state.link === "open" && state.canCommand && state.client !== null && state.lease?.holder === state.client;
 
 function opened() {
-  Object.assign(state, { link: "open", problem: "", me: null });
+  Object.assign(state, { link: "open", problem: "", client: null });
   drawSoon();
-  connection.send({ type: "visible", seen: !document.hidden });
+  connection.send({ type: "visibility", visible: !document.hidden });
 }
 
 function closed(reason) {
-  Object.assign(state, { link: "closed", problem: reason, lease: null, me: null, sending: false });
+  Object.assign(state, { link: "closed", problem: reason, lease: null, client: null, jogging: false });
   drawSoon();
-  input.drop();
+  input.clear();
 }
 
-function said(message) {
+function received(message) {
   if (message.type === "state") return newState(message);
   if (message.type === "welcome") {
-    Object.assign(state, { me: message.you, commands: message.commands, maxSpeed: message.max_speed });
+    Object.assign(state, { client: message.client, canCommand: message.can_command, maxSpeed: message.max_speed });
     if (!state.adjusted) setSpeed(message.speed);
     if (message.refusal) notice(message.refusal);
   } else if (message.type === "error") notice(message.text);
-  else if (message.type === "done" && message.refusal) notice(`${message.what}: ${message.refusal}`);
+  else if (message.type === "result" && message.refusal) notice(`${message.request}: ${message.refusal}`);
 }
 
 function newState(message) {
-  connection.send({ type: "got", what: "state" });
+  connection.send({ type: "acknowledge", kind: "state" });
   stats.states += 1;
-  Object.assign(state, { graph: message.graph, host: message.host, lease: message.lease, heard: clock() });
+  Object.assign(state, { graph: message.graph, host: message.host, lease: message.lease, received: clock() });
   drawSoon();
-  plots.add(message.graph, state.heard);
+  plots.add(message.graph, state.received);
   const stopped = Boolean(message.graph.bridge?.emergency_stopped);
-  if (stopped && !state.stopped) input.drop();
+  if (stopped && !state.stopped) input.clear();
   state.stopped = stopped;
 }
 
@@ -74,28 +74,28 @@ async function frame(buffer) {
     dish.image?.close();
     dish.image = image;
     stats.frames += 1;
-    if (since() > BETWEEN) drawSoon(); // else the next state draws it
+    if (since() > FRAME_DELAY) drawSoon(); // else the next state draws it
   } catch {
     stats.errors += 1;
     notice("A camera frame could not be read");
   }
-  connection.send({ type: "got", what: "frame" });
+  connection.send({ type: "acknowledge", kind: "frame" });
 }
 
-// Say what is held; once, when nothing is held any more.
-function beat() {
-  const [x, y] = mine() && since() <= SILENT ? input.direction() : [0, 0];
+// Send the jog that is held, and its end once.
+function sendJog() {
+  const [x, y] = hasControl() && since() <= SILENCE_TIMEOUT ? input.direction() : [0, 0];
   if (x || y) {
-    state.sending = connection.send({ type: "hold", direction: [x, y], speed: state.speed, sent: clock() });
-  } else if (state.sending) {
-    state.sending = false;
-    connection.send({ type: "release" });
+    state.jogging = connection.send({ type: "jog", direction: [x, y], speed: state.speed, sent: clock() });
+  } else if (state.jogging) {
+    state.jogging = false;
+    connection.send({ type: "end_jog" });
   }
 }
 
 function emergencyStop() {
-  input.drop();
-  if (!connection.send({ type: "act", action: "stop" })) notice("Not connected: the emergency stop did not go out. Use the one on the rig.");
+  input.clear();
+  if (!connection.send({ type: "bridge_action", action: "stop" })) notice("Not connected: the emergency stop was not sent. Use the one on the rig.");
 }
 
 let noticeTimer = 0;
@@ -104,7 +104,7 @@ function notice(text) {
   if (element.textContent !== text) element.textContent = text;
   element.hidden = false;
   clearTimeout(noticeTimer);
-  noticeTimer = setTimeout(() => (element.hidden = true), NOTICE);
+  noticeTimer = setTimeout(() => (element.hidden = true), NOTICE_TIME);
 }
 
 function setSpeed(speed) {
@@ -113,69 +113,69 @@ function setSpeed(speed) {
   find("speed").value = String(state.speed * 1e3);
 }
 
-const ask = (id, message) => find(id).addEventListener("click", () => connection.send(message()));
+const request = (id, message) => find(id).addEventListener("click", () => connection.send(message()));
 find("stop").addEventListener("click", emergencyStop);
-for (const action of ["arm", "disarm", "reset"]) ask(action, () => ({ type: "act", action }));
-ask("take", () => {
-  input.drop();
-  return { type: mine() ? "hand_back" : "take" };
+for (const action of ["arm", "disarm", "reset"]) request(action, () => ({ type: "bridge_action", action }));
+request("control", () => {
+  input.clear();
+  return { type: hasControl() ? "release_control" : "acquire_control" };
 });
-ask("pause", () => ({ type: "pause", still: !state.host.paused }));
-ask("record", () => ({ type: "record", on: !state.host.recording }));
-find("scenario").addEventListener("change", ({ target }) => {
-  connection.send({ type: "choose", scenario: target.value });
-  target.blur(); // arrow keys steer again
+request("pause", () => ({ type: "pause", paused: !state.host.paused }));
+request("record", () => ({ type: "record", recording: !state.host.recording }));
+find("setup").addEventListener("change", ({ target }) => {
+  connection.send({ type: "select_setup", setup: target.value });
+  target.blur(); // arrow keys jog again
 });
 find("speed").addEventListener("input", ({ target }) => {
   state.adjusted = true;
   state.speed = Number(target.value) / 1e3;
 });
 find("speed").addEventListener("pointerup", ({ target }) => target.blur());
-document.addEventListener("visibilitychange", () => connection.send({ type: "visible", seen: !document.hidden }));
+document.addEventListener("visibilitychange", () => connection.send({ type: "visibility", visible: !document.hidden }));
 addEventListener("resize", drawSoon);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   drawSoon();
   plots.draw();
 });
 
-let asked = false;
+let scheduled = false;
 function drawSoon() {
-  if (!asked) requestAnimationFrame(draw);
-  asked = true;
+  if (!scheduled) requestAnimationFrame(draw);
+  scheduled = true;
 }
 
 function draw() {
-  asked = false;
+  scheduled = false;
   stats.drawn += 1;
-  dish.draw(state.graph, { since: since(), leash: mine() ? input.leash() : null, maxSpeed: state.maxSpeed });
+  dish.draw(state.graph, { since: since(), drag: hasControl() ? input.drag() : null, maxSpeed: state.maxSpeed });
 }
 
 let counted = { at: clock(), drawn: 0 };
-function look() {
+function update() {
   const now = clock();
   if (now - counted.at >= 1) {
     stats.fps = Math.round((stats.drawn - counted.drawn) / (now - counted.at));
     counted = { at: now, drawn: stats.drawn };
   }
-  if (state.graph && since() > SILENT) {
-    input.drop(); // nobody steers blind
+  if (state.graph && since() > SILENCE_TIMEOUT) {
+    input.clear(); // no jogging without a current state
     drawSoon();
   }
   document.body.dataset.link = state.link;
   showPanel({
     link: state.link, open: state.link === "open", problem: state.problem, since: since(), graph: state.graph, host: state.host,
-    lease: state.lease, me: state.me, mine: mine(), commands: state.commands, held: state.sending, hasImage: dish.image !== null,
+    lease: state.lease, client: state.client, hasControl: hasControl(), canCommand: state.canCommand, jogging: state.jogging, hasImage: dish.image !== null,
     fps: stats.fps, speed: state.speed, maxSpeed: state.maxSpeed,
   });
 }
 
 setInterval(() => {
   input.poll();
-  beat();
+  sendJog();
   if (input.pointer) drawSoon();
-}, BEAT);
-setInterval(look, PANEL);
-setInterval(() => plots.draw(), PLOTS);
+}, JOG_PERIOD);
+setInterval(update, PANEL_PERIOD);
+setInterval(() => plots.draw(), PLOT_PERIOD);
 connection.open();
-look();
+update();
 drawSoon();

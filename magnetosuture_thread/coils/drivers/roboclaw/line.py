@@ -35,12 +35,7 @@ class LineThread:
     """
 
     def __init__(
-        self,
-        number: int,
-        path: str,
-        boards: dict[int, int],
-        settings: CoilBridgeSettings,
-        mailbox: Mailbox,
+        self, number: int, path: str, boards: dict[int, int], settings: CoilBridgeSettings, mailbox: Mailbox
     ) -> None:
         self._number, self._path, self._addresses, self._settings = number, path, boards, settings
         self._mailbox = mailbox

@@ -46,15 +46,7 @@ SETTING_QUERIES = (Query.TIMEOUT, Query.LIMIT_1, Query.LIMIT_2)
 POLL_SEQUENCE = tuple(
     query
     for setting in SETTING_QUERIES
-    for query in (
-        Query.DUTIES,
-        Query.CURRENTS,
-        Query.STATUS,
-        Query.DUTIES,
-        Query.CURRENTS,
-        Query.VOLTAGES,
-        setting,
-    )
+    for query in (Query.DUTIES, Query.CURRENTS, Query.STATUS, Query.DUTIES, Query.CURRENTS, Query.VOLTAGES, setting)
 )
 
 
