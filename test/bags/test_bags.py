@@ -76,7 +76,9 @@ def test_own_messages_are_known(tmp_path: Path):
         for name in ("PredictedThread", "SafetyMargins", "CoilCurrents", "BarrierMargin"):
             bag.add_topic(f"/{name}", f"magnetosuture_msgs/msg/{name}")
         types = typestore().types
-        bag.write_message("/BarrierMargin", 5, types["magnetosuture_msgs/msg/BarrierMargin"](2, 7, 1, 0.5, 0.25))
+        bag.write_message(
+            "/BarrierMargin", 5, types["magnetosuture_msgs/msg/BarrierMargin"]("obstacle", 7, 1, 0.5, 0.25)
+        )
     record = next(Bag(tmp_path / "own").records())
     assert record.type_name == "magnetosuture_msgs/msg/BarrierMargin"
     assert (record.decode().node, record.decode().clearance) == (7, 0.25)

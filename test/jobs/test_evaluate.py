@@ -236,7 +236,7 @@ def test_recorded_predictions_of_frames_that_nobody_asks_for_hide_none(monkeypat
         return Record("/thread/predicted", "", stamp, struct.pack("<4sIII", b"\0\1\0\0", seconds, rest, 0))
 
     points = [SimpleNamespace(x=0.0, y=0.0), SimpleNamespace(x=1.0, y=0.0)]
-    monkeypatch.setattr(Record, "decode", lambda self: SimpleNamespace(vertices=points))
+    monkeypatch.setattr(Record, "decode", lambda self: SimpleNamespace(positions=points))
     recording: Any = SimpleNamespace(
         counts={PREDICTED_THREAD.recorded: 1}, records=lambda *a, **n: (record(k * 10**6) for k in range(2000))
     )

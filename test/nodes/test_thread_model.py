@@ -155,7 +155,7 @@ def test_shapes_give_margins_and_contact(graph):
     margins = graph.listen(topics.MARGINS)
     graph.publish(topics.NEEDLE_POSE, pose(1.0))
     graph.wait(lambda: bool(margins), "margins")
-    assert margins[0].contact_state == SafetyMargins.CONTACT_TOUCHING
+    assert margins[0].contact_state == SafetyMargins.CONTACT_IN_CONTACT
     assert list(margins[0].contact_nodes) == [12]
     least = next(entry for entry in margins[0].minimum if entry.barrier == "obstacle")
     assert least.obstacle == 0
