@@ -67,6 +67,22 @@ def margins(clearance: float) -> Margins:
     return Margins((obstacle,), (3,) if clearance <= 0.0 else ())
 
 
+def test_a_barrier_of_a_user_has_a_column_and_a_minimum_like_the_others():
+    run = RunMetrics(1.0, 10**9)
+    line = np.column_stack([-np.linspace(0.0, 1.0, 9), np.zeros(9)])
+    tail, east = np.zeros(2), np.array([1.0, 0.0])
+    for k, clearance in enumerate((0.5, -0.1, 0.2), 1):
+        given = margins(1.0)
+        if k > 1:  # it comes while the run goes on
+            one = np.array([clearance])
+            own = BarrierMargins("tip_keep_in", np.array([4], np.uint32), np.array([-1], np.int32), one, one)
+            given = Margins((*given.barriers, own))
+        run.add(FrameResult.of(Observation(k * 10**9, tail, east, line), prediction(0.0), given, 1e-4))
+    assert run.series.column("margin_tip_keep_in") == pytest.approx([np.nan, -0.1, 0.2], nan_ok=True)
+    assert list(run.minimum_margins) == ["obstacle", "tip_keep_in"]
+    assert (run.minimum_margins["tip_keep_in"].clearance, run.minimum_margins["tip_keep_in"].node) == (-0.1, 4)
+
+
 def test_of_a_run_numbers_are_kept_and_the_worst_in_full(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "BATCH", 2)
     run = RunMetrics(1.0, 10**9)

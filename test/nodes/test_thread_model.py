@@ -22,6 +22,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene
+from test.examples import FOLDER
 from test.model.worlds import polygon, scene_with
 
 
@@ -184,6 +185,22 @@ def test_the_wall_of_the_dish_has_a_row_in_the_margins(graph):
     least = next(entry for entry in margins[0].minimum if entry.barrier == "wall")
     assert (least.node, least.obstacle) == (25, -1)
     assert least.clearance == pytest.approx(0.0175 - 0.016 - 30e-6, abs=1e-6)
+
+
+def test_a_barrier_of_ones_own_has_margins_on_the_topic(graph, tmp_path, monkeypatch: pytest.MonkeyPatch):
+    source = (FOLDER / "barriers/tip_keep_in.py").read_text()
+    (tmp_path / "barriers_of_a_laboratory.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    graph.add(ThreadModelNode, initial_shape="straight", barriers=["barriers_of_a_laboratory:TipKeepIn"])
+    margins = graph.listen(topics.MARGINS)
+    for k in range(3):
+        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, 0.0, 1e-4 * k))
+    graph.wait(lambda: len(margins) == 3, "margins")
+    assert margins[-1].valid
+    own = margins[-1].barrier_names.index("tip_keep_in")
+    assert [margins[-1].node[row] for row, barrier in enumerate(margins[-1].barrier) if barrier == own] == [25] * 4
+    least = next(entry for entry in margins[-1].minimum if entry.barrier == "tip_keep_in")
+    assert 0.0 < least.clearance < 1e-3
 
 
 def test_the_papers_formulation_runs_in_the_graph(graph):
