@@ -86,7 +86,7 @@ class FrictionLaw:
     beta: float
     stuck_speed: float
 
-    def judge(self, margins: Mapping[str, BarrierMargins], speeds: NDArray[np.float64]) -> Friction:
+    def classify(self, margins: Mapping[str, BarrierMargins], speeds: NDArray[np.float64]) -> Friction:
         """Return the friction of a thread.
 
         Args:

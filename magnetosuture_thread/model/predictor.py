@@ -68,7 +68,7 @@ class Prediction:
         residual: the largest scaled residual of the solves.
         converged: whether every step ended where the barriers themselves hold, not only their linearisations;
             if not, the margins are those of a thread that is not where the equations say.
-        judge: computes the margins.
+        compute_margins: of this prediction.
     """
 
     stamp: float
@@ -82,12 +82,12 @@ class Prediction:
     status: str
     residual: float
     converged: bool
-    judge: Callable[[], Margins] = field(repr=False, compare=False)
+    compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
 
     @cached_property
     def margins(self) -> Margins:
         """The margins of every barrier by its name, in SI units; computed when they are first asked for."""
-        return self.judge()
+        return self.compute_margins()
 
 
 class ThreadPredictor:
@@ -347,7 +347,7 @@ class ThreadPredictor:
         formulation.added.set_time(pose.stamp)
         added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
-        def judge() -> Margins:
+        def compute_margins() -> Margins:
             rows = [*formulation.margins(positions, pose.heading), *added]
             return Margins.of(rows, self._contact_tolerance, self._scene_version)
 
@@ -365,7 +365,7 @@ class ThreadPredictor:
             status=step.status if step else STARTED,
             residual=residuals.largest,
             converged=converged,
-            judge=judge,
+            compute_margins=compute_margins,
         )
 
 

@@ -53,7 +53,7 @@ class PredictionResult:
         if self.prediction is None or self.law is None or not self.prediction.converged:
             return None
         margins = self.prediction.margins
-        return margins.with_friction(self.law.judge(margins, self.speeds))
+        return margins.with_friction(self.law.classify(margins, self.speeds))
 
     @property
     def waiting(self) -> bool:

@@ -88,7 +88,7 @@ class ThreadModelNode(Node):
         except InvalidInputError as error:
             self._health.refuse(error)
             return
-        self._tell(outcome, time.perf_counter() - began)
+        self._report(outcome, time.perf_counter() - began)
 
     def on_measured_thread_message(self, data: bytes) -> None:
         """Keep the thread that the camera sees, to start from.
@@ -113,11 +113,11 @@ class ThreadModelNode(Node):
     def _start(self, stamp: int, centreline: np.ndarray) -> None:
         began = time.perf_counter()
         for outcome in self._session.on_measured_thread(stamp, centreline):
-            self._tell(outcome, time.perf_counter() - began)
+            self._report(outcome, time.perf_counter() - began)
             began = time.perf_counter()
 
-    def _tell(self, outcome: PredictionResult, step_time: float) -> None:
-        """Publish what came of a pose."""
+    def _report(self, outcome: PredictionResult, step_time: float) -> None:
+        """Publish the result of a pose, or why there is none."""
         if outcome.prediction is not None:
             self._publish(outcome, outcome.prediction, step_time)
         elif isinstance(outcome.problem, InvalidInputError):

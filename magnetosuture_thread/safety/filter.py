@@ -308,35 +308,33 @@ class NeedleSafetyFilter:
         return AddedRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
     def _checked_share(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[float, str]:
-        """Return the share of a velocity with which every added barrier holds at every check, and the one it is for.
+        """Return the share of a velocity with which every added barrier holds at every check, and what it is for."""
+        broken = self._broken(velocity, tail, heading)
+        if not broken:
+            return 1.0, ""
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if self._broken(middle * velocity, tail, heading) else (middle, high)
+        return low, broken
 
-        A barrier that is below 0 already may not get lower.
-        """
-        share, what = 1.0, ""
-        for barrier in self._barriers:
-            if self._holds(barrier, share * velocity, tail, heading):
-                continue
-            low, high = 0.0, share
-            for _ in range(BISECTIONS):
-                middle = 0.5 * (low + high)
-                low, high = (middle, high) if self._holds(barrier, middle * velocity, tail, heading) else (low, middle)
-            share, what = low, barrier.name
-        return share, what
-
-    def _holds(self, barrier: Barrier, velocity: Vector, tail: Vector, heading: Vector) -> bool:
-        """Return whether a barrier stays at 0 or above, or gets no lower, at the checks of a hold."""
+    def _broken(self, velocity: Vector, tail: Vector, heading: Vector) -> str:
+        """Return the first added barrier that gets below 0, or lower than it is, within the hold; empty for none."""
+        heading = heading / math.hypot(float(heading[0]), float(heading[1]))
         along, across = self.kinematics.body_velocity(heading, velocity)
-        barrier.set_time(self._time)
-        least = np.minimum(barrier.value(self._at(tail, heading).points), 0.0) - ROUNDING
-        for check in range(1, CHECKS + 1):
-            part = check / CHECKS * self.hold_time
-            barrier.set_time(self._time + part)
-            points = self._points_at(*self.kinematics.moved(tail, heading, along, across, part))
-            value = barrier.value(points)
-            # Where the number of rows changes with time, every one of them has to be safe.
-            if not (value >= (least if value.shape == least.shape else -ROUNDING)).all():
-                return False
-        return True
+        begin = self._at(tail, heading).points
+        times = [check / CHECKS * self.hold_time for check in range(1, CHECKS + 1)]
+        points = [self._points_at(*self.kinematics.moved(tail, heading, along, across, time)) for time in times]
+        for barrier in self._barriers:
+            barrier.set_time(self._time)
+            least = np.minimum(barrier.value(begin), 0.0) - ROUNDING
+            for time, where in zip(times, points, strict=True):
+                barrier.set_time(self._time + time)
+                value = barrier.value(where)
+                # Where the number of rows changes with time, every one of them has to be safe.
+                if not (value >= (least if value.shape == least.shape else -ROUNDING)).all():
+                    return barrier.name
+        return ""
 
     def _points_at(self, tail: Vector, heading: Vector) -> Vector:
         """Return the points that stand for the needle, from tail to tip, shape (m, 2) [m]."""

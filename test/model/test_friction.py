@@ -33,22 +33,22 @@ GATE = ((-3.5e-3, 1.9e-3, 1e-3), (-3.5e-3, -1.9e-3, 1e-3))
 
 
 def test_a_node_close_to_one_obstacle_is_free():
-    assert LAW.judge(barriers(GATE[0]), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
-    assert LAW.judge(barriers(), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
+    assert LAW.classify(barriers(GATE[0]), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
+    assert LAW.classify(barriers(), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
 
 
 def test_nodes_close_to_two_obstacles_slow_the_needle_while_pulled():
-    assert LAW.judge(barriers(*GATE), np.full(8, 1e-3)) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
+    assert LAW.classify(barriers(*GATE), np.full(8, 1e-3)) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
     third = (-3.5e-3, 1.85e-3, 1e-3)
-    assert LAW.judge(barriers(*GATE, third), np.full(8, 1e-3)).nodes == (3, 4)
+    assert LAW.classify(barriers(*GATE, third), np.full(8, 1e-3)).nodes == (3, 4)
 
 
 def test_who_moves_elsewhere_pulls_nothing():
     speeds = np.full(8, 1e-3)
     speeds[[3, 4]] = 2e-4
-    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.STUCK, (3, 4), 1.0)
+    assert LAW.classify(barriers(*GATE), speeds) == Friction(FrictionState.STUCK, (3, 4), 1.0)
     speeds[4] = 2.1e-4  # one is enough
-    assert LAW.judge(barriers(*GATE), speeds) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
+    assert LAW.classify(barriers(*GATE), speeds) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
 
 
 def test_the_threshold_is_of_the_clearance():
@@ -57,27 +57,27 @@ def test_the_threshold_is_of_the_clearance():
     near = float(avoided.clearance[avoided.node == 3].max())
     assert near == pytest.approx(np.hypot(0.5e-3, 1.9e-3) - 1e-3)
     for threshold, count in ((0.999 * near, 0), (1.001 * near, 2)):
-        assert len(FrictionLaw(threshold, 0.9, 0.0).judge(barriers(*GATE), np.ones(8)).nodes) == count
+        assert len(FrictionLaw(threshold, 0.9, 0.0).classify(barriers(*GATE), np.ones(8)).nodes) == count
 
 
 def test_a_node_at_the_threshold_itself_is_free():
     """Two rows of one node with the same clearance, as no roundings can be told apart in a scene."""
     node, near = np.array([[3], [3]]), np.full(2, 5e-4)
     margins = Margins.of([BarrierRows("obstacle", node, np.array([0, 1]), near, np.zeros((2, 1, 2)), near)], 0.0)
-    assert FrictionLaw(5e-4, 0.9, 0.0).judge(margins, np.ones(8)).state is FrictionState.FREE
-    assert FrictionLaw(np.nextafter(5e-4, 1.0), 0.9, 0.0).judge(margins, np.ones(8)).nodes == (3,)
+    assert FrictionLaw(5e-4, 0.9, 0.0).classify(margins, np.ones(8)).state is FrictionState.FREE
+    assert FrictionLaw(np.nextafter(5e-4, 1.0), 0.9, 0.0).classify(margins, np.ones(8)).nodes == (3,)
 
 
 def test_the_needle_itself_is_no_friction_of_the_thread():
     at_needle = ((0.0, 1.9e-3, 1e-3), (0.0, -1.9e-3, 1e-3))
-    assert LAW.judge(barriers(*at_needle), np.ones(8)).state is FrictionState.FREE
+    assert LAW.classify(barriers(*at_needle), np.ones(8)).state is FrictionState.FREE
 
 
 def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it():
     close = WallAvoidance(7.5e-3, 0.0, 5e-3).rows(NODES)
     assert (close.clearance < 1e-3).any()
     disc = (-7e-3, 1.5e-3, 1e-3)
-    assert LAW.judge(barriers(disc, others=(close,)), np.full(8, 1e-3)) == Friction(FrictionState.FREE, (), 1.0)
+    assert LAW.classify(barriers(disc, others=(close,)), np.full(8, 1e-3)) == Friction(FrictionState.FREE, (), 1.0)
 
 
 def test_speeds_are_averaged():
@@ -131,6 +131,6 @@ def test_colours_tell_the_state():
 
 @pytest.mark.parametrize("beta", [0.5, 0.9, 1.0])
 def test_each_node_counts_as_one_factor(beta: float):
-    slowed = FrictionLaw(2e-3, beta, 0.0).judge(barriers(*GATE), np.ones(8))
+    slowed = FrictionLaw(2e-3, beta, 0.0).classify(barriers(*GATE), np.ones(8))
     assert len(slowed.nodes) > 2
     assert slowed.slowdown == pytest.approx(beta ** len(slowed.nodes))

@@ -60,7 +60,6 @@ def driven(safety: NeedleSafetyFilter, seed: int, periods: int = 300) -> tuple[f
     random = np.random.default_rng(seed)
     tail, heading, least = np.array([-0.001, 0.0]), np.array([1.0, 0.0]), math.inf
     active: set[str] = set()
-    (barrier,) = safety._barriers
     for period in range(periods):
         if period % 5 == 0:
             angle = random.uniform(-math.pi, math.pi)
@@ -70,9 +69,10 @@ def driven(safety: NeedleSafetyFilter, seed: int, periods: int = 300) -> tuple[f
         active.update(found.active)
         along, across = safety.kinematics.body_velocity(heading, found.filtered)
         for part in np.linspace(0.0, 1.0, 33):
-            barrier.set_time(now + part * HOLD)
             points = safety._points_at(*safety.kinematics.moved(tail, heading, along, across, part * HOLD))
-            least = min(least, float(barrier.value(points).min()))
+            for barrier in safety._barriers:
+                barrier.set_time(now + part * HOLD)
+                least = min(least, float(barrier.value(points).min()))
         tail, heading = safety.kinematics.moved(tail, heading, along, across, HOLD)
     return least, active
 
@@ -84,6 +84,13 @@ def test_an_added_barrier_holds_whatever_is_commanded(barrier: Barrier, length: 
     # It is checked at 8 instants of a hold, and between two of them the arc of a needle bends by no more than this.
     assert least > -1e-6
     assert barrier.name in active
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_added_barriers_hold_together(seed: int):
+    least, active = driven(needle(HalfPlane(), TurnedAway()), seed)
+    assert least > -1e-6
+    assert active >= {"half_plane", "turned_away"}
 
 
 def test_a_needle_slides_along_an_added_barrier():
