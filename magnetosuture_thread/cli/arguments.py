@@ -73,9 +73,9 @@ def add_source(parser: argparse._ActionsContainer) -> None:
 
 def remap(text: str) -> tuple[str, str]:
     """Return a topic's name and its new one: an argument type."""
-    from magnetosuture_thread.jobs.bag import remapping
+    from magnetosuture_thread.jobs.bag import parse_remap
 
     try:
-        return remapping(text)
+        return parse_remap(text)
     except ConfigurationError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not {error.expectation}") from None

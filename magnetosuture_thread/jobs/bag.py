@@ -6,15 +6,15 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from magnetosuture_thread.bags.damage import counted
+from magnetosuture_thread.bags.damage_report import pluralize
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.remap import remapping
-from magnetosuture_thread.bags.repair import repair
-from magnetosuture_thread.bags.report import BagReport, report
+from magnetosuture_thread.bags.remap import parse_remap
+from magnetosuture_thread.bags.repair import write_repaired_bag
+from magnetosuture_thread.bags.report import BagReport, inspect_bag
 from magnetosuture_thread.interface import DISH_FRAME
 from magnetosuture_thread.jobs.output import whole_folder
 
-__all__ = ["BagReport", "check_bag", "remapping", "repair_bag"]
+__all__ = ["BagReport", "check_bag", "parse_remap", "repair_bag"]
 
 Say = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -39,7 +39,7 @@ def check_bag(
         BagError: nothing of it can be read, or there is no such topic to remap.
     """
     bag = Bag(path, remap=remap, progress=lambda share: progress(0.5 * share))
-    return report(bag, frame, lambda share: progress(0.5 + 0.5 * share))
+    return inspect_bag(bag, frame, lambda share: progress(0.5 + 0.5 * share))
 
 
 def repair_bag(
@@ -65,14 +65,14 @@ def repair_bag(
     bag = Bag(path, remap=remap, progress=lambda share: progress(0.5 * share))
     refused: Counter[str] = Counter()
     with whole_folder(output) as folder:
-        count = repair(bag, folder, output.name, refused, lambda share: progress(0.5 + 0.5 * share))
+        count = write_repaired_bag(bag, folder, output.name, refused, lambda share: progress(0.5 + 0.5 * share))
     if bag.damage is not None:
         say(str(bag.damage))
     elif not refused:
         say(bag.unchecked or "is not damaged: the new bag holds the same")
     for reason, lost in refused.items():
-        say(f"{reason}: {counted(lost, 'message')} lost")
-    for place in bag.damage.places if bag.damage is not None else ():
+        say(f"{reason}: {pluralize(lost, 'message')} lost")
+    for place in bag.damage.regions if bag.damage is not None else ():
         say(f"  {place}{_times(place.first, place.last, bag.start)}")
     return count
 

@@ -226,7 +226,7 @@ def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter
         start=recording.start,
         begin=given.start,
         duration=given.duration,
-        damage=tuple(str(place) for place in recording.damage.places) if recording.damage else (),
+        damage=tuple(str(place) for place in recording.damage.regions) if recording.damage else (),
         refused=dict(refused.most_common()),
         topics={
             channel.recorded: (channel.type_name, recording.counts[channel.recorded])

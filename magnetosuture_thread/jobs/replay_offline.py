@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SCENE, SEEN_THREAD, TRACKER_STATE
@@ -202,7 +202,7 @@ class _Output:
                 self._bag.write(SEEN_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
         self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), messages.tracker_state(stamp, track))
 
-    def _record(self, stamp: int, record: Record) -> None:
+    def _record(self, stamp: int, record: RecordedMessage) -> None:
         if record.topic == SCENE.recorded:
             version = record.decode().version
             if version == self._version:

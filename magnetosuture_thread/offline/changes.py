@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.interface import MATERIAL, SCENE
 from magnetosuture_thread.model import changes
@@ -14,7 +14,7 @@ CHANGING = (SCENE, MATERIAL)
 
 
 def changed(
-    settings: ThreadModelSettings, scene: Scene | None, record: Record
+    settings: ThreadModelSettings, scene: Scene | None, record: RecordedMessage
 ) -> tuple[ThreadModelSettings, Scene | None]:
     """Return settings and scene after a recorded message on one of these channels.
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.geometry.orientation import angle_of, turned
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (

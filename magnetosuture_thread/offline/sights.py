@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError, MagnetosutureError
 from magnetosuture_thread.geometry.orientation import as_told
@@ -65,7 +65,7 @@ class Sights(Iterator[Sight]):
         self.count = self.found = 0
         self.refused: Counter[str] = Counter()
         self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
-        self.on_record: Callable[[int, Record], None] = lambda stamp, record: None
+        self.on_record: Callable[[int, RecordedMessage], None] = lambda stamp, record: None
         self._scene = setup.scene
         self._length = setup.model.thread_length
         self._threads = self._measured = self._odd = 0
@@ -95,7 +95,7 @@ class Sights(Iterator[Sight]):
         """
         return next(self._going)
 
-    def changes(self) -> list[Record]:
+    def changes(self) -> list[RecordedMessage]:
         """Return, once, what the bag says of scene and thread before the sight that was given last."""
         changes, self._changes = self._changes, []
         for record in changes:
@@ -112,9 +112,9 @@ class Sights(Iterator[Sight]):
             f"shorter than {SHORTEST:g} times the set-up's {self._length:g} m: is it another thread?"
         )
 
-    def _go(self, records: Iterator[Record], awaited: set[Channel]) -> Iterator[Sight]:
+    def _go(self, records: Iterator[RecordedMessage], awaited: set[Channel]) -> Iterator[Sight]:
         """Give a sight once what belongs to it has come, or cannot be expected any more."""
-        waiting: deque[Sight | Record] = deque()
+        waiting: deque[Sight | RecordedMessage] = deque()
         parts: dict[str, dict[int, Points]] = {channel.recorded: {} for channel in awaited}
         for record in records:
             if record.topic in parts:
@@ -126,14 +126,14 @@ class Sights(Iterator[Sight]):
                 waiting.append(self._pose(record) if self.source == "poses" else self._frame(record))
             while waiting and (
                 len(waiting) > EARLY
-                or isinstance(head := waiting[0], Record)
+                or isinstance(head := waiting[0], RecordedMessage)
                 or all(head.stamp in known for known in parts.values())
             ):
                 yield from self._next(waiting.popleft(), parts)
         while waiting:
             yield from self._next(waiting.popleft(), parts)
 
-    def _follow(self, record: Record) -> None:
+    def _follow(self, record: RecordedMessage) -> None:
         """Look for the needle in a recorded scene from here on, as `vision_tracker` does."""
         if record.topic != SCENE.recorded:
             return
@@ -145,13 +145,13 @@ class Sights(Iterator[Sight]):
             return  # counted and reported where the model takes it
         self._scene = scene
 
-    def _next(self, head: Sight | Record, parts: dict[str, dict[int, Points]]) -> Iterator[Sight]:
-        if isinstance(head, Record):
+    def _next(self, head: Sight | RecordedMessage, parts: dict[str, dict[int, Points]]) -> Iterator[Sight]:
+        if isinstance(head, RecordedMessage):
             self._changes.append(head)
         else:
             yield self._whole(head, parts)
 
-    def _keep(self, known: dict[int, Points], record: Record) -> None:
+    def _keep(self, known: dict[int, Points], record: RecordedMessage) -> None:
         stamp = stamp_of(record)
         if record.topic == _SEEN:
             self.on_record(stamp, record)
@@ -179,7 +179,7 @@ class Sights(Iterator[Sight]):
         seen = seen if self.source == "poses" else sight.seen
         return Sight(sight.stamp, sight.tail, sight.heading, seen, truth, sight.reason, sight.processing)
 
-    def _pose(self, record: Record) -> Sight:
+    def _pose(self, record: RecordedMessage) -> Sight:
         """Return what a recorded pose says."""
         self.count += 1
         stamp = stamp_of(record)
@@ -193,7 +193,7 @@ class Sights(Iterator[Sight]):
         self.found += 1
         return Sight(stamp, tail, heading, _NOTHING, _NOTHING)
 
-    def _frame(self, record: Record) -> Sight:
+    def _frame(self, record: RecordedMessage) -> Sight:
         """Return what a camera frame says, as `thread_model` would get it."""
         assert self._tracker is not None
         self.count += 1
@@ -238,7 +238,9 @@ def pixels(message: Any, type_name: str) -> Any:
     return np.asarray(unpack_image(message.data, message.height, message.width, message.step, message.encoding))
 
 
-def _telling(records: Iterator[Record], begin: int, whole: float, progress: Progress) -> Iterator[Record]:
+def _telling(
+    records: Iterator[RecordedMessage], begin: int, whole: float, progress: Progress
+) -> Iterator[RecordedMessage]:
     """Go through records and tell how far, a thousand times at the most: showing it takes longer than a step."""
     following, pause = begin, max(round(whole * 1e6), 1)
     for record in records:

@@ -10,8 +10,8 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.headers import DISH_END, LITTLE_ENDIAN, is_in_dish
-from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.headers import DISH_END, LITTLE_ENDIAN, is_in_dish_frame
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_of
 from magnetosuture_thread.geometry.polyline import Points
@@ -24,7 +24,7 @@ _COUNT = struct.Struct("<I")
 _LONGEST = 256  # bytes of the names of frames that are passed over in a path
 
 
-def stamp_of(record: Record) -> int:
+def stamp_of(record: RecordedMessage) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
     if len(record.data) < _SHORTEST:
         return record.time
@@ -32,7 +32,7 @@ def stamp_of(record: Record) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def read_pose(record: Record) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_pose(record: RecordedMessage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return tail and heading of a recorded needle pose, each of shape (2,), as `thread_model` gets them.
 
     Raises:
@@ -49,7 +49,7 @@ def read_pose(record: Record) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     return np.array([x, y]), heading_of(qx, qy, qz, qw, f"{NEEDLE_POSE.name}.pose.orientation")
 
 
-def read_path(record: Record) -> Points:
+def read_path(record: RecordedMessage) -> Points:
     """Return a recorded path as an array of shape (m, 2) [m].
 
     Raises:
@@ -81,7 +81,7 @@ _NAME_AT = _PATH_AT + 8  # the length of the frame's name in a path's first pose
 
 def _is_plain(data: bytes) -> bool:
     """Return whether a message is in the dish frame, and written as our machines write it."""
-    return data[:2] == LITTLE_ENDIAN and is_in_dish(data)
+    return data[:2] == LITTLE_ENDIAN and is_in_dish_frame(data)
 
 
 def _quick_pose(data: bytes) -> tuple[float, ...] | None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from magnetosuture_msgs.msg import BarrierMargin, ThreadMaterial
 from rclpy.serialization import serialize_message
 
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.model.barriers import BarrierKind
 from magnetosuture_thread.nodes import messages, thread_messages, topics

@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from rclpy.serialization import deserialize_message, serialize_message
 
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.interface import SCENE
