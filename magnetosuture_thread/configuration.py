@@ -208,15 +208,26 @@ class _RosLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_RosLoader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in entries if not tag.endswith((":float", ":timestamp"))]
-    for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_RosLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"),
-    list("-+0123456789."),
-)
+def use_ros_numbers(loader: type[Any], *, decimal_integers: bool = False) -> None:
+    """Make a YAML loader read numbers as ROS does: 1e-5 is a number, and nothing is a date.
+
+    Args:
+        loader: a class of the package `yaml`, changed in place.
+        decimal_integers: whether only decimal integers are numbers; else octal, hexadecimal and others are too.
+    """
+    dropped = (":float", ":timestamp", ":int") if decimal_integers else (":float", ":timestamp")
+    loader.yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in entries if not tag.endswith(dropped)]
+        for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+    signs = list("-+0123456789")
+    if decimal_integers:
+        loader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), signs)
+    number = r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"
+    loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), [*signs, "."])
+
+
+use_ros_numbers(_RosLoader)
 
 
 def read_yaml(path: Path, what: str) -> Any:
@@ -241,7 +252,7 @@ def read_yaml(path: Path, what: str) -> Any:
         raise ConfigurationError(what, problem + line, "valid YAML", str(path)) from None
 
 
-def parse_yaml(text: str) -> Any:
+def parse_parameter_value(text: str) -> Any:
     """Return the value that a text stands for in a parameter file; the text itself where it is no YAML."""
     try:
         return yaml.load(text, _RosLoader)

@@ -11,7 +11,7 @@ from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.arc import require_needle
 from magnetosuture_thread.guidance.follower import PathFollower
-from magnetosuture_thread.scene import WALL, Scene, occupant
+from magnetosuture_thread.scene import WALL_NAME, Scene, find_collision
 from magnetosuture_thread.shared_parameters import shared
 
 
@@ -66,9 +66,10 @@ class PathFollowerSettings(Configuration):
             ConfigurationError: the message names the waypoint and what is there.
         """
         for point in np.reshape(self.waypoints, (-1, 2)):
-            what = occupant(scene, point[None])
+            what = find_collision(scene, point[None])
             if what:
-                expected = f"within the dish, {scene.dish.radius:g} m" if what == WALL else f"a point outside of {what}"
+                within = f"within the dish, {scene.dish.radius:g} m"
+                expected = within if what == WALL_NAME else f"a point outside of {what}"
                 raise ConfigurationError(f"{self.GROUP}.waypoints", point.tolist(), expected)
 
     def follower(self) -> PathFollower:

@@ -23,7 +23,7 @@ from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.offline.predictions import chosen_source
 from magnetosuture_thread.offline.sights import pixels
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.messages import scene_message, scene_of
+from magnetosuture_thread.scene.messages import build_scene_message, parse_scene_message
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.study.picture import draw_summary
 from magnetosuture_thread.study.replayed import Instant, Summary
@@ -125,7 +125,7 @@ def scene_at(recording: Recording, start: float) -> Scene | None:
             if found is not None and record.time > recording.start + round(start * 1e9):
                 break
             try:
-                found = scene_of(record.decode())
+                found = parse_scene_message(record.decode())
             except InvalidInputError as error:
                 raise BagError(recording.path, str(error)) from None
     return found
@@ -134,7 +134,7 @@ def scene_at(recording: Recording, start: float) -> Scene | None:
 def begin_with_scene(bag: BagWriter, given: Given) -> None:
     """Write the scene at the beginning of a bag made from another."""
     bag.add_topic(SCENE.recorded, SCENE.type_name)
-    bag.write_message(SCENE.recorded, given.begin, scene_message(given.setup.scene, header(given.begin), make))
+    bag.write_message(SCENE.recorded, given.begin, build_scene_message(given.setup.scene, header(given.begin), make))
 
 
 def _setup_of(

@@ -27,7 +27,7 @@ from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.scene import write_scene
-from magnetosuture_thread.scene.messages import scene_message
+from magnetosuture_thread.scene.messages import build_scene_message
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.topics import Topic
@@ -106,7 +106,7 @@ class Playing:
         """Give the messages to play, by time."""
         given = self.given
         # The scene comes first: the one that the bag tells to be in force, or else the set-up's.
-        message = scene_message(given.setup.scene, header(given.begin), make)
+        message = build_scene_message(given.setup.scene, header(given.begin), make)
         data = bytes(typestore().serialize_cdr(message, SCENE.type_name))
         yield RecordedMessage(SCENE.recorded, SCENE.type_name, given.begin, data)
         if given.start > 0.0:  # what was said before of the thread is in force

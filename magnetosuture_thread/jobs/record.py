@@ -32,7 +32,7 @@ from magnetosuture_thread.model.thread import Attachment
 from magnetosuture_thread.offline.messages import header, make, path_message, placed, pose_message
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.camera.scene import Scene as CameraScene
-from magnetosuture_thread.scene.messages import scene_message
+from magnetosuture_thread.scene.messages import build_scene_message
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
@@ -95,7 +95,7 @@ def record(
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
         bag.add_topic(SCENE.recorded, SCENE.type_name)
         begin = round((start + EPOCH) * 1e9)
-        bag.write_message(SCENE.recorded, begin, scene_message(setup.scene, header(begin), make))
+        bag.write_message(SCENE.recorded, begin, build_scene_message(setup.scene, header(begin), make))
         topics = _PoseTopics(bag, setup, noise, seed) if poses else _FrameTopics(bag, setup, reference, quality, seed)
         for index in range(frames):
             time = start + index / rate

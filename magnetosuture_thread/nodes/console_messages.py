@@ -22,7 +22,7 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.orientation import angle_of
 from magnetosuture_thread.nodes.messages import needle_pose
 from magnetosuture_thread.scene import Scene, SceneShape
-from magnetosuture_thread.scene.messages import scene_of
+from magnetosuture_thread.scene.messages import parse_scene_message
 
 DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
 
@@ -131,7 +131,7 @@ def scene(message: SceneMessage) -> dict[str, Any]:
     Raises:
         InvalidInputError: the message is damaged.
     """
-    return shown_scene(scene_of(message))
+    return shown_scene(parse_scene_message(message))
 
 
 def shown_scene(known: Scene) -> dict[str, Any]:

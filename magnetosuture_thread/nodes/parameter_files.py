@@ -20,7 +20,7 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.utilities import get_default_context
 
-from magnetosuture_thread.configuration import parse_yaml
+from magnetosuture_thread.configuration import parse_parameter_value
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.parameter_files import EVERY_NODE, check_list, last_name, matches, read_sections, shown
 
@@ -143,7 +143,7 @@ def _parameters(line: RosArguments, kind: str, node: str) -> dict[str, Any]:
                     check_list(f"{key}.{name}", value, str(entry))
                 given.update(flat)
         elif entry[0] in ("", kind, last_name(node)):
-            given[entry[1]] = parse_yaml(entry[2])
+            given[entry[1]] = parse_parameter_value(entry[2])
     return given
 
 

@@ -11,7 +11,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.thread_messages import decoded
 from magnetosuture_thread.scene import Scene, read_scene
-from magnetosuture_thread.scene.messages import scene_of
+from magnetosuture_thread.scene.messages import parse_scene_message
 
 MAX_MESSAGE_BYTES = 1 << 19  # of 10,000 vertices; what is larger is not even read
 
@@ -87,4 +87,4 @@ def received_scene(data: bytes) -> Scene:
     """
     if len(data) > MAX_MESSAGE_BYTES:
         raise InvalidInputError(topics.SCENE.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}")
-    return scene_of(decoded(topics.SCENE, data))
+    return parse_scene_message(decoded(topics.SCENE, data))

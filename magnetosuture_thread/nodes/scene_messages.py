@@ -27,7 +27,7 @@ NAME_SIZE = 0.025  # of the dish's diameter
 
 def scene_message(stamp: Time, scene: Scene) -> SceneMessage:
     """Return a scene as a message."""
-    return messages.scene_message(scene, header(stamp), _make)
+    return messages.build_scene_message(scene, header(stamp), _make)
 
 
 def scene_markers(stamp: Time, scene: Scene) -> MarkerArray:

@@ -8,7 +8,7 @@ from magnetosuture_thread.interface import MATERIAL, SCENE
 from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.messages import scene_of
+from magnetosuture_thread.scene.messages import parse_scene_message
 
 CHANGING = (SCENE, MATERIAL)
 
@@ -24,6 +24,6 @@ def changed(
         InvalidInputError: it is of another frame, or damaged.
     """
     if record.topic == SCENE.recorded:
-        return settings, scene_of(record.decode())
+        return settings, parse_scene_message(record.decode())
     values = changes.told_material(record.decode())
     return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values}), scene

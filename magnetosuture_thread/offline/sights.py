@@ -18,7 +18,7 @@ from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE,
 from magnetosuture_thread.model.session import EARLY
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
-from magnetosuture_thread.scene.messages import scene_of
+from magnetosuture_thread.scene.messages import parse_scene_message
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.study.sight import Sight
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -138,7 +138,7 @@ class Sights(Iterator[Sight]):
         if record.topic != SCENE.recorded:
             return
         try:
-            scene = scene_of(record.decode())
+            scene = parse_scene_message(record.decode())
             if scene.version != self._scene.version and self._tracker is not None:
                 self._tracker.set_scene(scene)
         except MagnetosutureError:

@@ -25,7 +25,7 @@ from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
 from magnetosuture_thread.rig.power.process import StageProcess
-from magnetosuture_thread.scene import Scene, occupant
+from magnetosuture_thread.scene import Scene, find_collision
 from magnetosuture_thread.shared_parameters import shared
 
 LARGEST_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
@@ -153,7 +153,7 @@ class RigSettings(Configuration):
         x, y, heading = self.needle_start
         needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
         for name, points in {"a needle": needle, "a thread": self.thread_at_start(at)}.items():
-            what = occupant(scene, points, holes=False)
+            what = find_collision(scene, points, holes=False)
             if what:
                 start = f"{list(self.needle_start)}, thread curvature {self.thread_start_curvature:g}"
                 expectation = f"{name} in the dish, off the obstacles: it would be in {what}"

@@ -27,7 +27,7 @@ from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.scene.messages import scene_message
+from magnetosuture_thread.scene.messages import build_scene_message
 from magnetosuture_thread.study.bag_table import TIMES, Row
 from magnetosuture_thread.study.report.moments import Moment
 from magnetosuture_thread.study.report.pictures import Picture, draw_moment
@@ -204,7 +204,7 @@ def test_a_picture_has_the_obstacles_that_were_in_force(
     tmp_path: Path, short_bag: Path, monkeypatch: pytest.MonkeyPatch
 ):
     post = Scene(Dish(0.035), (SceneShape("post", "instrument", ObstacleDisc((0.0, 0.012), 0.002)),))
-    data = bytes(typestore().serialize_cdr(scene_message(post, header(0), make), SCENE.type_name))
+    data = bytes(typestore().serialize_cdr(build_scene_message(post, header(0), make), SCENE.type_name))
     bag = copied(short_bag, tmp_path / "changed", [(SCENE, Bag(short_bag).start, data)], leave=SCENE.recorded)
     shown: list[Moment] = []
 

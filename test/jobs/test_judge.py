@@ -17,7 +17,7 @@ from magnetosuture_thread.jobs.playing import Playing
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.offline.messages import header, make
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
-from magnetosuture_thread.scene.messages import scene_message, scene_of
+from magnetosuture_thread.scene.messages import build_scene_message, parse_scene_message
 
 POST = Scene(Dish(0.035), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.001)),))
 OLD = "vision_tracker: {ros__parameters: {dish_diameter: 0.035}}\nthread_model: {ros__parameters: {length: 0.019}}\n"
@@ -37,7 +37,7 @@ def copied(short_bag: Path, tmp_path: Path):
             for time, topic, data in records:
                 while waiting and waiting[0][0] <= time:
                     at, scene = waiting.pop(0)
-                    message = scene_message(scene, header(at), make)
+                    message = build_scene_message(scene, header(at), make)
                     message.version = version or message.version
                     writer.write_message(SCENE.recorded, at, message)
                 writer.write(topic, time, data)
@@ -101,7 +101,7 @@ def test_the_scene_is_played_first_and_nodes_begin_in_it(copied, tmp_path: Path)
         first, *rest = playing.records()
         assert first.topic == SCENE.recorded
         assert first.time == found.begin <= rest[0].time
-        assert scene_of(first.decode()) == POST
+        assert parse_scene_message(first.decode()) == POST
         assert SCENE in playing.channels
         arguments = playing.arguments(tmp_path / "qos.yaml")
         assert f"scene:={tmp_path / 'scene.yaml'}" in arguments
@@ -112,5 +112,5 @@ def test_a_scene_that_changes_on_the_way_is_played_when_it_does(copied):
     path = copied([(0.0, Scene()), (0.4, POST)], setup="petri_35mm_polyamide")
     with given(path) as found:
         told = [record for record in Playing(found).records() if record.topic == SCENE.recorded]
-        assert [scene_of(record.decode()) for record in told] == [Scene(), POST]
+        assert [parse_scene_message(record.decode()) for record in told] == [Scene(), POST]
         assert told[1].time == pytest.approx(found.begin + 4e8, abs=1e8)

@@ -19,7 +19,7 @@ from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.simulate import simulate
 from magnetosuture_thread.resources import setup_file
 from magnetosuture_thread.scene import read_scene
-from magnetosuture_thread.scene.messages import scene_of
+from magnetosuture_thread.scene.messages import parse_scene_message
 
 pytestmark = pytest.mark.whole_graph
 
@@ -120,7 +120,7 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     ):
         assert bag.counts[topic] > 0, topic
     (told,) = bag.records({"/scene"})
-    assert scene_of(told.decode()) == read_scene("dish_35mm")
+    assert parse_scene_message(told.decode()) == read_scene("dish_35mm")
     assert told.time == bag.start
     first = min(record.time for record in bag.records({"/truth/needle"}))
     assert first - bag.start < 0.5e9  # the nodes' start is not in it

@@ -9,7 +9,7 @@ from std_msgs.msg import Header
 
 from magnetosuture_thread.interface import DISH_FRAME
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.messages import scene_message
+from magnetosuture_thread.scene.messages import build_scene_message
 
 
 def scene_told(scene: Scene) -> Any:
@@ -19,4 +19,4 @@ def scene_told(scene: Scene) -> Any:
         package, _, name = type_name.split("/")
         return getattr(import_module(f"{package}.msg"), name)(**fields)
 
-    return scene_message(scene, Header(frame_id=DISH_FRAME), make)
+    return build_scene_message(scene, Header(frame_id=DISH_FRAME), make)

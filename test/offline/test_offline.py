@@ -38,7 +38,7 @@ from magnetosuture_thread.offline.predictions import predictions, sights
 from magnetosuture_thread.offline.unpacking import read_path, read_pose, stamp_of
 from magnetosuture_thread.packing.thread import packed_margins, packed_prediction
 from magnetosuture_thread.scene import SceneShape
-from magnetosuture_thread.scene.messages import scene_message
+from magnetosuture_thread.scene.messages import build_scene_message
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.study.reference import ReferenceTrajectory
 
@@ -330,7 +330,7 @@ def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
         for record in source.records(set(source.topics)):
             writer.write(record.topic, record.time, record.data)
         stamp = round(1.39e9)
-        writer.write_message(SCENE.recorded, stamp, scene_message(wider, header(stamp), make))
+        writer.write_message(SCENE.recorded, stamp, build_scene_message(wider, header(stamp), make))
     for start, found in ((0.0, 12), (0.5, 0)):
         seen = sights(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
         # In a dish of twice the diameter, what was the needle is twice as long.
@@ -352,7 +352,7 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
             writer.write(record.topic, record.time, record.data)
         for time, told, version in ((1.39, scene, scene.version), (1.5, scene, "f" * 16), (1.61, too_fine, "")):
             stamp = round(time * 1e9)
-            message = scene_message(told, header(stamp), make)
+            message = build_scene_message(told, header(stamp), make)
             message.version = version or message.version
             writer.write_message(SCENE.recorded, stamp, message)
         silk = make(
