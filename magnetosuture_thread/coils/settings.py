@@ -14,7 +14,7 @@ from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibra
 from magnetosuture_thread.coils.field import CoilProperties, coils_around, make_coils
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared
@@ -242,7 +242,7 @@ class CoilBridgeSettings(Configuration):
 
     def check(self) -> None:
         """Refuse too few coils, a coiled needle, and limits that cannot hold."""
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
             name = f"{self.GROUP}.coil_angles"
             raise ConfigurationError(name, list(self.coil_angles), "at least 3 coils' angles [rad]")

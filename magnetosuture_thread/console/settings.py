@@ -8,7 +8,7 @@ from typing import ClassVar
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.console.access import is_loopback
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.shared_parameters import shared
 
 FEWEST = 2.0  # commands within a hold timeout
@@ -50,7 +50,7 @@ class ConsoleSettings(Configuration):
 
     def check(self) -> None:
         """Refuse an open page, a speed beyond the greatest, a timeout between two commands, a coiled needle."""
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if not self.address:
             raise ConfigurationError(
                 f"{self.GROUP}.address", self.address, "an address, 0.0.0.0 for all of this machine"

@@ -9,7 +9,7 @@ import numpy as np
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.guidance.follower import PathFollower
 from magnetosuture_thread.scene import WALL_NAME, Scene, find_collision
 from magnetosuture_thread.shared_parameters import shared
@@ -57,7 +57,7 @@ class PathFollowerSettings(Configuration):
 
     def check(self) -> None:
         """Refuse a coiled needle."""
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
     def check_path(self, scene: Scene) -> None:
         """Refuse a waypoint beyond the wall or inside of a shape.

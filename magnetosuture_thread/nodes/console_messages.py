@@ -19,7 +19,7 @@ from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
 
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.orientation import angle_of
+from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.nodes.messages import needle_pose
 from magnetosuture_thread.scene import Scene, SceneShape
 from magnetosuture_thread.scene.messages import parse_scene_message
@@ -66,7 +66,7 @@ def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
         InvalidInputError: the pose is none in the dish plane.
     """
     pose = needle_pose(message)
-    return {"tail": pose.tail.tolist(), "heading": angle_of(pose.heading)}
+    return {"tail": pose.tail.tolist(), "heading": heading_angle(pose.heading)}
 
 
 def tracker(message: TrackerState) -> dict[str, Any]:

@@ -21,7 +21,12 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.orientation import angle_of, as_told, heading_of, turned
+from magnetosuture_thread.geometry.orientation import (
+    heading_angle,
+    heading_from_quaternion,
+    round_trip_heading,
+    yaw_quaternion,
+)
 from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_POSE
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.vision.look import State, Track
@@ -83,7 +88,7 @@ def pose_message(
             that it is not known, if None.
     """
     message = PoseWithCovarianceStamped(header=header(stamp))
-    message.pose.pose = flat_pose(tail, angle_of(heading))
+    message.pose.pose = flat_pose(tail, heading_angle(heading))
     if covariance is not None:
         whole = np.zeros((6, 6))
         whole[np.ix_(_IN_PLANE, _IN_PLANE)] = covariance
@@ -125,7 +130,7 @@ def needle_pose(message: PoseWithCovarianceStamped) -> NeedlePose:
     stamp = message.header.stamp
     checked_nanoseconds(stamp, NEEDLE_POSE.name)  # the prediction could not be stamped by another
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    heading = heading_of(q.x, q.y, q.z, q.w, f"{NEEDLE_POSE.name}.pose.orientation")
+    heading = heading_from_quaternion(q.x, q.y, q.z, q.w, f"{NEEDLE_POSE.name}.pose.orientation")
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
 
 
@@ -152,7 +157,7 @@ def tracked_pose(stamp: Time, tail: np.ndarray, heading: np.ndarray) -> NeedlePo
         InvalidInputError: no stamp.
     """
     checked_nanoseconds(stamp, NEEDLE_POSE.name)
-    along = as_told(heading, f"{NEEDLE_POSE.name}.pose.orientation")
+    along = round_trip_heading(heading, f"{NEEDLE_POSE.name}.pose.orientation")
     return NeedlePose(seconds(stamp), np.array([float(tail[0]), float(tail[1])]), along)
 
 
@@ -225,7 +230,7 @@ def twist_message(stamp: Time, velocity: np.ndarray) -> TwistStamped:
 
 def flat_pose(point: np.ndarray, angle: float) -> Pose:
     """Return a pose in the dish plane: a point of shape (2,) [m] and an angle from the x axis on [rad]."""
-    z, w = turned(angle)
+    z, w = yaw_quaternion(angle)
     return Pose(position=Point(x=float(point[0]), y=float(point[1])), orientation=Quaternion(z=z, w=w))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.geometry.orientation import angle_of, turned
+from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     DISH_FRAME,
@@ -45,7 +45,9 @@ def pose_message(
     whole = np.zeros((6, 6))
     if covariance is not None:
         whole[np.ix_(_IN_PLANE, _IN_PLANE)] = covariance
-    pose = make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(tail, angle_of(heading)), covariance=whole.ravel())
+    pose = make(
+        "geometry_msgs/msg/PoseWithCovariance", pose=_pose(tail, heading_angle(heading)), covariance=whole.ravel()
+    )
     return make(NEEDLE_POSE.type_name, header=header(stamp), pose=pose)
 
 
@@ -75,6 +77,6 @@ def tracker_state(stamp: int, track: Track) -> Any:
 
 def _pose(point: NDArray[np.float64], angle: float) -> Any:
     position = make("geometry_msgs/msg/Point", x=float(point[0]), y=float(point[1]), z=0.0)
-    z, w = turned(angle)
+    z, w = yaw_quaternion(angle)
     quaternion = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
     return make("geometry_msgs/msg/Pose", position=position, orientation=quaternion)

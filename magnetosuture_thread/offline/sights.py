@@ -12,7 +12,7 @@ import numpy as np
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError, MagnetosutureError
-from magnetosuture_thread.geometry.orientation import as_told
+from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import COMPRESSED_IMAGE, NEEDLE_POSE, SCENE, SEEN_THREAD, TRUE_THREAD, Channel
 from magnetosuture_thread.model.session import EARLY
@@ -215,7 +215,7 @@ class Sights(Iterator[Sight]):
             self.refused[kind] += 1
             return Sight(stamp, reason=seen.track.reason, processing=taken)
         self.found += 1
-        heading = as_told(seen.track.heading, NEEDLE_POSE.name)
+        heading = round_trip_heading(seen.track.heading, NEEDLE_POSE.name)
         return Sight(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
 
     def _check_place(self, topic: str, points: Points) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.bags.headers import DISH_END, LITTLE_ENDIAN, is_in_dish_frame
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.orientation import heading_of
+from magnetosuture_thread.geometry.orientation import heading_from_quaternion
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_POSE
 
@@ -46,7 +46,7 @@ def read_pose(record: RecordedMessage) -> tuple[NDArray[np.float64], NDArray[np.
         p, q = message.pose.pose.position, message.pose.pose.orientation
         found = p.x, p.y, p.z, q.x, q.y, q.z, q.w
     x, y, _, qx, qy, qz, qw = found
-    return np.array([x, y]), heading_of(qx, qy, qz, qw, f"{NEEDLE_POSE.name}.pose.orientation")
+    return np.array([x, y]), heading_from_quaternion(qx, qy, qz, qw, f"{NEEDLE_POSE.name}.pose.orientation")
 
 
 def read_path(record: RecordedMessage) -> Points:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import needle_axis, require_needle
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
@@ -134,7 +134,7 @@ class RigSettings(Configuration):
         if self.power_stage == "roboclaw" and (not ports or 2 * ports != len(self.coil_angles)):
             expectation = f"a path for two of the {len(self.coil_angles)} coils"
             raise ConfigurationError(f"{self.GROUP}.power_stage_ports", list(self.power_stage_ports), expectation)
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         for fault in self.faults:
             Fault.parse(fault)
 

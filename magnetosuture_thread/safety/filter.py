@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.arc import needle_points
+from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.safety.barriers import SURE, measure, nearest_clear
 from magnetosuture_thread.safety.certificate import NOTHING, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics

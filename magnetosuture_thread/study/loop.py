@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.geometry.arc import needle_axis
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     CURRENTS,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import SurroundingsData, find_near
+from magnetosuture_thread.geometry.obstacles import SurroundingsData, find_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
@@ -124,7 +124,7 @@ class Memory(NamedTuple):
         multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
         chords: length of each segment, shape (n,).
         work: shape (2, n + 1, d).
-        node: contacts: as `find_near` writes them, shape (c,).
+        node: contacts: as `find_contacts` writes them, shape (c,).
         obstacle: shape (c,).
         distance: shape (c,).
         outward: shape (c, d).
@@ -245,7 +245,7 @@ def contact_rows(
         The number of rows, -1 if there is no room for them, and the greatest depth of a node [m].
     """
     nodes, dimension = about.shape
-    found = find_near(
+    found = find_contacts(
         about * unit, surroundings, memory.node, memory.obstacle, memory.distance, memory.outward, memory.nearest
     )
     if found < 0 or row + found > len(memory.first):

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Surroundings, find_near
+from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Surroundings, find_contacts
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 # An L: its only reflex corner is (0.01, 0.01).
@@ -181,8 +181,8 @@ def test_too_small_arrays_are_told():
     ring = Surroundings([RING], 1.0)
     points = np.zeros((200, 2))
     room = (np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9), np.empty((9, 2)), np.empty(9, np.bool_))
-    assert find_near(points, ring.data, *room) == -1
-    assert find_near(points[:2], ring.data, *room) == 8
+    assert find_contacts(points, ring.data, *room) == -1
+    assert find_contacts(points[:2], ring.data, *room) == 8
     assert len(ring.near(points)) == 800
 
 
@@ -198,8 +198,8 @@ def test_the_wall_is_a_contact_of_its_own_before_the_obstacles():
     assert centre.distance.tolist() == [0.05]
     room = (np.empty(1, np.int64), np.empty(1, np.int64), np.empty(1), np.empty((1, 2)), np.empty(1, np.bool_))
     data = Surroundings([], 0.01, wall_radius=0.05).data
-    assert find_near(points[1:2], data, *room) == 1
-    assert find_near(points[1:3], data, *room) == -1
+    assert find_contacts(points[1:2], data, *room) == 1
+    assert find_contacts(points[1:3], data, *room) == -1
 
 
 def test_nothing_is_near_nothing():
