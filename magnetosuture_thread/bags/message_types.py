@@ -10,7 +10,7 @@ from rosbags.typesys.store import Typestore
 
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.resources import share
+from magnetosuture_thread.resources import share_directory
 
 HEADER = "std_msgs/msg/Header"
 
@@ -20,7 +20,7 @@ def typestore() -> Typestore:
     """Return the types of ROS 2 Jazzy and of magnetosuture_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
     own = {}
-    for path in sorted((share("magnetosuture_msgs") / "msg").glob("*.msg")):
+    for path in sorted((share_directory("magnetosuture_msgs") / "msg").glob("*.msg")):
         own.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"magnetosuture_msgs/msg/{path.stem}"))
     store.register(own)
     return store

@@ -17,7 +17,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 INSIDE = 0.9  # of the distance to the coils
 FEWEST = 4.0  # periods of the loop in a timeout; two of them are given away so that no current outlives it
@@ -74,7 +74,7 @@ class CoilBridgeSettings(Configuration):
         1000.0, "greatest change of a coil's current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
     )
 
-    scene: str = shared("scene")
+    scene: str = shared_parameter("scene")
     keep_out: float = quantity(
         0.0005,
         "clearance that the needle's axis keeps of the wall and of obstacles; half of its width is within",
@@ -130,9 +130,9 @@ class CoilBridgeSettings(Configuration):
     aligning_field: float = quantity(
         0.008, "field along the needle that holds its direction", unit="T", minimum=1e-4, maximum=1.0
     )
-    needle_length: float = shared("needle_length")
-    needle_width: float = shared("needle_width")
-    needle_curvature: float = shared("needle_curvature")
+    needle_length: float = shared_parameter("needle_length")
+    needle_width: float = shared_parameter("needle_width")
+    needle_curvature: float = shared_parameter("needle_curvature")
     needle_moment: float = quantity(
         8.8e-4, "magnetic moment of the needle, were it straight", unit="A m^2", minimum=1e-6, maximum=1.0
     )
@@ -165,7 +165,7 @@ class CoilBridgeSettings(Configuration):
     roboclaw_ports: tuple[str, ...] = quantity((), "serial port of each board, which has two coils in a row")
     roboclaw_addresses: tuple[int, ...] = quantity((), "address of each board, 128 if empty", minimum=128, maximum=135)
     roboclaw_baud_rate: int = quantity(115200, "of the serial lines; USB has none", minimum=2400, maximum=1000000)
-    driver_timeout: float = shared("driver_timeout")
+    driver_timeout: float = shared_parameter("driver_timeout")
     roboclaw_answer_timeout: float = quantity(
         0.03,
         "that a board has for an answer, of which it needs 1 or 2 ms over USB; it may miss one",

@@ -9,7 +9,7 @@ from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.console.access import is_loopback
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 FEWEST = 2.0  # commands within a hold timeout
 LEAST_TOKEN = 16  # characters of a token where others can reach the page
@@ -29,9 +29,9 @@ class ConsoleSettings(Configuration):
     image_transport: str = quantity(
         "compressed", "which of the camera's topics is shown", choices=("compressed", "raw")
     )
-    scene: str = shared("scene")
-    needle_length: float = shared("needle_length")
-    needle_curvature: float = shared("needle_curvature")
+    scene: str = shared_parameter("scene")
+    needle_length: float = shared_parameter("needle_length")
+    needle_curvature: float = shared_parameter("needle_curvature")
     frame_rate: float = quantity(30.0, "of what the page is told", unit="Hz", minimum=1.0, maximum=120.0)
     speed: float = quantity(
         0.003, "of the needle's tip at first, until the operator sets another", unit="m/s", minimum=1e-5, maximum=0.5

@@ -12,7 +12,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.guidance.follower import PathFollower
 from magnetosuture_thread.scene import WALL_NAME, Scene, find_collision
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class PathFollowerSettings(Configuration):
     longest_lag: float = quantity(
         0.002, "the wish waits while the tip is farther from it", unit="m", minimum=1e-5, maximum=0.1
     )
-    scene: str = shared("scene")
-    needle_length: float = shared("needle_length")
-    needle_curvature: float = shared("needle_curvature")
+    scene: str = shared_parameter("scene")
+    needle_length: float = shared_parameter("needle_length")
+    needle_curvature: float = shared_parameter("needle_curvature")
 
     def check(self) -> None:
         """Refuse a coiled needle."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.recording import CHANNELS
-from magnetosuture_thread.configuration import Configuration, described
+from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import DISH_FRAME, PREDICTED_THREAD, SEEN_THREAD, TRUE_THREAD
@@ -240,7 +240,7 @@ def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter
 
 
 def _settings(settings: Configuration) -> Iterator[tuple[str, str, str]]:
-    for field in described(type(settings)):
+    for field in configuration_fields(type(settings)):
         value = getattr(settings, field.name)
         shown = ", ".join(f"{entry}" for entry in value) if isinstance(value, tuple) else f"{value}"
         yield f"{field.group}.{field.name}", shown, field.quantity.unit

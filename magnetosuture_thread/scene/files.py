@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.resources import scene_file
+from magnetosuture_thread.resources import find_scene_file
 from magnetosuture_thread.scene.errors import scene_error
 from magnetosuture_thread.scene.geojson import scene_from_geojson, scene_to_geojson
 from magnetosuture_thread.scene.mapping import scene_from_mapping, scene_to_mapping
@@ -41,7 +41,7 @@ def read_scene(name: str) -> Scene:
             invalid.
     """
     try:
-        path = scene_file(name)
+        path = find_scene_file(name)
     except ConfigurationError as error:
         raise scene_error(error.name, error.value, error.expectation) from None
     text = read_text(path)

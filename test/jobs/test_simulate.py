@@ -17,7 +17,7 @@ from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.jobs.behaviour import behaviour
 from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.simulate import simulate
-from magnetosuture_thread.resources import setup_file
+from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.scene.messages import parse_scene_message
 
@@ -243,7 +243,7 @@ def test_the_behaviour_job_draws_each_scenario(scenario: Path, tmp_path: Path):
 
 def test_the_scenarios_of_the_paper_ship():
     for name in ("petri_35mm_polyamide", "petri_150mm_silk"):
-        assert setup_file(name).exists()
+        assert find_setup_file(name).exists()
 
 
 def test_an_interrupted_run_that_has_begun_keeps_what_was_recorded(scenario: Path, tmp_path: Path):

@@ -17,7 +17,7 @@ from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.model.barriers import BarrierKind
 from magnetosuture_thread.nodes import messages, thread_messages, topics
-from magnetosuture_thread.resources import share
+from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.study.replayed import KINDS
 
 STAMP = Time(sec=3, nanosec=500_000_000)
@@ -123,5 +123,5 @@ def test_the_kinds_of_barrier_have_the_same_numbers_everywhere():
     }
     assert constants == {kind.name.lower(): int(kind) for kind in BarrierKind}
     assert constants == {name: number for number, name in enumerate(KINDS)}
-    text = (share("magnetosuture_msgs") / "msg" / "BarrierMargin.msg").read_text()
+    text = (share_directory("magnetosuture_msgs") / "msg" / "BarrierMargin.msg").read_text()
     assert text.count("uint8 KIND_") == len(BarrierKind)
