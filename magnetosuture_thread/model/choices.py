@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.model.formulations import Formulation, PaperFormulation, PaperOptions, RodFormulation
 from magnetosuture_thread.model.program import Solver
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver
@@ -24,12 +24,12 @@ def make_solver(name: str, tolerance: float) -> Solver:
 def make_formulation(
     name: str,
     thread: Thread,
-    surroundings: Surroundings,
+    workspace: Workspace,
     solver: Solver,
     tolerance: float,
     paper: PaperOptions | None = None,
 ) -> Formulation:
     """Return a formulation by name; the options are those of `paper`."""
     if name == PaperFormulation.name:
-        return PaperFormulation(thread, surroundings, solver, tolerance, paper)
-    return RodFormulation(thread, surroundings, solver, tolerance)
+        return PaperFormulation(thread, workspace, solver, tolerance, paper)
+    return RodFormulation(thread, workspace, solver, tolerance)

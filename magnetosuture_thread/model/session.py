@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
 from magnetosuture_thread.model.friction import FrictionLaw
 from magnetosuture_thread.model.margins import Margins
@@ -96,7 +96,7 @@ class ThreadSession:
         self.settings, self.scene = settings, scene
         self._predictor = settings.predictor(scene)
         # Obstacles may come later, and no callback shall wait for the compiler of what they need.
-        Surroundings(_OBSTACLES, settings.margin_range)
+        Workspace(_OBSTACLES, settings.margin_range)
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=EARLY)
         self._last: int | None = None

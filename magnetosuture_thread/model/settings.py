@@ -10,7 +10,7 @@ import numpy as np
 
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.model.choices import FORMULATIONS, SOLVERS, make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.friction import FrictionLaw, NodeMotion
@@ -248,19 +248,19 @@ class ThreadModelSettings(Configuration):
             ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
         check_scene(self, scene)
-        thread, surroundings = self.thread(), surroundings_of(scene, self.margin_range)
+        thread, workspace = self.thread(), workspace_of(scene, self.margin_range)
         tolerance = self.residual_tolerance
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
         paper = replace(PaperOptions.tuned(weight), damping=self.paper_damping)
         formulation = make_formulation(
-            self.formulation, thread, surroundings, make_solver(self.solver, tolerance), tolerance, paper
+            self.formulation, thread, workspace, make_solver(self.solver, tolerance), tolerance, paper
         )
         predictor = ThreadPredictor(
             formulation,
             thread,
             longest_step=self.longest_step,
             held=self.held_nodes,
-            wall_radius=surroundings.wall_radius,
+            wall_radius=workspace.wall_radius,
             scene_version=scene.version if scene else "",
         )
         predictor.warm_up()
@@ -275,11 +275,11 @@ class ThreadModelSettings(Configuration):
         return NodeMotion(self.friction_averaging)
 
 
-def surroundings_of(scene: Scene | None, reach: float) -> Surroundings:
+def workspace_of(scene: Scene | None, reach: float) -> Workspace:
     """Return a scene's obstacles and wall for the barriers, which see as far as a reach [m]; none of no scene."""
     if scene is None:
-        return Surroundings((), reach)
-    return Surroundings(scene.obstacles, reach, wall_radius=scene.dish.radius)
+        return Workspace((), reach)
+    return Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius)
 
 
 def check_scene(settings: ThreadModelSettings, scene: Scene | None) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.choices import make_formulation, make_solver
 from magnetosuture_thread.model.formulations import PaperOptions
@@ -194,8 +194,8 @@ def score_one(
     Source: reference set, "How a prediction is scored". Deviation: none.
     """
     thread, paper = thread_of(reference, path, segments)
-    surroundings = Surroundings(reference.discs, NEAR)
-    chosen = make_formulation(formulation, thread, surroundings, make_solver(solver, TOLERANCE), TOLERANCE, paper)
+    workspace = Workspace(reference.discs, NEAR)
+    chosen = make_formulation(formulation, thread, workspace, make_solver(solver, TOLERANCE), TOLERANCE, paper)
     predictor = ThreadPredictor(chosen, thread)
     predictor.warm_up()
     truth = np.stack([resampled(curve, thread.segments) for curve in reference.threads])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.model.barriers import BarrierRows, Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.barriers.rows import BarrierKind
 from magnetosuture_thread.model.friction import (
@@ -23,7 +23,7 @@ NODES = np.column_stack([np.arange(0.0, -8e-3, -1e-3), np.zeros(8)])  # 0 is the
 
 def barriers(*discs: tuple[float, float, float]) -> list[BarrierRows]:
     """Return the barriers of the nodes among discs x, y, radius."""
-    around = Surroundings([Disc((x, y), radius) for x, y, radius in discs], 5e-3)
+    around = Workspace([Disc((x, y), radius) for x, y, radius in discs], 5e-3)
     return [Connectivity(1e-3).rows(NODES), ObstacleAvoidance(around, 0.0).rows(NODES)]
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.model.choices import make_formulation, make_solver
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
@@ -25,7 +25,7 @@ def new(
     obstacles: tuple[Disc | Polygon, ...] = (), held: tuple[int, ...] = (), formulation: str = "rod"
 ) -> ThreadPredictor:
     """Return a predictor that has not started."""
-    chosen = make_formulation(formulation, THREAD, Surroundings(obstacles, 5e-3), make_solver("banded", 1e-6), 1e-6)
+    chosen = make_formulation(formulation, THREAD, Workspace(obstacles, 5e-3), make_solver("banded", 1e-6), 1e-6)
     return ThreadPredictor(chosen, THREAD, held=held)
 
 
@@ -236,7 +236,7 @@ def test_any_motion_keeps_the_promises(
         if polygon.has_room_for(0.5 * THREAD.segment_length):
             obstacles.append(polygon.smoothed(1e-4))
     predictor = started(tuple(obstacles))
-    around = Surroundings(obstacles, 5e-3)
+    around = Workspace(obstacles, 5e-3)
     where, angle = np.zeros(2), 0.0
     for k, turn in enumerate(turns, start=1):
         angle += turn
@@ -269,8 +269,8 @@ def test_any_thread_at_any_times_stays_whole(
     thread = Thread.of(
         MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=attachment, rest_curvature=curvature
     )
-    surroundings = Surroundings((), 5e-3, dimension)
-    chosen = make_formulation("rod", thread, surroundings, make_solver("banded", 1e-6), 1e-6)
+    workspace = Workspace((), 5e-3, dimension)
+    chosen = make_formulation("rod", thread, workspace, make_solver("banded", 1e-6), 1e-6)
     predictor = ThreadPredictor(chosen, thread, held=held)
     east = np.eye(dimension)[0]
     where, time = np.zeros(dimension), 0.0

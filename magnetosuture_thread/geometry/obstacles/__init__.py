@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from magnetosuture_thread.geometry.obstacles.closest import closest_on_triangles
-from magnetosuture_thread.geometry.obstacles.contacts import WALL, SurroundingsData, find_contacts, wall_contact
+from magnetosuture_thread.geometry.obstacles.contacts import WALL, WorkspaceData, find_contacts, wall_contact
 from magnetosuture_thread.geometry.obstacles.disc import Disc
 from magnetosuture_thread.geometry.obstacles.mesh import Mesh
 from magnetosuture_thread.geometry.obstacles.packing import Obstacle
 from magnetosuture_thread.geometry.obstacles.polygon import Polygon
-from magnetosuture_thread.geometry.obstacles.surroundings import Contacts, Surroundings
 from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
+from magnetosuture_thread.geometry.obstacles.workspace import Contacts, Workspace
 
 __all__ = [
     "WALL",
@@ -18,9 +18,9 @@ __all__ = [
     "Mesh",
     "Obstacle",
     "Polygon",
-    "Surroundings",
-    "SurroundingsData",
     "Triangulation",
+    "Workspace",
+    "WorkspaceData",
     "closest_on_triangles",
     "find_contacts",
     "triangulate",

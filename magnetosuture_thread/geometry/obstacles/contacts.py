@@ -18,7 +18,7 @@ WALL = -1
 """Index of the dish wall in place of an obstacle's."""
 
 
-class SurroundingsData(NamedTuple):
+class WorkspaceData(NamedTuple):
     """All obstacles, packed into few arrays: each costs time when compiled code is entered. Not to be written to.
 
     Row 0 of `frames` and `tables` is the grid over all obstacles; row o + 1 belongs to obstacle o.
@@ -46,7 +46,7 @@ class SurroundingsData(NamedTuple):
 
 
 @compiled
-def cell_of(x: float, y: float, z: float, row: int, data: SurroundingsData) -> int:
+def cell_of(x: float, y: float, z: float, row: int, data: WorkspaceData) -> int:
     """Return where the cell of a point is in `entries`, or -1 when it is outside of the grid, or not a number."""
     frame, table = data.frames[row], data.tables[row]
     i, j, k = (x - frame[0]) * frame[3], (y - frame[1]) * frame[3], (z - frame[2]) * frame[3]
@@ -64,7 +64,7 @@ def nearest_of(
     obstacle: int,
     first: int,
     last: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
@@ -97,7 +97,7 @@ def _ball_contact(
     y: float,
     z: float,
     obstacle: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
@@ -135,7 +135,7 @@ def _shape_contacts(
     y: float,
     z: float,
     obstacle: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
@@ -172,18 +172,18 @@ def _shape_contacts(
 @compiled
 def find_contacts(
     points: Points,
-    data: SurroundingsData,
+    data: WorkspaceData,
     node: NDArray[np.int64],
     obstacle: NDArray[np.int64],
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
     nearest: NDArray[np.bool_],
 ) -> int:
-    """Write the contacts of points into the caller's arrays; see `Surroundings.near` for what they are.
+    """Write the contacts of points into the caller's arrays; see `Workspace.near` for what they are.
 
     Args:
         points: shape (m, d) [m].
-        data: `Surroundings.data`.
+        data: `Workspace.data`.
         node: index of the point, shape (c,), c rows of room.
         obstacle: index of the obstacle, `WALL` for the wall, shape (c,).
         distance: signed distance, shape (c,) [m].

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.contacts import BALL, EDGES, FACES, SurroundingsData, nearest_of
+from magnetosuture_thread.geometry.obstacles.contacts import BALL, EDGES, FACES, WorkspaceData, nearest_of
 from magnetosuture_thread.geometry.obstacles.disc import Disc
 from magnetosuture_thread.geometry.obstacles.features import Features, edges_of, faces_of
 from magnetosuture_thread.geometry.obstacles.grid import Grid, fill_grid, plan_grid
@@ -19,7 +19,7 @@ from magnetosuture_thread.geometry.obstacles.polygon import Polygon
 from magnetosuture_thread.geometry.obstacles.search import MIN_DISTANCE
 
 Obstacle = Disc | Polygon | Mesh
-"""Any shape that `Surroundings` takes."""
+"""Any shape that `Workspace` takes."""
 
 _MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
 _MIN_CELLS = 200
@@ -49,7 +49,7 @@ class _FlatArray:
 
 def pack_obstacles(
     shapes: Sequence[Obstacle], reach: float, dimension: int, wall_radius: float = math.inf
-) -> SurroundingsData:
+) -> WorkspaceData:
     """Return all obstacles with their grids in flat arrays.
 
     Each obstacle has a grid of its own over its surroundings, so that its cells fit its features; a grid over
@@ -96,7 +96,7 @@ def pack_obstacles(
             *over.counts,
             _add_cells(index, *fill_grid(over, low, high, np.empty((len(low), 0, dimension)))),
         ]
-    data = SurroundingsData(
+    data = WorkspaceData(
         reach,
         float(wall_radius),
         frames,
@@ -123,7 +123,7 @@ def _add_cells(index: _FlatArray, starts: NDArray[np.int64], entries: NDArray[np
 @compiled
 def _mark_inside(
     obstacle: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     index: NDArray[np.int32],
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],

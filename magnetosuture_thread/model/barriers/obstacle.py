@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import WALL, Surroundings
+from magnetosuture_thread.geometry.obstacles import WALL, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers.rows import BarrierKind, BarrierRows
 
@@ -19,7 +19,7 @@ class ObstacleAvoidance:
         h_obs,i,O = sd_O(x_i) - rho,    i = 0 ... n,  O = 1 ... M
 
     with the signed distance sd_O, negative inside. Unit of h: that of the positions. A pair of node and
-    obstacle that is farther apart than the surroundings' reach has no row.
+    obstacle that is farther apart than the workspace' reach has no row.
 
     Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: the paper
     has (|x_i - p_O|^2 - rho^2) / 2 with the closest point p_O, see `SquaredObstacleAvoidance`. Outside of
@@ -28,16 +28,16 @@ class ObstacleAvoidance:
     gradient everywhere.
 
     Attributes:
-        surroundings: the obstacles, in the unit of the positions.
+        workspace: the obstacles, in the unit of the positions.
         distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
-    surroundings: Surroundings
+    workspace: Workspace
     distance: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
-        found = self.surroundings.near(positions)
+        found = self.workspace.near(positions)
         chosen = found.nearest & (found.obstacle != WALL)
         value = found.distance[chosen] - self.distance
         return BarrierRows(
@@ -63,16 +63,16 @@ class SquaredObstacleAvoidance:
     vanishes on the surface: the formulation `paper` takes `ObstacleAvoidance` for nodes that are too near.
 
     Attributes:
-        surroundings: the obstacles, in the unit of the positions.
+        workspace: the obstacles, in the unit of the positions.
         distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
-    surroundings: Surroundings
+    workspace: Workspace
     distance: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
-        found = self.surroundings.near(positions)
+        found = self.workspace.near(positions)
         chosen = found.nearest & (found.obstacle != WALL)
         signed = found.distance[chosen]
         value, slope = np.empty(len(signed)), np.empty(len(signed))

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import WALL, Surroundings, SurroundingsData
+from magnetosuture_thread.geometry.obstacles import WALL, Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import (
     BarrierRows,
@@ -47,7 +47,7 @@ from magnetosuture_thread.model.formulations.step import (
     DEPTH_REACHED,
     ROW_REACH,
     Drive,
-    Memory,
+    StepBuffers,
     StepSolution,
     ThreadState,
     contact_rows,
@@ -91,7 +91,7 @@ class PaperFormulation:
 
     Args:
         thread: the thread; of its mechanics only the rest shape counts.
-        surroundings: obstacles and wall [m]; their reach is that of the margins.
+        workspace: obstacles and wall [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
         options: what the paper sets or leaves open.
@@ -102,21 +102,21 @@ class PaperFormulation:
     def __init__(
         self,
         thread: Thread,
-        surroundings: Surroundings,
+        workspace: Workspace,
         solver: Solver,
         tolerance: float,
         options: PaperOptions | None = None,
     ) -> None:
-        nodes, dimension = thread.segments + 1, surroundings.dimension
+        nodes, dimension = thread.segments + 1, workspace.dimension
         self.dimension = dimension
-        self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
+        self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
         self._options = options or PaperOptions()
-        reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
-        self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
+        reach, wall_radius = ROW_REACH * thread.segment_length, workspace.wall_radius
+        self._near = Workspace(workspace.shapes, reach, dimension, wall_radius)
         self._room_radius = (wall_radius - 0.5 * thread.diameter) / thread.segment_length
         self._rest = rest_distances(thread.rest_turns)
         self._rows = 3 * thread.segments - 2
-        self._memory = Memory.of(nodes, dimension, self._rows, 2 * nodes)
+        self._memory = StepBuffers.of(nodes, dimension, self._rows, 2 * nodes)
 
     def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
         """Move the driven nodes and let the thread follow; see `Formulation`."""
@@ -188,15 +188,15 @@ class PaperFormulation:
             Connectivity(unit).rows(positions),
             EnhancedConnectivity(unit).rows(positions),
             Stiffness(unit * self._rest).rows(positions),
-            ObstacleAvoidance(self._surroundings, radius).rows(positions),
-            WallAvoidance(self._surroundings.wall_radius, radius, self._surroundings.reach).rows(positions),
+            ObstacleAvoidance(self._workspace, radius).rows(positions),
+            WallAvoidance(self._workspace.wall_radius, radius, self._workspace.reach).rows(positions),
         ]
 
 
 @compiled
 def _assemble(
-    memory: Memory,
-    surroundings: SurroundingsData,
+    memory: StepBuffers,
+    workspace: WorkspaceData,
     start: Points,
     velocities: Points,
     known: NDArray[np.bool_],
@@ -230,7 +230,7 @@ def _assemble(
         memory.lower[r] = -(gain if r < stiff else stiffness_gain) * memory.value[r]
         memory.upper[r] = np.inf
         memory.compliance[r] = connectivity_compliance if r < stiff else stiffness_compliance
-    contacts, depth = contact_rows(memory, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
+    contacts, depth = contact_rows(memory, rows, workspace, start, start, known, 1.0 / gain, unit, radius)
     for r in range(rows, rows + contacts):
         clearance = memory.value[r]
         if clearance > 0.0 and memory.obstacle[r - rows] != WALL:

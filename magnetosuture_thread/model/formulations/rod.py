@@ -30,13 +30,20 @@ from __future__ import annotations
 import numpy as np
 
 from magnetosuture_thread.errors import ConfigurationError, SolverError
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import BarrierRows, Compression, Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.formulations.rod_program import Rod
 from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, Motion, go_on, take
-from magnetosuture_thread.model.formulations.step import ROW_REACH, Drive, Memory, StepSolution, ThreadState, warmed
+from magnetosuture_thread.model.formulations.step import (
+    ROW_REACH,
+    Drive,
+    StepBuffers,
+    StepSolution,
+    ThreadState,
+    warmed,
+)
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.solvers.banded import STATUS
@@ -50,7 +57,7 @@ class RodFormulation:
 
     Args:
         thread: the thread.
-        surroundings: obstacles and wall [m]; their reach is that of the margins.
+        workspace: obstacles and wall [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
 
@@ -60,12 +67,12 @@ class RodFormulation:
 
     name = "rod"
 
-    def __init__(self, thread: Thread, surroundings: Surroundings, solver: Solver, tolerance: float) -> None:
-        nodes, dimension = thread.segments + 1, surroundings.dimension
+    def __init__(self, thread: Thread, workspace: Workspace, solver: Solver, tolerance: float) -> None:
+        nodes, dimension = thread.segments + 1, workspace.dimension
         self.dimension = dimension
-        self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
-        reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
-        self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
+        self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
+        reach, wall_radius = ROW_REACH * thread.segment_length, workspace.wall_radius
+        self._near = Workspace(workspace.shapes, reach, dimension, wall_radius)
         medium, glued = thread.medium, thread.attachment is Attachment.GLUED
         if len(medium.gravity) not in (0, dimension):
             raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
@@ -87,7 +94,7 @@ class RodFormulation:
         )
         self._axes, (self._banded, self._at_once) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
         self._motion = Motion.of(nodes, dimension)
-        self._give(Memory.of(nodes, dimension, thread.segments, 2 * nodes))
+        self._give(StepBuffers.of(nodes, dimension, thread.segments, 2 * nodes))
 
     def step(self, state: ThreadState, drive: Drive, interval: float) -> StepSolution:
         """Move the driven nodes and let the thread follow; see `Formulation`."""
@@ -105,7 +112,7 @@ class RodFormulation:
                 self._rod,
                 self._memory,
                 self._near.data,
-                self._workspace,
+                self._buffers,
                 motion,
                 positions,
                 velocities,
@@ -146,11 +153,11 @@ class RodFormulation:
         take(self._memory, self._motion, solution.velocities, solution.multipliers, 1.0)
         self._memory.forget()
 
-    def _give(self, memory: Memory) -> None:
+    def _give(self, memory: StepBuffers) -> None:
         """Take memory for the step, and as much for the structured solver."""
         self._memory = memory
         nodes, dimension = memory.linear.shape
-        self._workspace = self._banded.workspace(nodes, dimension, len(memory.first))
+        self._buffers = self._banded.buffers(nodes, dimension, len(memory.first))
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the chords of the segments' arcs; see `Formulation`."""
@@ -164,8 +171,8 @@ class RodFormulation:
         return [
             Connectivity(self._thread.segment_length).rows(positions),
             Compression(self.rest_lengths(positions, heading)).rows(positions),
-            ObstacleAvoidance(self._surroundings, radius).rows(positions),
-            WallAvoidance(self._surroundings.wall_radius, radius, self._surroundings.reach).rows(positions),
+            ObstacleAvoidance(self._workspace, radius).rows(positions),
+            WallAvoidance(self._workspace.wall_radius, radius, self._workspace.reach).rows(positions),
         ]
 
 

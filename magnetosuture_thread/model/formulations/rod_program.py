@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import SurroundingsData
+from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers.connectivity import distance_barrier
-from magnetosuture_thread.model.formulations.step import DEPTH_REACHED, Memory, contact_rows
+from magnetosuture_thread.model.formulations.step import DEPTH_REACHED, StepBuffers, contact_rows
 from magnetosuture_thread.model.program import Vector
 
 STRETCH_REACHED = 1e-3  # of the segments; beyond it the barriers are linearised once more
@@ -41,8 +41,8 @@ class Rod(NamedTuple):
 def assemble(
     solves: int,
     rod: Rod,
-    memory: Memory,
-    surroundings: SurroundingsData,
+    memory: StepBuffers,
+    workspace: WorkspaceData,
     about: Points,
     start: Points,
     before: Points,
@@ -60,7 +60,7 @@ def assemble(
     segments = len(about) - 1
     mechanics.chord_lengths(about, heading, rod.glued, memory.chords)
     stretch = _segment_rows(memory, about, start, known, interval)
-    contacts, depth = contact_rows(memory, segments, surroundings, about, start, known, interval, rod.unit, rod.radius)
+    contacts, depth = contact_rows(memory, segments, workspace, about, start, known, interval, rod.unit, rod.radius)
     off = max(stretch / STRETCH_REACHED, depth / DEPTH_REACHED)
     if contacts >= 0 and (solves == 0 or off > 1.0):
         _objective(rod, memory, about, start, before, last, heading, interval, last_interval)
@@ -70,7 +70,7 @@ def assemble(
 @compiled
 def _objective(
     rod: Rod,
-    memory: Memory,
+    memory: StepBuffers,
     about: Points,
     start: Points,
     before: Points,
@@ -127,7 +127,7 @@ def _objective(
 
 
 @compiled
-def _taut(memory: Memory, about: Points, start: Points, interval: float) -> None:
+def _taut(memory: StepBuffers, about: Points, start: Points, interval: float) -> None:
     """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
 
         1/2 dt sum_i T_i |w_i - w_{i-1}|^2,    w = u - (y - x) / dt
@@ -149,7 +149,9 @@ def _taut(memory: Memory, about: Points, start: Points, interval: float) -> None
 
 
 @compiled
-def _segment_rows(memory: Memory, about: Points, start: Points, known: NDArray[np.bool_], interval: float) -> float:
+def _segment_rows(
+    memory: StepBuffers, about: Points, start: Points, known: NDArray[np.bool_], interval: float
+) -> float:
     """Write the rows  grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt; return the largest |h(y)|."""
     nodes, dimension = about.shape
     distance_barrier(about, 1, memory.chords, memory.value, memory.gradient)

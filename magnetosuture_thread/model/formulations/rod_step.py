@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import SurroundingsData
+from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers.wall import moved_inside
 from magnetosuture_thread.model.formulations.rod_program import LONGEST_RATIO, Rod, assemble
-from magnetosuture_thread.model.formulations.step import Memory, driven, remember_push
+from magnetosuture_thread.model.formulations.step import StepBuffers, driven, remember_push
 from magnetosuture_thread.model.program import ChainProgram, Vector
 from magnetosuture_thread.model.solvers import banded
 
@@ -90,9 +90,9 @@ def set_out(
 def go_on(
     axes: tuple[int, ...],
     rod: Rod,
-    memory: Memory,
-    surroundings: SurroundingsData,
-    workspace: banded.Workspace,
+    memory: StepBuffers,
+    workspace: WorkspaceData,
+    buffers: banded.Buffers,
     motion: Motion,
     positions: Points,
     velocities: Points,
@@ -111,8 +111,8 @@ def go_on(
         axes: 0 to d - 1.
         rod: the thread.
         memory: has the program in the end, and its multipliers.
-        surroundings: obstacles and wall [m].
-        workspace: of the structured solver; one without iterations leaves every solve to the caller.
+        workspace: obstacles and wall [m].
+        buffers: of the structured solver; one without iterations leaves every solve to the caller.
         motion: where the step has got to; written.
         positions: see `set_out`, as are the following.
         velocities: over the last step [m/s].
@@ -138,7 +138,7 @@ def go_on(
             solves,
             rod,
             memory,
-            surroundings,
+            workspace,
             motion.about,
             motion.start,
             motion.before,
@@ -152,9 +152,9 @@ def go_on(
             return NO_ROOM, contacts, solves, off, status, worst
         if off <= 1.0 or solves == most_solves:
             if off > 1.0:  # whatever else holds, nothing passes the wall
-                moved_inside(motion.about, motion.known, (surroundings.wall_radius - rod.radius) / rod.unit)
+                moved_inside(motion.about, motion.known, (workspace.wall_radius - rod.radius) / rod.unit)
             return ENDED, contacts, solves, off, status, worst
-        if workspace.iterations == 0:
+        if buffers.iterations == 0:
             return UNSOLVED, contacts, solves, off, status, worst
         rows = segments + contacts
         program = ChainProgram(
@@ -169,7 +169,7 @@ def go_on(
             memory.compliance[:rows],
         )
         u, multipliers = motion.velocities.copy(), memory.multipliers[:rows].copy()
-        word, _, found = banded.solve_and_judge(axes, program, u, multipliers, workspace)
+        word, _, found = banded.solve_and_judge(axes, program, u, multipliers, buffers)
         if not max(found) <= tolerance:
             return UNSOLVED, contacts, solves, off, status, worst
         take(memory, motion, u, multipliers, interval)
@@ -178,7 +178,7 @@ def go_on(
 
 
 @compiled
-def take(memory: Memory, motion: Motion, velocities: Points, multipliers: Vector, interval: float) -> None:
+def take(memory: StepBuffers, motion: Motion, velocities: Points, multipliers: Vector, interval: float) -> None:
     """Take a solution: its velocities, where they lead, and its multipliers as a guess for the next one."""
     segments = len(velocities) - 1
     memory.multipliers[: len(multipliers)] = multipliers

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import SurroundingsData, find_contacts
+from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import BarrierRows
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
@@ -108,7 +108,7 @@ class Formulation(Protocol):
         ...
 
 
-class Memory(NamedTuple):
+class StepBuffers(NamedTuple):
     """Memory for a step's program and its contacts, kept from step to step so that no step pays for it.
 
     Attributes:
@@ -152,7 +152,7 @@ class Memory(NamedTuple):
     push: Vector
 
     @classmethod
-    def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> Memory:
+    def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> StepBuffers:
         """Return memory for a number of rows, and of contacts besides."""
         total = rows + contacts
         return cls(
@@ -176,11 +176,11 @@ class Memory(NamedTuple):
             np.zeros(nodes),
         )
 
-    def with_room(self) -> Memory:
+    def with_room(self) -> StepBuffers:
         """Return memory for twice as many contacts, with the same chords and multipliers."""
         nodes, dimension = self.linear.shape
         rows = len(self.first) - len(self.node)
-        larger = Memory.of(nodes, dimension, rows, 2 * len(self.node))
+        larger = StepBuffers.of(nodes, dimension, rows, 2 * len(self.node))
         larger.multipliers[:rows] = self.multipliers[:rows]
         larger.chords[:] = self.chords
         larger.push[:] = self.push
@@ -206,7 +206,7 @@ class Memory(NamedTuple):
         )
 
 
-def warmed(solver: Solver, memory: Memory, known: NDArray[np.bool_], rows: int) -> Solution:
+def warmed(solver: Solver, memory: StepBuffers, known: NDArray[np.bool_], rows: int) -> Solution:
     """Return a solution of the memory's last program as a general solver gets it, its residuals worked out here."""
     program = memory.program(rows, known)
     solution = solver.solve(program, np.zeros_like(memory.linear), np.zeros(rows))
@@ -216,9 +216,9 @@ def warmed(solver: Solver, memory: Memory, known: NDArray[np.bool_], rows: int) 
 
 @compiled
 def contact_rows(
-    memory: Memory,
+    memory: StepBuffers,
     row: int,
-    surroundings: SurroundingsData,
+    workspace: WorkspaceData,
     about: Points,
     start: Points,
     known: NDArray[np.bool_],
@@ -233,7 +233,7 @@ def contact_rows(
     Args:
         memory: written, from a row on.
         row: the first of these rows.
-        surroundings: obstacles and wall [m].
+        workspace: obstacles and wall [m].
         about: y, shape (n + 1, d) [D].
         start: x, shape (n + 1, d) [D].
         known: nodes that have no rows, as nothing can push them, shape (n + 1,).
@@ -246,7 +246,7 @@ def contact_rows(
     """
     nodes, dimension = about.shape
     found = find_contacts(
-        about * unit, surroundings, memory.node, memory.obstacle, memory.distance, memory.outward, memory.nearest
+        about * unit, workspace, memory.node, memory.obstacle, memory.distance, memory.outward, memory.nearest
     )
     if found < 0 or row + found > len(memory.first):
         return -1, 0.0

@@ -37,7 +37,7 @@ STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "s
 SOLVED, LIMIT, INDEFINITE, NOT_FINITE, STALLED = range(5)
 
 
-class Workspace(NamedTuple):
+class Buffers(NamedTuple):
     """What the compiled solver works with; kept from step to step, so that no step pays for memory.
 
     Attributes:
@@ -66,27 +66,27 @@ class BandedSolver:
     name = "banded"
 
     def __init__(self, tolerance: float = 1e-8, iterations: int = 60) -> None:
-        self._workspace = Workspace(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
+        self._buffers = Buffers(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
 
     def solve(self, program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector) -> Solution:
         """Solve one program, started from a guess; see `Solver`."""
         nodes, dimension = program.linear.shape
-        workspace = self.workspace(nodes, dimension, len(program.first))
+        buffers = self.buffers(nodes, dimension, len(program.first))
         u, found, axes = velocities.copy(), multipliers.copy(), (0, 1, 2)[:dimension]
-        status, iterations, residuals = solve_and_judge(axes, program, u, found, workspace)
+        status, iterations, residuals = solve_and_judge(axes, program, u, found, buffers)
         return Solution(u, found, self.name, STATUS[status], iterations, Residuals(*residuals))
 
-    def workspace(self, nodes: int, dimension: int, rows: int) -> Workspace:
+    def buffers(self, nodes: int, dimension: int, rows: int) -> Buffers:
         """Return what the compiled solver needs for programs of at most so many rows."""
         width = SPAN * dimension
         unknowns = nodes * dimension + width
-        if self._workspace.band.shape != (unknowns, width + 1):
-            self._workspace = self._workspace._replace(band=np.empty((unknowns, width + 1)))
+        if self._buffers.band.shape != (unknowns, width + 1):
+            self._buffers = self._buffers._replace(band=np.empty((unknowns, width + 1)))
         wanted = max(unknowns, rows)
-        if self._workspace.vectors.shape[1] < wanted:
+        if self._buffers.vectors.shape[1] < wanted:
             vectors, pushing = np.empty((7, 2 * wanted)), np.empty(2 * wanted, dtype=np.bool_)
-            self._workspace = self._workspace._replace(vectors=vectors, pushing=pushing)
-        return self._workspace
+            self._buffers = self._buffers._replace(vectors=vectors, pushing=pushing)
+        return self._buffers
 
 
 @compiled
@@ -213,10 +213,10 @@ def solve(
     program: ChainProgram,
     u: NDArray[np.float64],
     multipliers: Vector,
-    workspace: Workspace,
+    buffers: Buffers,
 ) -> tuple[int, int]:
     """Improve u and the multipliers in place; return status and iterations."""
-    tolerance, iterations, band, vectors, pushing = workspace
+    tolerance, iterations, band, vectors, pushing = buffers
     d, width = len(axes), SPAN * len(axes)
     nodes, rows, unknowns = len(program.linear), len(program.first), program.linear.size
     step, force, smooth = vectors[0], vectors[1, :unknowns], vectors[2, :unknowns]
@@ -292,8 +292,8 @@ def solve_and_judge(
     program: ChainProgram,
     u: NDArray[np.float64],
     multipliers: Vector,
-    workspace: Workspace,
+    buffers: Buffers,
 ) -> tuple[int, int, tuple[float, float, float]]:
     """Solve, and judge by code that knows nothing of how it was solved; once into compiled code is cheaper."""
-    status, taken = solve(axes, program, u, multipliers, workspace)
+    status, taken = solve(axes, program, u, multipliers, buffers)
     return status, taken, compiled_residuals(program, u, multipliers)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
 from magnetosuture_thread.model.formulations import Drive, Formulation, RodFormulation, StepSolution, ThreadState
 from magnetosuture_thread.model.formulations.rod_step import Motion, set_out
-from magnetosuture_thread.model.formulations.step import Memory
+from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.thread import Attachment, Thread
@@ -282,7 +282,7 @@ def test_a_thread_among_hundreds_of_obstacles_keeps_its_length():
 
 
 def test_memory_that_grows_keeps_the_chords_and_the_multipliers():
-    memory = Memory.of(6, 2, 5, 3)
+    memory = StepBuffers.of(6, 2, 5, 3)
     memory.chords[:], memory.multipliers[:], memory.push[:] = 0.9, 7.0, 3.0
     larger = memory.with_room()
     assert len(larger.node) == 6
@@ -368,7 +368,7 @@ class LyingSolver:
 
 def test_a_solution_is_refused_by_its_residual_whatever_the_solver_says():
     thread = polyamide()
-    formulation = RodFormulation(thread, Surroundings((), 0.01), LyingSolver(), 1e-5)
+    formulation = RodFormulation(thread, Workspace((), 0.01), LyingSolver(), 1e-5)
     with pytest.raises(SolverError, match=r"liar ended with status 'solved' and residual 2\.0e-05"):
         formulation.step(ThreadState.at_rest(straight(thread)), lead(np.zeros(2)), DT)
 
@@ -389,7 +389,7 @@ class Hidden:
 def among_discs(solver: Solver) -> RodFormulation:
     """Return a formulation of a glued thread with two discs beside it."""
     discs = tuple(Disc((-0.009 + 0.006 * k, 0.0025), 0.0015) for k in range(2))
-    return RodFormulation(polyamide(Attachment.GLUED), Surroundings(discs, 0.05), solver, TOLERANCE)
+    return RodFormulation(polyamide(Attachment.GLUED), Workspace(discs, 0.05), solver, TOLERANCE)
 
 
 def assert_same(one: StepSolution, other: StepSolution) -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.model.barriers import BarrierKind
 from magnetosuture_thread.model.choices import make_formulation, make_solver
@@ -119,7 +119,7 @@ def test_polyamide_along_the_rim_is_where_the_rig_has_it(attachment: Attachment)
     predictors = {}
     for wall in errors:
         formulation = make_formulation(
-            "rod", thread, Surroundings((), 5e-3, 2, wall), make_solver("banded", TOLERANCE), TOLERANCE
+            "rod", thread, Workspace((), 5e-3, 2, wall), make_solver("banded", TOLERANCE), TOLERANCE
         )
         predictors[wall] = ThreadPredictor(formulation, thread)
     furthest = 0.0

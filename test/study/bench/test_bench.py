@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from magnetosuture_thread.geometry.obstacles import Mesh, Polygon, Surroundings, triangulate
+from magnetosuture_thread.geometry.obstacles import Mesh, Polygon, Workspace, triangulate
 from magnetosuture_thread.model.solvers.banded import BandedSolver
 from magnetosuture_thread.model.solvers.osqp import OsqpSolver
 from magnetosuture_thread.study.bench.cases import SEGMENT, case
@@ -67,11 +67,11 @@ def test_obstacles_have_200_triangles_and_are_met_by_the_thread_but_not_by_the_n
     for shape in motion.shapes:
         assert isinstance(shape, (Mesh, Polygon))
         assert len(shape.faces if isinstance(shape, Mesh) else triangulate(shape).triangles) == 200
-    surroundings = Surroundings(motion.shapes, 5e-3, dimension)
-    assert surroundings.near(motion.tails).distance.min() > 1e-4
+    workspace = Workspace(motion.shapes, 5e-3, dimension)
+    assert workspace.near(motion.tails).distance.min() > 1e-4
     walked = run(motion, BandedSolver())
     assert walked.contact_steps >= 30
-    assert surroundings.near(walked.positions.reshape(-1, dimension)).distance.min() < motion.thread.diameter
+    assert workspace.near(walked.positions.reshape(-1, dimension)).distance.min() < motion.thread.diameter
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

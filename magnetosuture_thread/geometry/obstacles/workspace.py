@@ -1,4 +1,4 @@
-"""Surroundings: all obstacles around a thread, ready to be asked for what is near."""
+"""Workspace: the dish wall and all obstacles, and the contacts of points with them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Contacts:
         return len(self.node)
 
 
-class Surroundings:
+class Workspace:
     """Obstacles that do not move and the round wall of the dish about the origin, and what of them is near.
 
     Args:
@@ -67,17 +67,17 @@ class Surroundings:
         self, shapes: Sequence[Obstacle], reach: float, dimension: int = 2, wall_radius: float = math.inf
     ) -> None:
         if dimension not in (2, 3):
-            raise ConfigurationError("surroundings.dimension", dimension, "2 or 3")
+            raise ConfigurationError("workspace.dimension", dimension, "2 or 3")
         if not (math.isfinite(reach) and reach >= 0.0):
-            raise ConfigurationError("surroundings.reach", reach, "a number of at least 0 m")
+            raise ConfigurationError("workspace.reach", reach, "a number of at least 0 m")
         if not wall_radius > 0.0:
-            raise ConfigurationError("surroundings.wall_radius", wall_radius, "a number above 0 m, or inf")
+            raise ConfigurationError("workspace.wall_radius", wall_radius, "a number above 0 m, or inf")
         self.shapes = tuple(shapes)
         self.reach = float(reach)
         self.dimension = dimension
         self.wall_radius = float(wall_radius)
         for i, shape in enumerate(self.shapes):
-            _check(f"surroundings.shapes[{i}]", shape, dimension)
+            _check(f"workspace.shapes[{i}]", shape, dimension)
         self.data = pack_obstacles(self.shapes, self.reach, dimension, self.wall_radius)
         self._max_rows = _INITIAL_ROWS
 
