@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from magnetosuture_thread.bags.types import MESSAGES
+from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.reproduce.hernia.replay import start_centreline

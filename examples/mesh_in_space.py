@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from magnetosuture_thread import Attachment, Medium, Mesh, NeedlePose, Surroundings, Thread, ThreadPredictor
+from magnetosuture_thread import Attachment, Medium, Mesh, NeedlePose, Thread, ThreadPredictor, Workspace
 
 corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 1]]) * 0.01 - [0.0, 0.0, 0.02]
 faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])  # outward by the right hand
@@ -15,7 +15,7 @@ thread = Thread(
     medium=Medium.air(mass_per_length=2e-4, gravity=(0.0, 0.0, -9.81), drag=2e-3),
     attachment=Attachment.PINNED,
 )
-predictor = ThreadPredictor(thread, Surroundings([Mesh(corners, faces)], reach=0.01, dimension=3), max_step=2e-3)
+predictor = ThreadPredictor(thread, Workspace([Mesh(corners, faces)], reach=0.01, dimension=3), max_step=2e-3)
 east, tail = np.array([1.0, 0.0, 0.0]), np.array([0.015, 0.0, 0.0])
 predictor.start(NeedlePose(0.0, tail, east))
 for step in range(1, 151):

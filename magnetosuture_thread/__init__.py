@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magnetosuture_thread.barrier import Barrier, Gradient
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
-    from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
+    from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
     from magnetosuture_thread.model.margins import BarrierMargins, Margins
     from magnetosuture_thread.model.medium import Medium
     from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _HOME = {
     "barrier": ("Barrier", "Gradient"),
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
-    "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Surroundings"),
+    "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
     "model.margins": ("BarrierMargins", "Margins"),
     "model.medium": ("Medium",),
     "model.predictor": ("NeedlePose", "Prediction", "ThreadPredictor"),
@@ -55,9 +55,9 @@ __all__ = [
     "Scene",
     "SceneShape",
     "SolverError",
-    "Surroundings",
     "Thread",
     "ThreadPredictor",
+    "Workspace",
     "read_scene",
 ]
 

@@ -1,4 +1,4 @@
-"""Compiled functions: one decorator, so that every kernel is compiled and cached alike."""
+"""The decorator of all compiled functions, and their cache."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from typing import Any, TypeVar, cast
 import numba
 
 PACKAGE = Path(__file__).parent
-MARK = b"magnetosuture_thread.compiled"
+COMPILED_MARK = b"magnetosuture_thread.compiled"
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def compiled(function: _Function) -> _Function:
-    """Compile a function at its first call, with numpy's rules for division by zero.
+    """Compile a function with numba at its first call, with numpy's rules for division by zero.
 
-    The result is cached beside the source file, so only the first start of a node on a machine pays.
+    The result is cached beside the source file, so that only the first start of a node on a machine compiles.
     """
     return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
 
 
-def forget_stale_kernels(package: Path = PACKAGE) -> bool:
+def delete_stale_cache(package: Path = PACKAGE) -> bool:
     """Delete the cache where a file with compiled functions has changed since; return whether it had to.
 
-    numba looks at a function's own file only. But a kernel holds the code of all that it calls, from other
-    files too, and would go on with what these were.
+    numba checks the file of a function only. But a compiled function contains the code of all functions that it calls,
+    from other files too, and would keep their old code.
     """
     state = hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
-        if MARK in path.read_bytes():
+        if COMPILED_MARK in path.read_bytes():
             status = path.stat()
             state.update(f"{path.relative_to(package)} {status.st_mtime_ns} {status.st_size}\n".encode())
     stamp = package / "__pycache__" / "kernels.stamp"
@@ -51,4 +51,4 @@ def forget_stale_kernels(package: Path = PACKAGE) -> bool:
     return True
 
 
-forget_stale_kernels()
+delete_stale_cache()

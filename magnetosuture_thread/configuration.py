@@ -1,8 +1,7 @@
-"""Configuration: frozen dataclasses whose fields know their unit, bounds and meaning.
+"""Configuration classes: frozen dataclasses with unit, bounds and description of each field.
 
-A configuration class is written once, with `quantity` for each field. From it come the validation of
-YAML files, the parameters that a node declares and their descriptions. Values are checked when the
-object is made, so an object that exists is valid.
+Validation of YAML files, the parameters that a node declares, and their descriptions are derived from the class.
+Values are checked when the object is created, so every object is valid.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from magnetosuture_thread.errors import ConfigurationError
 
 C = TypeVar("C", bound="Configuration")
 
-# Parameters that every node has, whatever it does.
-OF_ROS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
+# Parameters that rclpy declares for every node.
+ROS_PARAMETERS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a configuration field may hold.
+    """Allowed values of a configuration field.
 
     Attributes:
         description: one sentence for a person.
         unit: SI unit, empty for text and switches.
-        minimum: least value accepted, also of each entry of a list.
-        maximum: greatest value accepted, also of each entry of a list.
-        choices: the words accepted, empty for any.
+        minimum: minimum value accepted, also of each entry of a list.
+        maximum: maximum value accepted, also of each entry of a list.
+        choices: the texts accepted, empty for any.
         multiple: a list's length must be a multiple of this.
     """
 
@@ -46,7 +45,7 @@ class Quantity:
     multiple: int = 1
 
     def expectation(self, kind: type) -> str:
-        """Say in words what is accepted."""
+        """Return what is accepted, in words."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "text", tuple: "a list"}[kind]
@@ -79,7 +78,7 @@ def quantity(
 class Configuration:
     """Base of the configuration dataclasses: checks every field when an object is made.
 
-    A subclass is a frozen dataclass with a `GROUP`, the name of its section in a set-up file, and all
+    A subclass is a frozen dataclass with a `GROUP`, the name of its section in a setup file, and all
     of whose fields are made by `quantity`. It checks what concerns several fields in `check`.
     """
 
@@ -87,7 +86,7 @@ class Configuration:
 
     def __post_init__(self) -> None:
         """Check every field by its quantity, then the fields together."""
-        for about in described(type(self)):
+        for about in configuration_fields(type(self)):
             object.__setattr__(self, about.name, about.checked(getattr(self, about.name)))
         self.check()
 
@@ -96,7 +95,7 @@ class Configuration:
 
 
 @dataclass(frozen=True)
-class Described:
+class ConfigurationField:
     """One field of a configuration class: its name, type, default and quantity."""
 
     group: str
@@ -152,7 +151,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def described(cls: type[Configuration]) -> tuple[Described, ...]:
+def configuration_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
     """Return the fields of a configuration class."""
     hints = get_type_hints(cls)
     result = []
@@ -160,7 +159,9 @@ def described(cls: type[Configuration]) -> tuple[Described, ...]:
         hint = hints[entry.name]
         kind, entries = getattr(hint, "__origin__", hint), getattr(hint, "__args__", (float,))[0]
         assert entry.default is not MISSING, f"{cls.__name__}.{entry.name} has no default"
-        result.append(Described(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"], entries))
+        result.append(
+            ConfigurationField(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"], entries)
+        )
     return tuple(result)
 
 
@@ -175,11 +176,11 @@ def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C
     Raises:
         ConfigurationError: a key is unknown, or a value is of the wrong type or out of its bounds.
     """
-    about = {entry.name: entry for entry in described(cls)}
+    about = {entry.name: entry for entry in configuration_fields(cls)}
     checked = {}
     for name, value in values.items():
         if name not in about:
-            raise ConfigurationError(f"{cls.GROUP}.{name}", value, known_names(name, list(about)), source)
+            raise ConfigurationError(f"{cls.GROUP}.{name}", value, suggest_names(name, list(about)), source)
         checked[name] = about[name].checked(value, source)
     try:
         return cls(**checked)
@@ -189,7 +190,7 @@ def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C
 
 def to_mapping(settings: Configuration) -> dict[str, Any]:
     """Return a configuration object's values by field name, tuples as lists."""
-    values = {about.name: getattr(settings, about.name) for about in described(type(settings))}
+    values = {about.name: getattr(settings, about.name) for about in configuration_fields(type(settings))}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
@@ -200,7 +201,7 @@ class _RosLoader(yaml.SafeLoader):
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return a mapping, or raise where a key stands twice."""
+        """Return a mapping, or raise where a key occurs twice."""
         keys = [key.value for key, _ in node.value]
         twice = next((key for index, key in enumerate(keys) if key in keys[:index]), None)
         if twice is not None:
@@ -208,19 +209,30 @@ class _RosLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_RosLoader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in entries if not tag.endswith((":float", ":timestamp"))]
-    for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_RosLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"),
-    list("-+0123456789."),
-)
+def use_ros_numbers(loader: type[Any], *, decimal_integers: bool = False) -> None:
+    """Make a YAML loader read numbers as ROS does: 1e-5 is a number, and nothing is a date.
+
+    Args:
+        loader: a class of the package `yaml`, changed in place.
+        decimal_integers: whether only decimal integers are numbers; else octal, hexadecimal and others are too.
+    """
+    dropped = (":float", ":timestamp", ":int") if decimal_integers else (":float", ":timestamp")
+    loader.yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in entries if not tag.endswith(dropped)]
+        for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+    signs = list("-+0123456789")
+    if decimal_integers:
+        loader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), signs)
+    number = r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"
+    loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), [*signs, "."])
+
+
+use_ros_numbers(_RosLoader)
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """Return what a YAML file holds, read as ROS does: 1e-5 is a number, nothing is a date, no key stands twice.
+    """Return the content of a YAML file, read as ROS does: 1e-5 is a number, nothing is a date, keys are unique.
 
     Args:
         path: the file.
@@ -241,16 +253,16 @@ def read_yaml(path: Path, what: str) -> Any:
         raise ConfigurationError(what, problem + line, "valid YAML", str(path)) from None
 
 
-def parse_yaml(text: str) -> Any:
-    """Return the value that a text stands for in a parameter file; the text itself where it is no YAML."""
+def parse_parameter_value(text: str) -> Any:
+    """Return the value of a text as in a parameter file; the text itself where it is no YAML."""
     try:
         return yaml.load(text, _RosLoader)
     except yaml.YAMLError:
         return text
 
 
-def known_names(name: str, known: list[str]) -> str:
-    """Say in words which names are known, and which of them may have been meant."""
+def suggest_names(name: str, known: list[str]) -> str:
+    """Return the known names in words, with the closest match as a hint."""
     close = difflib.get_close_matches(name, known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"one of {', '.join(known)}{hint}"

@@ -1,4 +1,4 @@
-"""Errors that carry their evidence: what was given, where, and what was expected."""
+"""Errors with the value that was given, where, and what was expected."""
 
 from __future__ import annotations
 

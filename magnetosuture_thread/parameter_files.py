@@ -1,4 +1,4 @@
-"""ROS 2 parameter files: which sections are for which node, and set-ups made of such sections.
+"""ROS 2 parameter files: sections for nodes, and setups made of such sections.
 
 A section's key says for which nodes it is, as in ROS: `/**` for all, `/**/coil_bridge` for those of this name in any
 namespace, `/lab1/coil_bridge` for one. Of several sections for one node, a later one overrides an earlier one,
@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from magnetosuture_thread.configuration import (
-    OF_ROS,
+    ROS_PARAMETERS,
     Configuration,
-    described,
+    configuration_fields,
     from_mapping,
-    known_names,
     read_yaml,
+    suggest_names,
 )
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.shared_parameters import SHARED
+from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
 PARAMETERS = "ros__parameters"
 EVERY_NODE = "/**"
@@ -50,26 +50,26 @@ def _sections(above: str, content: Mapping[str, Any], source: str) -> Iterable[t
     for name, section in content.items():
         key = f"{above}/{str(name).strip('/')}"
         if not isinstance(section, Mapping) or not section:
-            raise ConfigurationError(shown(key), section, f"one key, {PARAMETERS}", source)
+            raise ConfigurationError(format_key(key), section, f"one key, {PARAMETERS}", source)
         if PARAMETERS not in section:
             yield from _sections(key, section, source)
             continue
         values = section[PARAMETERS]
         if len(section) > 1:
-            raise ConfigurationError(shown(key), list(section), f"one key, {PARAMETERS}", source)
+            raise ConfigurationError(format_key(key), list(section), f"one key, {PARAMETERS}", source)
         if not isinstance(values, Mapping):
-            raise ConfigurationError(f"{shown(key)}.{PARAMETERS}", values, "parameters by name", source)
+            raise ConfigurationError(f"{format_key(key)}.{PARAMETERS}", values, "parameters by name", source)
         yield key, {str(name): value for name, value in values.items()}
 
 
-def matches(key: str, node: str) -> bool:
+def key_matches(key: str, node: str) -> bool:
     """Return whether a section is for a node: `*` stands for one name, `**` for any number of them, none too.
 
     Args:
         key: of the section, with a leading slash.
         node: its fully qualified name.
 
-    >>> matches("/**/coil_bridge", "/lab1/coil_bridge"), matches("/coil_bridge", "/lab1/coil_bridge")
+    >>> key_matches("/**/coil_bridge", "/lab1/coil_bridge"), key_matches("/coil_bridge", "/lab1/coil_bridge")
     (True, False)
     """
     parts = {"**": "(/[^/]+)*", "*": "/[^/]+"}
@@ -77,13 +77,13 @@ def matches(key: str, node: str) -> bool:
     return re.fullmatch(pattern, node) is not None
 
 
-def last_name(key: str) -> str:
+def node_of_key(key: str) -> str:
     """Return the name of the node that a section's key ends in, which may be a wildcard."""
     return key.rpartition("/")[2]
 
 
 def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, Any]:
-    """Read a set-up: a ROS 2 parameter file with shared parameters under `/**` and a section for each node.
+    """Read a setup: a ROS 2 parameter file with shared parameters under `/**` and a section for each node.
 
     Args:
         path: the YAML file.
@@ -96,41 +96,44 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
         ConfigurationError: the file cannot be read, is no parameter file, or holds anything invalid.
     """
     known = {cls.GROUP: cls for cls in classes}
-    fields = {group: {about.name for about in described(cls)} for group, cls in known.items()}
+    fields = {group: {about.name for about in configuration_fields(cls)} for group, cls in known.items()}
     given: dict[str, dict[str, Any]] = {group: {} for group in known}
     spaces: list[str] = []
     for key, section in read_sections(path, "set-up file"):
-        values = {name: value for name, value in section.items() if name.split(".")[0] not in OF_ROS}
-        group = last_name(key)
+        values = {name: value for name, value in section.items() if name.split(".")[0] not in ROS_PARAMETERS}
+        group = node_of_key(key)
         for name, value in values.items():
-            check_list(f"{shown(key)}.{name}", value, str(path))
+            check_list_value(f"{format_key(key)}.{name}", value, str(path))
         if key == EVERY_NODE:
             for name, value in values.items():
-                if name not in SHARED:
-                    expected = f"a shared parameter, {known_names(name, list(SHARED))}; others in their node's section"
+                if name not in SHARED_PARAMETERS:
+                    known_shared = suggest_names(name, list(SHARED_PARAMETERS))
+                    expected = f"a shared parameter, {known_shared}; others in their node's section"
                     raise ConfigurationError(f"{EVERY_NODE}.{name}", value, expected, str(path))
                 for owner in known:
                     if name in fields[owner]:
                         given[owner][name] = value
             continue
         if group not in known:
-            raise ConfigurationError(shown(key), "…", known_names(group, [EVERY_NODE, *known]), str(path))
+            raise ConfigurationError(format_key(key), "…", suggest_names(group, [EVERY_NODE, *known]), str(path))
         space = key.rpartition("/")[0]
         if space and "*" not in space:
             spaces.append(space)
         if len(set(spaces)) > 1:
-            raise ConfigurationError(shown(key), "…", f"one namespace in a set-up, as {spaces[0]} before", str(path))
+            raise ConfigurationError(
+                format_key(key), "…", f"one namespace in a set-up, as {spaces[0]} before", str(path)
+            )
         given[group].update(values)
     return {group: from_mapping(cls, given[group], str(path)) for group, cls in known.items()}
 
 
-def shown(key: str) -> str:
-    """Return a key as people write it: a name alone without its slash."""
+def format_key(key: str) -> str:
+    """Return a key for an error text: a single name without its slash."""
     return key[1:] if key.count("/") == 1 and "*" not in key else key
 
 
-def check_list(name: str, value: Any, source: str) -> None:
-    """Refuse a list that ROS cannot take, or takes for no value at all.
+def check_list_value(name: str, value: Any, source: str) -> None:
+    """Refuse a list that is not valid in ROS.
 
     Raises:
         ConfigurationError: its entries are of several kinds, or there are none.

@@ -1,4 +1,4 @@
-"""Finds the files that ship with the packages: set-ups, message definitions."""
+"""Finds the files that ship with the packages: setups, scenes, message definitions."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ _CHECKOUT = Path(__file__).resolve().parent.parent
 _IN_CHECKOUT = {"magnetosuture_thread": _CHECKOUT, "magnetosuture_msgs": _CHECKOUT / "msg_defs"}
 
 
-def share(package: str) -> Path:
-    """Return the folder that holds a package's shared files.
+def share_directory(package: str) -> Path:
+    """Return the share directory of a package.
 
     In a source checkout that is the checkout itself; otherwise `share/` below a prefix that ROS names
     in AMENT_PREFIX_PATH, or below a place that pip installs into.
@@ -34,8 +34,8 @@ def share(package: str) -> Path:
     raise FileNotFoundError(f"{package} is not installed: no package.xml in any of {[str(f) for f in folders]}")
 
 
-def setup_file(name: str) -> Path:
-    """Return the file of a set-up, given as a path or as the name of one that ships with the package.
+def find_setup_file(name: str) -> Path:
+    """Return the file of a setup, given as a path or as the name of one that ships with the package.
 
     Raises:
         ConfigurationError: there is no such file.
@@ -43,7 +43,7 @@ def setup_file(name: str) -> Path:
     return _named_file("set-up", name, "config", (".yaml", ".yml"))
 
 
-def scene_file(name: str) -> Path:
+def find_scene_file(name: str) -> Path:
     """Return the file of a scene, given as a path or as the name of one that ships with the package.
 
     Raises:
@@ -53,7 +53,7 @@ def scene_file(name: str) -> Path:
 
 
 def _named_file(what: str, name: str, folder: str, endings: tuple[str, ...]) -> Path:
-    shipped = share("magnetosuture_thread") / folder
+    shipped = share_directory("magnetosuture_thread") / folder
     path = Path(name) if Path(name).suffix in endings or os.sep in name else shipped / f"{name}.yaml"
     try:
         exists = path.is_file()

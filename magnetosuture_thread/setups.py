@@ -1,4 +1,4 @@
-"""Set-ups: the settings of all nodes, from one YAML file."""
+"""Setups: the settings of all nodes, from one YAML file."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import EVERY_NODE, load_setup
-from magnetosuture_thread.resources import setup_file
+from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, read_scene
-from magnetosuture_thread.shared_parameters import SHARED
+from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-CLASSES = (
+SETTINGS_CLASSES = (
     VisionTrackerSettings,
     ThreadModelSettings,
     CoilBridgeSettings,
@@ -32,7 +32,7 @@ CLASSES = (
 
 @dataclass(frozen=True)
 class Setup:
-    """One set-up.
+    """The settings of all nodes, and their scene.
 
     Attributes:
         name: the file's name without its ending.
@@ -54,15 +54,15 @@ class Setup:
     follower: PathFollowerSettings
     console: ConsoleSettings
 
-    def within(self, scene: Scene) -> Setup:
-        """Return the set-up with another scene than its file names, as a bag has its own."""
+    def with_scene(self, scene: Scene) -> Setup:
+        """Return the setup with another scene, as that of a bag."""
         other = replace(self)
         other.__dict__["scene"] = scene  # where the cached property looks first
         return other
 
     @property
     def has_scene(self) -> bool:
-        """Whether it names a scene."""
+        """Whether the setup names a scene."""
         return bool(self.model.scene)
 
     @cached_property
@@ -70,7 +70,7 @@ class Setup:
         """The scene that all nodes start from.
 
         Raises:
-            ConfigurationError: the set-up names none, or its file cannot be used.
+            ConfigurationError: the setup names none, or its file cannot be used.
         """
         if not self.has_scene:
             raise ConfigurationError("scene", "none", f"a scene file under {EVERY_NODE}", str(self.path))
@@ -88,7 +88,7 @@ def _check_agreement(path: Path, settings: Mapping[str, Configuration]) -> None:
     for group, values in settings.items():
         if group == RigSettings.GROUP:
             continue
-        for name in SHARED:
+        for name in SHARED_PARAMETERS:
             if hasattr(values, name):
                 owner, expected = first.setdefault(name, (group, getattr(values, name)))
                 if getattr(values, name) != expected:
@@ -97,21 +97,21 @@ def _check_agreement(path: Path, settings: Mapping[str, Configuration]) -> None:
 
 
 def read_setup(name: str, scene: Scene | None = None) -> Setup:
-    """Read a set-up, given as a path or as the name of one that ships with the package.
+    """Read a setup, given as a path or as the name of one that ships with the package.
 
     Args:
-        name: of the set-up, or the path of its file.
+        name: of the setup, or the path of its file.
         scene: in place of the one that the file names.
 
     Raises:
         ConfigurationError: there is no such file, or it holds anything invalid.
     """
-    path = setup_file(name)
-    settings = load_setup(path, CLASSES)
+    path = find_setup_file(name)
+    settings = load_setup(path, SETTINGS_CLASSES)
     _check_agreement(path, settings)
-    setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in CLASSES))
+    setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in SETTINGS_CLASSES))
     if scene is not None:  # as of a bag, of which no path is followed
-        return setup.within(scene)
+        return setup.with_scene(scene)
     if setup.has_scene:
         try:
             setup.follower.check_path(setup.scene)

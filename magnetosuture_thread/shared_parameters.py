@@ -1,7 +1,7 @@
-"""Parameters that several nodes share: described once here, written once in a set-up, under `/**`.
+"""Parameters that several nodes share, written once in a setup under `/**`.
 
-Every node is given all parameters under `/**`; it takes those that its settings have, and leaves the others here
-aside. Any other parameter that a node does not know is refused.
+Every node receives all parameters under `/**`. It uses those of its settings and ignores the other shared ones. Any
+other unknown parameter is refused.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ _QUANTITIES: dict[str, dict[str, Any]] = {
     },
 }
 
-SHARED = tuple(_QUANTITIES)
+SHARED_PARAMETERS = tuple(_QUANTITIES)
 """Names of the shared parameters."""
 
 
-def shared(name: str) -> Any:
+def shared_parameter(name: str) -> Any:
     """Return the dataclass field of a shared parameter."""
     about = dict(_QUANTITIES[name])
     return quantity(about.pop("default"), about.pop("description"), **about)

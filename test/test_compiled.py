@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from magnetosuture_thread.compiled import compiled, forget_stale_kernels
+from magnetosuture_thread.compiled import compiled, delete_stale_cache
 
 
 def test_a_compiled_function_is_the_same_function():
@@ -36,15 +36,15 @@ def test_kernels_are_forgotten_when_any_file_with_compiled_functions_changes(tmp
         (kernels / "caller.1.nbc").write_text("code")
 
     cache()
-    assert forget_stale_kernels(tmp_path)
+    assert delete_stale_cache(tmp_path)
     assert not cached()
     cache()
-    assert not forget_stale_kernels(tmp_path)
+    assert not delete_stale_cache(tmp_path)
     assert cached()
     other.write_text("x = 2\n")  # holds no compiled function
-    assert not forget_stale_kernels(tmp_path)
+    assert not delete_stale_cache(tmp_path)
     os.utime(callee, (1.0, 1.0))
-    assert forget_stale_kernels(tmp_path)
+    assert delete_stale_cache(tmp_path)
     assert not cached()
 
 
@@ -77,4 +77,4 @@ print(len(compilations.buffer))
 def test_a_package_that_cannot_be_written_is_left_alone(tmp_path: Path):
     (tmp_path / "kernel.py").write_text("from magnetosuture_thread.compiled import compiled\n")
     (tmp_path / "__pycache__").write_text("a file where a folder should be, as nothing can be written into it")
-    assert forget_stale_kernels(tmp_path)
+    assert delete_stale_cache(tmp_path)

@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import pytest
 
-from magnetosuture_thread.configuration import Configuration, described, from_mapping, quantity, to_mapping
+from magnetosuture_thread.configuration import Configuration, configuration_fields, from_mapping, quantity, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.parameter_files import load_setup, matches
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.parameter_files import key_matches, load_setup
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def test_an_object_made_directly_is_checked_too():
 def test_mapping_goes_there_and_back():
     oven = Oven(temperature=500.0, corners=(0.0, 1.0))
     assert from_mapping(Oven, to_mapping(oven)) == oven
-    assert {about.name for about in described(Oven)} == set(to_mapping(oven))
+    assert {about.name for about in configuration_fields(Oven)} == set(to_mapping(oven))
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ class Kettle(Configuration):
     GROUP: ClassVar[str] = "kettle"
 
     volume: float = quantity(0.001, "of the water", unit="m^3", minimum=0.0, maximum=0.01)
-    viscosity: float = shared("viscosity")
+    viscosity: float = shared_parameter("viscosity")
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,8 @@ class Pot(Configuration):
 
     GROUP: ClassVar[str] = "pot"
 
-    viscosity: float = shared("viscosity")
-    thread_length: float = shared("thread_length")
+    viscosity: float = shared_parameter("viscosity")
+    thread_length: float = shared_parameter("thread_length")
 
 
 COMMON, OWN = "/**: {ros__parameters: {viscosity: 2.0}}\n", "/**/kettle: {ros__parameters: {viscosity: 3.0}}\n"
@@ -218,4 +218,4 @@ def test_what_is_of_ros_may_stand_under_every_key(tmp_path: Path):
     ],
 )
 def test_keys_match_as_in_ros(key: str, node: str, is_for: bool):
-    assert matches(key, node) == is_for
+    assert key_matches(key, node) == is_for

@@ -21,11 +21,11 @@ import yaml
 from benchmarks.__main__ import main as benchmark
 from magnetosuture_thread import interface
 from magnetosuture_thread.cli.parser import make_parser
-from magnetosuture_thread.configuration import OF_ROS, described
+from magnetosuture_thread.configuration import ROS_PARAMETERS, configuration_fields
 from magnetosuture_thread.model.thread import MATERIALS
 from magnetosuture_thread.scene import read_scene
-from magnetosuture_thread.setups import CLASSES
-from magnetosuture_thread.shared_parameters import SHARED
+from magnetosuture_thread.setups import SETTINGS_CLASSES
+from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -240,7 +240,11 @@ def check(line: str, *, complete: bool) -> None:
 @cache
 def parameters() -> frozenset[str]:
     """Return the names of all parameters."""
-    return frozenset({about.name for group in CLASSES for about in described(group)} | set(SHARED) | OF_ROS)
+    return frozenset(
+        {about.name for group in SETTINGS_CLASSES for about in configuration_fields(group)}
+        | set(SHARED_PARAMETERS)
+        | ROS_PARAMETERS
+    )
 
 
 @cache
@@ -403,7 +407,12 @@ def test_the_message_table_is_that_of_the_code():
 
 
 def test_the_table_of_shared_parameters_is_that_of_the_code():
-    about = {entry.name: entry for group in CLASSES for entry in described(group) if entry.name in SHARED}
+    about = {
+        entry.name: entry
+        for group in SETTINGS_CLASSES
+        for entry in configuration_fields(group)
+        if entry.name in SHARED_PARAMETERS
+    }
     expected = {name: (str(entry.default), entry.quantity.unit) for name, entry in about.items()}
     rows = {row[0].strip("`"): (row[1], row[2]) for row in table(NODES_PAGE, "Shared parameters")}
     assert rows == expected
@@ -432,7 +441,7 @@ def test_materials_are_listed():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_yaml_blocks_hold(page: Path, tmp_path: Path):
-    groups = {group.GROUP: {about.name: about for about in described(group)} for group in CLASSES}
+    groups = {group.GROUP: {about.name: about for about in configuration_fields(group)} for group in SETTINGS_CLASSES}
     for block in blocks(page, "yaml"):
         content = yaml.safe_load(block)
         if "dish" in content:

@@ -1,4 +1,4 @@
-"""Imports run one way through the house, and every package outside has one room that knows it."""
+"""Imports run one way through the package, and every third-party package is known to one subpackage."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 import magnetosuture_thread
 from magnetosuture_thread.interface import NODES, RIG_NODES
 
-HOUSE = Path(magnetosuture_thread.__file__).parent
+PACKAGE = Path(magnetosuture_thread.__file__).parent
 
-# What each room may import of the house, itself aside.
+# What each subpackage or top-level module may import of the package, itself aside.
 BASE = {"errors", "configuration", "resources", "shared_parameters", "parameter_files", "scene"}
 ALLOWED = {
     "errors": set(),
@@ -78,7 +78,7 @@ ALLOWED = {
     },
 }
 
-# Packages that only some rooms may know.
+# Third-party packages that only some subpackages may import.
 OWNERS = {
     "aiohttp": {"console"},
     "basicmicro": {"coils"},
@@ -110,7 +110,7 @@ OWNERS = {
     "visualization_msgs": {"nodes"},
 }
 
-MODULES = sorted(HOUSE.rglob("*.py"))
+MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
 def imported(path: Path) -> set[str]:
@@ -127,45 +127,45 @@ def imported(path: Path) -> set[str]:
     return names
 
 
-def room(path: Path) -> str:
-    """Return the room that a file is in: its folder, or its own name at the top."""
-    return path.relative_to(HOUSE).parts[0].removesuffix(".py")
+def part(path: Path) -> str:
+    """Return the part that a file belongs to: its subpackage, or its own name at the top level."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(HOUSE)))
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_run_one_way(path: Path):
-    here = room(path)
+    here = part(path)
     if here == "__init__":  # the public API, whose names are imported when they are first used
         at_import = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Import | ast.ImportFrom)]
         assert {getattr(node, "module", None) for node in at_import} == {"importlib", "typing"}
         return
-    rooms = {name.split(".")[1] for name in imported(path) if name.startswith("magnetosuture_thread.")} - {here}
-    assert rooms <= ALLOWED[here], f"{here} may not import {rooms - ALLOWED[here]}"
+    parts = {name.split(".")[1] for name in imported(path) if name.startswith("magnetosuture_thread.")} - {here}
+    assert parts <= ALLOWED[here], f"{here} may not import {parts - ALLOWED[here]}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(HOUSE)))
-def test_packages_outside_are_known_in_their_rooms_only(path: Path):
-    here = room(path)
-    strangers = {
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_third_party_packages_are_imported_by_their_owners_only(path: Path):
+    here = part(path)
+    foreign = {
         package
         for package in (name.split(".")[0] for name in imported(path))
         if here not in OWNERS.get(package, {here})
     }
-    assert not strangers, f"{here} may not know {strangers}"
+    assert not foreign, f"{here} may not import {foreign}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(HOUSE)))
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_what_is_installed_needs_nothing_of_the_source_tree(path: Path):
     assert not {name.split(".")[0] for name in imported(path)} & {"benchmarks", "examples", "test"}
 
 
-def test_no_room_is_missing_from_the_rules():
-    assert {room(path) for path in MODULES} - {"__init__"} == set(ALLOWED)
+def test_no_part_is_missing_from_the_rules():
+    assert {part(path) for path in MODULES} - {"__init__"} == set(ALLOWED)
 
 
 def test_modules_stay_small():
-    """A file is one concept, and its functions are bounded in complexity by the linter; this only keeps heaps away."""
-    sizes = {str(path.relative_to(HOUSE)): len(path.read_text().splitlines()) for path in MODULES}
+    """A file is one concept, with functions bounded in complexity by the linter; this bounds the size of a file."""
+    sizes = {str(path.relative_to(PACKAGE)): len(path.read_text().splitlines()) for path in MODULES}
     assert not {name: size for name, size in sizes.items() if size > 400}
     nodes = {
         name: size for name, size in sizes.items() if name in {f"nodes/{n}.py" for n in (*NODES, *RIG_NODES, "console")}

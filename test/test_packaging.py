@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.resources import share
+from magnetosuture_thread.resources import share_directory
 
 ROOT = Path(__file__).parent.parent
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
@@ -81,5 +81,5 @@ def test_requires_python_is_left_out():
 
 
 def test_shared_files_are_found():
-    assert (share("magnetosuture_thread") / "config").is_dir()
-    assert (share("magnetosuture_msgs") / "msg" / "SafetyMargins.msg").is_file()
+    assert (share_directory("magnetosuture_thread") / "config").is_dir()
+    assert (share_directory("magnetosuture_msgs") / "msg" / "SafetyMargins.msg").is_file()

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.resources import setup_file, share
+from magnetosuture_thread.resources import find_setup_file, share_directory
 from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.shared_parameters import SHARED
+from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
-SHIPPED = sorted(path.stem for path in (share("magnetosuture_thread") / "config").glob("*.yaml"))
+SHIPPED = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
 
 
 def test_there_are_setups():
@@ -32,7 +32,7 @@ def test_every_setup_that_ships_loads(name: str):
 def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     setup = read_setup(name)
     rig, vision, coils = setup.rig, setup.vision, setup.coils
-    for name in SHARED:
+    for name in SHARED_PARAMETERS:
         if hasattr(rig, name) and hasattr(vision, name):
             assert getattr(rig, name) == getattr(vision, name)
     assert (rig.thread_length, rig.thread_attachment) == (setup.model.thread_length, setup.model.attachment)
@@ -155,7 +155,7 @@ def test_a_setup_without_a_scene_says_so_once_it_is_needed(tmp_path: Path):
     with pytest.raises(ConfigurationError, match=r"scene: got 'none', expected a scene file under /\*\*"):
         _ = setup.scene
     other = Scene(Dish(0.15))
-    assert setup.within(other).scene is other
+    assert setup.with_scene(other).scene is other
     assert read_setup(str(path), other).scene is other
 
 
@@ -184,9 +184,9 @@ def test_a_needle_in_millimetres_is_refused(tmp_path: Path):
 
 def test_an_unknown_setup_is_refused_with_the_known_ones():
     with pytest.raises(ConfigurationError, match="petri_150mm_silk"):
-        setup_file("petri_36mm")
+        find_setup_file("petri_36mm")
     with pytest.raises(ConfigurationError, match=r"nowhere\.yaml"):
-        setup_file("nowhere.yaml")
+        find_setup_file("nowhere.yaml")
 
 
 def test_a_thread_must_make_sense(tmp_path: Path):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.solver.cases import Case
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.rod import RodFormulation
 from magnetosuture_thread.model.formulations.step import PrescribedMotion, StepResult, ThreadState
@@ -159,8 +159,8 @@ class Walk:
     """
 
     def __init__(self, case: Case, solver: Solver) -> None:
-        surroundings = Surroundings(case.shapes, REACH, case.dimension)
-        self._formulation = RodFormulation(case.thread, surroundings, solver, ANY_RESIDUAL)
+        workspace = Workspace(case.shapes, REACH, case.dimension)
+        self._formulation = RodFormulation(case.thread, workspace, solver, ANY_RESIDUAL)
         self._case = case
         self._taken = 0
         self.state = ThreadState.at_rest(case.start)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magnetosuture_thread.bags.transforms import Rigid, rigid_of, rotation_of
-from magnetosuture_thread.bags.types import MESSAGES
+from magnetosuture_thread.bags.message_types import MESSAGES
+from magnetosuture_thread.bags.transforms import RigidTransform, rotation_from_message, transform_from_message
 from magnetosuture_thread.messages.building import ADD, LINE_STRIP
 
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -73,10 +73,10 @@ def path_of_marker(message: Any, time: int) -> Any:
     turn, place = message.pose.orientation, message.pose.position
     # RViz takes a quaternion of zeros, which a careless node sends, for no rotation.
     is_none = not np.any([turn.x, turn.y, turn.z, turn.w])
-    rotation = Rotation.identity() if is_none else rotation_of(turn)
+    rotation = Rotation.identity() if is_none else rotation_from_message(turn)
     if rotation is None:
         raise UnfitError("an orientation that is none")
-    moved = Rigid(rotation, np.array([place.x, place.y, place.z])).points(points)
+    moved = RigidTransform(rotation, np.array([place.x, place.y, place.z])).apply(points)
     return _path(message, [MESSAGES.pose(xyz, UPRIGHT) for xyz in moved])
 
 
@@ -111,7 +111,7 @@ CONVERSIONS: dict[str, dict[str, Convert]] = {
 }
 
 
-def moved(message: Any, rigid: Rigid, frame: str) -> Any:
+def moved(message: Any, rigid: RigidTransform, frame: str) -> Any:
     """Return a message of one of the types in `CONVERSIONS` in another frame.
 
     Of a twist only the directions change: it stays the velocity of the same point, seen from a frame at rest.
@@ -130,9 +130,9 @@ def moved(message: Any, rigid: Rigid, frame: str) -> Any:
     return MESSAGES.twist_stamped(header, _twist(message.twist, rigid.rotation.apply))
 
 
-def _moved_pose(pose: Any, rigid: Rigid) -> Any:
-    place = rigid.points(np.array([pose.position.x, pose.position.y, pose.position.z], dtype=float))
-    turn, rotation = pose.orientation, rotation_of(pose.orientation)
+def _moved_pose(pose: Any, rigid: RigidTransform) -> Any:
+    place = rigid.apply(np.array([pose.position.x, pose.position.y, pose.position.z], dtype=float))
+    turn, rotation = pose.orientation, rotation_from_message(pose.orientation)
     if rotation is None:
         raise UnfitError("an orientation that is none")
     # Composed by hand, so that its length stays what it was: whoever takes it judges that.
@@ -143,7 +143,7 @@ def _moved_pose(pose: Any, rigid: Rigid) -> Any:
 def _pose_in(message: Any) -> Any:
     """Return the pose in a message, however deep."""
     if hasattr(message, "transform"):
-        if rigid_of(message.transform) is None:
+        if transform_from_message(message.transform) is None:
             raise UnfitError("a transform that is none")
         return _pose(message.transform.translation, message.transform.rotation)
     pose = getattr(message.pose, "pose", message.pose)

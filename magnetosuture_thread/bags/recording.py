@@ -1,4 +1,4 @@
-"""A bag in the words of our graph: its topics, types and frame, whatever the recorder's were."""
+"""Adapts a bag to our graph: converts its topics, types and frames to ours."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ from typing import Any
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.conversion import CONVERSIONS, UNSTAMPED_TWIST, UnfitError, moved
-from magnetosuture_thread.bags.reader import Bag, Record
-from magnetosuture_thread.bags.transforms import TF_MESSAGE, TOPICS, Rigid, Transforms
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.transforms import TF_MESSAGE, TOPICS, RigidTransform, TransformTree
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA, DISH_FRAME, Channel
-from magnetosuture_thread.messages.cdr import is_in_dish, stamp_and_frame
+from magnetosuture_thread.messages.cdr import is_in_dish_frame, stamp_and_frame
 
 CHANNELS = tuple(value for value in vars(interface).values() if isinstance(value, Channel))
-_CAMERA_NAMES = {channel.recorded for channel in CAMERA.values()}
+_CAMERA_TOPICS = {channel.recorded for channel in CAMERA.values()}
 _CAMERA_TYPES = {channel.type_name: channel for channel in CAMERA.values()}
 
 
 class Recording:
-    """A bag as our graph would have recorded it.
+    """A bag whose messages are converted to the topics, types and frame of our graph.
 
-    Messages whose type and frame are ours already are passed on byte for byte. Camera images are told by their
-    type, whichever of the two topics they are on.
+    Messages whose type and frame are ours already are passed on byte for byte. Camera images are identified by their
+    type, whichever of the two camera topics they are on.
 
     Args:
         bag: the bag, its topics remapped to ours.
-        dish_frame: name of the bag's frame that is ours, `dish`.
+        dish_frame: name of the dish frame in the bag.
 
     Attributes:
         path: of the bag.
         camera: the camera's channel, the one with more messages if there are both; None if there is none.
         counts: messages of each of our channels that the bag has, by its recorded name.
-        unfit: why a topic that has the name of one of our channels cannot be taken for it.
-        refused: how many messages could not be converted, by the reason.
+        unfit: why a topic with the name of one of our channels cannot be used, by that name.
+        refused: number of messages that could not be converted, by reason.
         notes: as the bag's.
         start: as the bag's [ns].
         duration: as the bag's [s].
@@ -52,17 +52,17 @@ class Recording:
         self.counts: Counter[str] = Counter()
         self._bag = bag
         self._dish_frame = dish_frame.lstrip("/")
-        self._transforms: Transforms | None = None
+        self._transforms: TransformTree | None = None
         self._topics: dict[Channel, str] = {}
         for channel in CHANNELS:
-            self._find(channel)
+            self._match(channel)
         for channel, topic in self._topics.items():
             self.counts[channel.recorded] = bag.counts[topic]
         cameras = [channel for channel in CAMERA.values() if self.counts.get(channel.recorded)]
         self.camera: Channel | None = max(cameras, key=lambda c: self.counts[c.recorded], default=None)
 
     def require(self, channel: Channel) -> None:
-        """Raise `BagError` unless the bag has messages that can be taken for a channel."""
+        """Raise `BagError` unless the bag has messages for a channel."""
         if channel.recorded in self.unfit:
             raise BagError(self.path, self.unfit[channel.recorded])
         if not self.counts.get(channel.recorded):
@@ -73,8 +73,8 @@ class Recording:
 
     def records(
         self, channels: Collection[Channel], *, start: float = 0.0, duration: float | None = None
-    ) -> Iterator[Record]:
-        """Go through the messages of some channels by time; what cannot be converted is counted in `refused`.
+    ) -> Iterator[RecordedMessage]:
+        """Yield the messages of some channels by time; those that cannot be converted are counted in `refused`.
 
         Args:
             channels: of our graph; those that the bag lacks give nothing.
@@ -82,38 +82,38 @@ class Recording:
             duration: only messages until this time after `start` [s]; all that follow if None.
 
         Raises:
-            BagError: a topic has another type than can be converted, or a frame from which nothing leads to the
-                dish's; or the bag has changed since it was opened.
+            BagError: a topic has a type that cannot be converted, or a frame without a transform to the dish frame; or
+                the bag has changed since it was opened.
         """
         for channel in channels:
             if channel.recorded in self.unfit:
                 raise BagError(self.path, self.unfit[channel.recorded])
         wanted = {self._topics[channel]: channel for channel in channels if channel in self._topics}
-        # The first of each, so that a frame that leads nowhere is known before anything is made of the others.
+        # The first message of each, so that an unknown frame is reported before any message is used.
         for topic, channel in wanted.items():
-            self._try(topic, channel)
+            self._check_first(topic, channel)
         return self._records(wanted, start, duration)
 
-    def takes(self, topic: str) -> bool:
-        """Return whether one of the bag's topics is one of our channels."""
+    def uses(self, topic: str) -> bool:
+        """Return whether a topic of the bag is used as one of our channels."""
         return topic in self._topics.values()
 
     def problem_of(self, topic: str) -> str:
-        """Return why a topic with the name of one of our channels cannot be taken for it; empty if it can."""
+        """Return why a topic with the name of one of our channels cannot be used; empty if it can."""
         for channel, name in self._topics.items():
             if name == topic:
                 try:
-                    self._try(topic, channel)
+                    self._check_first(topic, channel)
                 except BagError as error:
                     return error.problem
         return self.unfit.get(topic, "")
 
-    def _try(self, topic: str, channel: Channel) -> None:
+    def _check_first(self, topic: str, channel: Channel) -> None:
         for record in self._bag.records({topic}, refused=Counter()):
             self._convert(record, channel)
             return
 
-    def _records(self, wanted: dict[str, Channel], start: float, duration: float | None) -> Iterator[Record]:
+    def _records(self, wanted: dict[str, Channel], start: float, duration: float | None) -> Iterator[RecordedMessage]:
         for record in self._bag.records(wanted, start=start, duration=duration, refused=self.refused):
             channel = wanted[record.topic]
             converted = self._convert(record, channel)
@@ -122,89 +122,89 @@ class Recording:
             else:
                 yield converted
 
-    def _find(self, channel: Channel) -> None:
-        """Find the topic that is one of our channels."""
+    def _match(self, channel: Channel) -> None:
+        """Find the topic for one of our channels."""
         bag, name = self._bag, channel.recorded
-        if name in _CAMERA_NAMES:
-            fitting = [topic for topic in _CAMERA_NAMES if bag.topics.get(topic) == channel.type_name]
+        if name in _CAMERA_TOPICS:
+            fitting = [topic for topic in _CAMERA_TOPICS if bag.topics.get(topic) == channel.type_name]
             if len(fitting) > 1:
-                fitting = [name]  # what has the channel's own name comes first
+                fitting = [name]  # the name of the channel comes first
             if fitting:
                 self._topics[channel] = fitting[0]
                 return
             if bag.topics.get(name) in _CAMERA_TYPES:
-                return  # the other camera channel takes it
+                return  # used by the other camera channel
         if name in bag.conflicts:
             self.unfit[name] = f"topic {name} has two types, {' and '.join(bag.conflicts[name])}; expected one"
         elif name in bag.topics:
-            taken = {*CONVERSIONS.get(channel.type_name, {}), channel.type_name}
-            if bag.topics[name] in taken:
+            accepted = {*CONVERSIONS.get(channel.type_name, {}), channel.type_name}
+            if bag.topics[name] in accepted:
                 self._topics[channel] = name
             else:
-                expected = " or ".join(sorted(taken))
+                expected = " or ".join(sorted(accepted))
                 self.unfit[name] = f"topic {name} is of type {bag.topics[name]}, expected {expected}"
 
-    def _convert(self, record: Record, channel: Channel) -> Record | str:
-        """Return a record as our graph would have it; the reason where it cannot be one."""
+    def _convert(self, record: RecordedMessage, channel: Channel) -> RecordedMessage | str:
+        """Return a message converted to our type and frame; the reason where that is impossible."""
         conversions = CONVERSIONS.get(channel.type_name)
         is_ours = record.type_name == channel.type_name and record.decoder.is_ours
-        if is_ours and (conversions is None or (self._dish_frame == DISH_FRAME and is_in_dish(record.data))):
-            return record if record.topic == channel.recorded else self._said(record, channel, record.data)
+        if is_ours and (conversions is None or (self._dish_frame == DISH_FRAME and is_in_dish_frame(record.data))):
+            return record if record.topic == channel.recorded else self._as_channel(record, channel, record.data)
         if conversions is None:
-            return f"its type {record.type_name} is defined in another way than ours"
+            return f"its type {record.type_name} has another definition than ours"
         frame, stamp = self._dish_frame, record.time
         try:
             if record.type_name != UNSTAMPED_TWIST:
                 stamp, frame = stamp_and_frame(record.topic, record.data)
             message = conversions[record.type_name](record.decode(), record.time)
         except (BagError, UnfitError, AttributeError, TypeError, ValueError) as problem:
-            # Fields that are not there, or are of other kinds: another definition of the type.
+            # Fields are missing or of other types: another definition of the type.
             return problem.problem if isinstance(problem, BagError) else str(problem)
         frame = frame.lstrip("/")
         if frame == self._dish_frame:
             message.header.frame_id = DISH_FRAME
         else:
-            rigid = self._into_dish(record.topic, frame, stamp)
-            if rigid is None:
-                return f"nothing tells where its frame {frame} was at its time"
+            transform = self._transform_to_dish(record.topic, frame, stamp)
+            if transform is None:
+                return f"no transform from its frame {frame} at its time"
             try:
-                message = moved(message, rigid, DISH_FRAME)
+                message = moved(message, transform, DISH_FRAME)
             except (UnfitError, ValueError) as problem:  # a covariance of another size
                 return str(problem)
         try:
             data = bytes(typestore().serialize_cdr(message, channel.type_name))
-        except Exception:  # The writer raises whatever a value makes it stumble over, such as a stamp out of range.
-            return "a value that our type has no room for"
-        return self._said(record, channel, data)
+        except Exception:  # The serialiser raises any error, for example for a stamp out of range.
+            return "a value out of range of our type"
+        return self._as_channel(record, channel, data)
 
-    def _into_dish(self, topic: str, frame: str, stamp: int) -> Rigid | None:
-        """Return where the points of a frame are in the dish's at a time [ns]; None where nothing tells.
+    def _transform_to_dish(self, topic: str, frame: str, stamp: int) -> RigidTransform | None:
+        """Return the transform from a frame to the dish frame at a time [ns]; None where it is unknown.
 
         Raises:
-            BagError: nothing ever leads from the frame to the dish's.
+            BagError: the frame is never connected to the dish frame.
         """
         if self._transforms is None:
-            self._transforms = Transforms(self._told_transforms())
-        if not frame or not self._transforms.lead(frame, self._dish_frame):
+            self._transforms = TransformTree(self._transform_messages())
+        if not frame or not self._transforms.is_connected(frame, self._dish_frame):
             known = ", ".join(self._transforms.frames) or "none"
-            which = f"the frame {frame}, from which nothing leads to {self._dish_frame}" if frame else "an empty frame"
+            which = f"the frame {frame}, which is not connected to {self._dish_frame}" if frame else "an empty frame"
             raise BagError(
                 self.path,
-                f"topic {topic} has {which}; frames told on {' and '.join(TOPICS)}: {known}. "
-                f"If it is the dish's own frame, say so: --frame {frame or repr(frame)}",
+                f"topic {topic} has {which}; frames on {' and '.join(TOPICS)}: {known}. "
+                f"If it is the dish frame, give it: --frame {frame or repr(frame)}",
             )
-        return self._transforms.between(frame, self._dish_frame, stamp)
+        return self._transforms.lookup(frame, self._dish_frame, stamp)
 
-    def _told_transforms(self) -> Iterator[tuple[str, Any]]:
-        """Yield topic and message of all transforms; what is none is counted in `refused`."""
+    def _transform_messages(self) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message of all transforms; invalid ones are counted in `refused`."""
         topics = [topic for topic in TOPICS if self._bag.topics.get(topic) == TF_MESSAGE]
         for record in self._bag.records(topics, refused=self.refused):
             try:
                 if not record.decoder.is_ours:
-                    raise BagError(record.topic, f"its type {record.type_name} is defined in another way than ours")
+                    raise BagError(record.topic, f"its type {record.type_name} has another definition than ours")
                 yield record.topic, record.decode()
             except BagError as error:
                 self.refused[str(error)] += 1
 
-    def _said(self, record: Record, channel: Channel, data: bytes) -> Record:
-        return Record(channel.recorded, channel.type_name, record.time, data)
+    def _as_channel(self, record: RecordedMessage, channel: Channel, data: bytes) -> RecordedMessage:
+        return RecordedMessage(channel.recorded, channel.type_name, record.time, data)

@@ -1,4 +1,4 @@
-"""Topics of a bag under other names."""
+"""Remapping of topic names, as in ROS."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 from magnetosuture_thread.errors import BagError, ConfigurationError
 
 
-def remapping(text: str) -> tuple[str, str]:
-    """Return a topic's recorded name and the name it shall have, written as ROS does.
+def parse_remap(text: str) -> tuple[str, str]:
+    """Return the recorded and the new name of a topic from a ROS remapping rule.
 
-    >>> remapping("/camera/color/image_raw:=camera/image_raw")
+    >>> parse_remap("/camera/color/image_raw:=camera/image_raw")
     ('/camera/color/image_raw', '/camera/image_raw')
 
     Args:
@@ -25,16 +25,16 @@ def remapping(text: str) -> tuple[str, str]:
     names = [part.strip() for part in (before, after)]
     if not sign or not all(name.strip("/") for name in names) or any(set(name) & set(" :=") for name in names):
         raise ConfigurationError("remap", text, "FROM:=TO, two topics, for example /cam/image:=/camera/image_raw")
-    return recorded(names[0]), recorded(names[1])
+    return absolute_topic(names[0]), absolute_topic(names[1])
 
 
-def recorded(topic: str) -> str:
-    """Return a topic's name with a leading slash."""
+def absolute_topic(topic: str) -> str:
+    """Return the name of a topic with a leading slash."""
     return topic if topic.startswith("/") else f"/{topic}"
 
 
-def renamed(path: Path, topics: Collection[str], remap: Mapping[str, str]) -> dict[str, str]:
-    """Return the name of each of a bag's topics once they are remapped.
+def apply_remap(path: Path, topics: Collection[str], remap: Mapping[str, str]) -> dict[str, str]:
+    """Return the remapped name of each topic of a bag.
 
     Args:
         path: of the bag, for errors.
@@ -46,14 +46,14 @@ def renamed(path: Path, topics: Collection[str], remap: Mapping[str, str]) -> di
     """
     names = {topic: topic for topic in topics}
     for before, after in remap.items():
-        known = [topic for topic in topics if recorded(topic) == recorded(before)]
+        known = [topic for topic in topics if absolute_topic(topic) == absolute_topic(before)]
         if not known:
-            raise BagError(path, f"has no topic {recorded(before)} to remap{_suggestion(before, topics)}")
-        names[known[0]] = recorded(after)
-    together: dict[str, list[str]] = {}
+            raise BagError(path, f"has no topic {absolute_topic(before)} to remap{_suggestion(before, topics)}")
+        names[known[0]] = absolute_topic(after)
+    sources: dict[str, list[str]] = {}
     for topic, name in sorted(names.items()):
-        together.setdefault(name, []).append(topic)
-    for name, own in together.items():
+        sources.setdefault(name, []).append(topic)
+    for name, own in sources.items():
         if len(own) > 1 and name in own:
             other = next(topic for topic in own if topic != name)
             raise BagError(path, f"has {name} itself; {other} cannot be remapped to it without mixing the two")
@@ -63,6 +63,6 @@ def renamed(path: Path, topics: Collection[str], remap: Mapping[str, str]) -> di
 
 
 def _suggestion(topic: str, topics: Collection[str]) -> str:
-    close = get_close_matches(recorded(topic), topics, n=1)
+    close = get_close_matches(absolute_topic(topic), topics, n=1)
     meant = f"; did you mean {close[0]}?" if close else ""
     return f"{meant}; its topics: {', '.join(sorted(topics)) or 'none'}"

@@ -1,4 +1,4 @@
-"""Writes what is intact in a bag into a new one that is whole."""
+"""Repairs a bag: writes its intact messages into a new one."""
 
 from __future__ import annotations
 
@@ -7,29 +7,30 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from magnetosuture_thread.bags.message_types import own_definition
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import Connection
-from magnetosuture_thread.bags.writer import BagWriter, our_definition
+from magnetosuture_thread.bags.writer import BagWriter
 
 
-def repair(
+def write_repaired_bag(
     bag: Bag,
     folder: Path,
     name: str,
     refused: Counter[str],
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Callable[[float], None] = lambda fraction: None,
 ) -> int:
     """Write every intact message of a bag into a new one, with its notes and definitions.
 
-    Types keep the bag's own definitions; only where it has none and we know the type, ours is written. Packed
-    messages are unpacked, and topics have the names that they were remapped to.
+    Types keep the definitions of the bag; ours is written where it has none and we know the type. Compressed messages
+    are decompressed, and topics have their remapped names.
 
     Args:
-        bag: the old one.
+        bag: the bag to repair.
         folder: of the new one; must be empty.
         name: of the new one.
-        refused: to count messages in, by the reason, that cannot be unpacked.
-        progress: called with the share done, 0 to 1.
+        refused: counts the messages that cannot be decompressed, by reason.
+        progress: called with the completed fraction, 0 to 1.
 
     Returns:
         The number of messages.
@@ -42,7 +43,7 @@ def repair(
     with BagWriter(folder, bag.notes, name=name) as writer:
         for connection in bag.connections():
             if connection not in numbers:
-                numbers[connection] = writer.add_connection(_told(bag, connection))
+                numbers[connection] = writer.add_connection(_defined(bag, connection))
         for connection, record in bag.every_record(refused):
             writer.write_to(numbers[connection], record.time, record.data)
             count += 1
@@ -50,9 +51,9 @@ def repair(
     return count
 
 
-def _told(bag: Bag, connection: Connection) -> Connection:
-    """Return a connection as the new bag tells it."""
+def _defined(bag: Bag, connection: Connection) -> Connection:
+    """Return a connection as it is written to the new bag."""
     definition = connection.definition
     if not definition.text:
-        definition = our_definition(definition.type_name)
+        definition = own_definition(definition.type_name)
     return replace(connection, topic=bag.name_of(connection), definition=definition)

@@ -1,4 +1,4 @@
-"""What a bag holds, topic by topic, and what is odd about it."""
+"""Report on the content of a bag: topics, rates, gaps, frames and damage."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import CDR
 from magnetosuture_thread.errors import BagError
@@ -16,20 +16,20 @@ from magnetosuture_thread.messages.cdr import stamp_and_frame
 
 @dataclass
 class TopicReport:
-    """What was said on a topic.
+    """Report on a topic.
 
     Attributes:
         topic: its name, remapped.
-        types: of its messages; more than one is an error of the recorder's.
+        types: of its messages; more than one is an error of the recorder.
         count: number of messages.
         first: when the first was recorded [s since the bag's start]; None without messages.
         last: when the last was [s since the bag's start].
         gap: greatest time between two messages [s].
         backward: number of messages whose stamp is before that of the one before them.
-        unreadable: number of messages whose stamp cannot be read though their type has one.
-        frames: that the messages are in, as far as they have any.
-        known: whether our graph takes it.
-        problem: why it does not, though it has the name of one of our topics.
+        unreadable: number of messages whose stamp cannot be read although their type has one.
+        frames: frame ids of the messages.
+        known: whether our graph uses the topic.
+        problem: why it does not, although it has the name of one of our topics.
     """
 
     topic: str
@@ -47,13 +47,13 @@ class TopicReport:
 
     @property
     def rate(self) -> float | None:
-        """Return the mean number of messages a second; None where there is no second message."""
+        """Mean rate of messages [Hz]; None without a second message."""
         if self.first is None or self.last is None or self.last <= self.first:
             return None
         return (self.count - 1) / (self.last - self.first)
 
-    def take(self, record: Record, time: float, *, is_cdr: bool) -> None:
-        """Take a message that was recorded at a time [s since the bag's start]."""
+    def add(self, record: RecordedMessage, time: float, *, is_cdr: bool) -> None:
+        """Add a message that was recorded at a time [s since the bag's start]."""
         self.count += 1
         if self.last is not None:
             self.gap = max(self.gap, time - self.last)
@@ -71,7 +71,7 @@ class TopicReport:
         self._stamp = stamp
 
     def to_json(self) -> dict[str, Any]:
-        """Return what is written of it, in SI units; null for what has no value."""
+        """Return the report in SI units; null where there is no value."""
         return {
             "topic": self.topic,
             "types": list(self.types),
@@ -90,12 +90,12 @@ class TopicReport:
 
 @dataclass(frozen=True)
 class BagReport:
-    """What a bag holds.
+    """Report on a bag.
 
     Attributes:
-        bag: that was looked through.
+        bag: the bag.
         topics: by name.
-        refused: how many messages cannot be unpacked, by the reason.
+        refused: number of messages that cannot be decompressed, by reason.
     """
 
     bag: Bag
@@ -103,7 +103,7 @@ class BagReport:
     refused: Counter[str]
 
     def to_json(self) -> dict[str, Any]:
-        """Return what is written of it, in SI units; null for what has no value."""
+        """Return the report in SI units; null where there is no value."""
         damage = self.bag.damage
         return {
             "bag": str(self.bag.path),
@@ -123,36 +123,36 @@ class BagReport:
                 "messages_lost": damage.messages,
                 "places": [
                     {
-                        "file": place.file,
-                        "start_byte": place.start,
-                        "end_byte": place.end,
-                        "what": place.what,
-                        "first_s": None if place.first is None else place.first * 1e-9,
-                        "last_s": None if place.last is None else place.last * 1e-9,
+                        "file": region.file,
+                        "start_byte": region.start,
+                        "end_byte": region.end,
+                        "what": region.what,
+                        "first_s": None if region.first is None else region.first * 1e-9,
+                        "last_s": None if region.last is None else region.last * 1e-9,
                     }
-                    for place in damage.places
+                    for region in damage.regions
                 ],
             },
             "topics": [topic.to_json() for topic in self.topics],
         }
 
 
-def report(bag: Bag, dish_frame: str, progress: Callable[[float], None] = lambda share: None) -> BagReport:
-    """Go through all messages of a bag, and say what it holds.
+def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = lambda fraction: None) -> BagReport:
+    """Read all messages of a bag and report on its content.
 
     Args:
-        bag: to look through.
-        dish_frame: name of its frame that is the dish's.
-        progress: called with the share done, 0 to 1.
+        bag: to inspect.
+        dish_frame: name of the dish frame in the bag.
+        progress: called with the completed fraction, 0 to 1.
     """
     recording = Recording(bag, dish_frame=dish_frame)
     topics: dict[str, TopicReport] = {}
     for name in sorted(bag.counts):
         own = bag.conflicts.get(name) or (bag.topics[name],)
-        topics[name] = TopicReport(name, own, known=recording.takes(name), problem=recording.problem_of(name))
+        topics[name] = TopicReport(name, own, known=recording.uses(name), problem=recording.problem_of(name))
     refused: Counter[str] = Counter()
     for connection, record in bag.every_record(refused):
         time = (record.time - bag.start) * 1e-9
-        topics[bag.name_of(connection)].take(record, time, is_cdr=connection.serialization == CDR)
+        topics[bag.name_of(connection)].add(record, time, is_cdr=connection.serialization == CDR)
         progress(time / max(bag.duration, 1e-9))
     return BagReport(bag, list(topics.values()), refused)

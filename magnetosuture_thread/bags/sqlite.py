@@ -1,4 +1,4 @@
-"""A bag's file in sqlite3, rosbag2's older format, which has no checksums."""
+"""Reads the files of a bag in sqlite3, the older format of rosbag2, which has no checksums."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
-from magnetosuture_thread.bags.damage import Damage, Place, counted
-from magnetosuture_thread.bags.storage import Connection, Definition, Item
+from magnetosuture_thread.bags.damage_report import CorruptRegion, DamageReport, pluralize
+from magnetosuture_thread.bags.storage import Connection, MessageDefinition, StoredMessage
 from magnetosuture_thread.errors import BagError
 
 UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
 _MAGIC = b"SQLite format 3\0"
-_STRIDE = 1 << 16  # rows that are left out at first where one cannot be read; then fewer and fewer
-_OFFERED = {
+_METADATA_COLUMNS = {
     "offered_qos_profiles": "offered_qos_profiles",
     "topic_type_hash": "type_description_hash",
-}  # column by word
-_LARGEST_ROW = (1 << 63) - 1
-# sqlite3 holds a column to no type, so that a row may have anything in it.
-_USABLE = "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
+}  # by metadata key
+_MAX_ROW_ID = (1 << 63) - 1
+# sqlite3 does not enforce column types, so that a row may hold anything.
+_IS_VALID = (
+    "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
+)
 
 
 class SqliteFile:
-    """A file of recorded messages in sqlite3; a `Storage`, where the attributes are told.
+    """A file of recorded messages in sqlite3; implements `BagStorage`, where the attributes are described.
 
     Args:
         path: the file.
-        progress: called with the number of bytes looked through since the last call.
+        progress: called with the number of bytes read since the last call.
 
     Raises:
         BagError: it cannot be read, is empty, or is no such file.
@@ -50,7 +51,7 @@ class SqliteFile:
             raise BagError(path, "is no sqlite3 file" if magic else "is empty, expected a sqlite3 file")
         self.notes: dict[str, str] = {}
         self.unchecked = UNCHECKED
-        self._rows: list[tuple[int, int]] | None = None  # time and number of each that can be read, if not all can
+        self._rows: list[tuple[int, int]] | None = None  # time and id of each readable row, if not all are readable
         lost: int | None = None
         try:
             with closing(self._connect()) as database:
@@ -59,22 +60,22 @@ class SqliteFile:
                 if problem:
                     self._salvage(database)
                 else:
-                    lost = self._look_through(database)
+                    lost = self._count_messages(database)
         except sqlite3.Error as error:
             raise BagError(path, f"cannot be read as a bag: {error}") from None
         progress(size)
         if lost:
-            problem = f"{counted(lost, 'row')} without a time, a topic or data that can be used"
+            problem = f"{pluralize(lost, 'row')} without a valid time, topic or data"
         elif problem:
             problem = f"the database is malformed ({problem})"
-        self.damage = Damage((Place(path.name, 0, size, problem),), 0, 0, lost) if problem else None
+        self.damage = DamageReport((CorruptRegion(path.name, 0, size, problem),), 0, 0, lost) if problem else None
         self.facts = {"format": "sqlite3", "bytes": str(size), "checksums": "none"}
 
-    def items(self, connections: Collection[int], start: int, end: int) -> Iterator[Item]:
-        """Go through the messages of some connections from `start` to `end` [ns], both included, by time.
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+        """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
 
         Raises:
-            BagError: the file has changed since it was looked through, or cannot be read any more.
+            BagError: the file has changed since it was verified, or cannot be read any more.
         """
         wanted = sorted(set(connections) & set(self.counts))
         try:
@@ -82,30 +83,30 @@ class SqliteFile:
                 if self._rows is None:
                     marks = ",".join("?" * len(wanted))
                     query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
-                    between = f" AND {_USABLE} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
+                    between = f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
                     rows = database.execute(query + between, (*wanted, start, end))
-                    yield from (Item(time, self.connections[topic], data) for time, topic, data in rows)
+                    yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)
                     return
                 query = "SELECT timestamp, topic_id, data FROM messages WHERE id = ?"
                 for time, number in self._rows:
                     if start <= time <= end:
-                        for said, topic, data in database.execute(query, (number,)):
+                        for stored_time, topic, data in database.execute(query, (number,)):
                             if topic in wanted:
-                                yield Item(said, self.connections[topic], data)
+                                yield StoredMessage(stored_time, self.connections[topic], data)
         except sqlite3.Error as error:
             raise BagError(self.path, f"cannot be read any more: {error}") from None
 
     def _connect(self) -> sqlite3.Connection:
-        """Open the file so that nothing is ever written, not even beside it, unless a recorder left a journal."""
+        """Open the file read-only; nothing is written beside it either, unless a recorder left a journal."""
         journal = any(self.path.with_name(self.path.name + ending).exists() for ending in ("-wal", "-journal"))
         mode = "mode=ro" if journal else "mode=ro&immutable=1"
         database = sqlite3.connect(f"file:{quote(os.fsencode(self.path.absolute()))}?{mode}", uri=True)
-        database.text_factory = _text
+        database.text_factory = _decode_text
         return database
 
-    def _look_through(self, database: sqlite3.Connection) -> int:
-        """Count what can be used, and return the number of rows that cannot."""
-        query = f"SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages WHERE {_USABLE} GROUP BY 1"
+    def _count_messages(self, database: sqlite3.Connection) -> int:
+        """Count the valid messages, and return the number of invalid rows."""
+        query = f"SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages WHERE {_IS_VALID} GROUP BY 1"
         found = [row for row in database.execute(query) if row[0] in self.connections]
         self.counts = {row[0]: row[1] for row in found}
         self.start = min((row[2] for row in found), default=0)
@@ -114,9 +115,9 @@ class SqliteFile:
         return int(total) - sum(int(row[1]) for row in found)
 
     def _salvage(self, database: sqlite3.Connection) -> None:
-        """Find the rows that can be read in a database that is broken."""
+        """Find the readable rows of a malformed database."""
         times, numbers, counts = array("q"), array("q"), Counter[int]()
-        for number, topic, time in _readable(database):
+        for number, topic, time in _readable_rows(database):
             if topic in self.connections:
                 times.append(time)
                 numbers.append(number)
@@ -126,8 +127,8 @@ class SqliteFile:
         self.start, self.end = (self._rows[0][0], self._rows[-1][0]) if self._rows else (0, 0)
 
 
-def _text(data: bytes) -> str | None:
-    """Return a text; None if it is none."""
+def _decode_text(data: bytes) -> str | None:
+    """Return a text; None if it is not valid UTF-8."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -148,27 +149,27 @@ def _connections(database: sqlite3.Connection) -> dict[int, Connection]:
     try:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         rows = database.execute(query)
-        definitions = {row[0]: Definition(*row) for row in rows if all(isinstance(word, str) for word in row)}
+        definitions = {row[0]: MessageDefinition(*row) for row in rows if all(isinstance(word, str) for word in row)}
     except sqlite3.Error:
         pass  # Older files have none.
     connections = {}
     cursor = database.execute("SELECT * FROM topics")
     names = [column[0] for column in cursor.description]
     for row in cursor:
-        told = dict(zip(names, row, strict=True))
-        number, topic, kind, form = (told[name] for name in ("id", "name", "type", "serialization_format"))
+        values = dict(zip(names, row, strict=True))
+        number, topic, kind, form = (values[name] for name in ("id", "name", "type", "serialization_format"))
         if isinstance(number, int) and all(isinstance(word, str) for word in (topic, kind, form)):
-            offered = {key: told.get(column) for key, column in _OFFERED.items()}
-            words = {key: word for key, word in offered.items() if isinstance(word, str)}
-            connections[number] = Connection(topic, definitions.get(kind, Definition(kind)), form, words)
+            entries = {key: values.get(column) for key, column in _METADATA_COLUMNS.items()}
+            metadata = {key: text for key, text in entries.items() if isinstance(text, str)}
+            connections[number] = Connection(topic, definitions.get(kind, MessageDefinition(kind)), form, metadata)
     return connections
 
 
-def _readable(database: sqlite3.Connection) -> Iterator[tuple[int, int, int]]:
-    """Yield number, topic and time of each row that can be read whole; leave out those that cannot."""
+def _readable_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int, int]]:
+    """Yield id, topic and time of each row that is fully readable."""
     last, stride = 0, 0
     query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id"
-    while last < _LARGEST_ROW:
+    while last < _MAX_ROW_ID:
         try:
             for number, topic, time, data in database.execute(query, (last,)):
                 last, stride = number, 0
@@ -176,6 +177,6 @@ def _readable(database: sqlite3.Connection) -> Iterator[tuple[int, int, int]]:
                     yield number, topic, time
             return
         except sqlite3.DatabaseError:
-            # Row by row past the broken ones, then in greater and greater steps.
-            stride = max(1, min(2 * stride, _LARGEST_ROW // 4))
+            # Skip row by row past the unreadable ones, then in growing steps.
+            stride = max(1, min(2 * stride, _MAX_ROW_ID // 4))
             last += stride

@@ -1,4 +1,4 @@
-"""What a file of recorded messages offers, whatever its format."""
+"""Common interface of the storage formats: connections, stored messages, and their order in time."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from magnetosuture_thread.bags.damage import Damage
+from magnetosuture_thread.bags.damage_report import DamageReport
 
 CDR = "cdr"  # how ROS 2 writes messages
 
 
 @dataclass(frozen=True)
-class Definition:
-    """How a bag defines a type.
+class MessageDefinition:
+    """The definition of a message type in a bag.
 
     Attributes:
         type_name: for example `nav_msgs/msg/Path`.
@@ -31,19 +31,19 @@ class Definition:
 
 @dataclass(frozen=True)
 class Connection:
-    """What one publisher, or one kind of publisher, said on a topic.
+    """The messages of one publisher, or of one kind of publisher, on a topic.
 
     Attributes:
         topic: as it was recorded.
         definition: of its type.
         serialization: of its messages; `cdr` in ROS 2.
-        offered: its quality of service and other words of the recorder, kept for repair.
+        metadata: quality of service and other entries of the recorder, kept for repair.
     """
 
     topic: str
-    definition: Definition
+    definition: MessageDefinition
     serialization: str = CDR
-    offered: Mapping[str, str] = field(default_factory=dict, hash=False)
+    metadata: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     @property
     def type_name(self) -> str:
@@ -51,16 +51,16 @@ class Connection:
         return self.definition.type_name
 
 
-class Item(NamedTuple):
-    """A recorded message as it is in a file: time [ns], who said it, bytes."""
+class StoredMessage(NamedTuple):
+    """A message as it is stored in a file: time [ns], connection, bytes."""
 
     time: int
     connection: Connection
     data: bytes
 
 
-class Storage(Protocol):
-    """A file of recorded messages, looked through and found readable.
+class BagStorage(Protocol):
+    """A file of recorded messages, verified and open for reading.
 
     Attributes:
         path: the file.
@@ -68,10 +68,10 @@ class Storage(Protocol):
         counts: number of messages that can be read, by connection.
         start: time of the first of them [ns]; 0 if there are none.
         end: time of the last of them [ns].
-        notes: what our writer said of the bag.
-        damage: what is broken; None if all is whole.
+        notes: notes of our writer.
+        damage: what is corrupt and lost; None if nothing is.
         unchecked: why damage may not have been noticed, in one line; empty if it would have been.
-        facts: about the file, for a person: name and value, for example chunks and compression.
+        facts: properties of the file for a person, for example chunks and compression.
     """
 
     path: Path
@@ -80,27 +80,27 @@ class Storage(Protocol):
     start: int
     end: int
     notes: dict[str, str]
-    damage: Damage | None
+    damage: DamageReport | None
     unchecked: str
     facts: dict[str, str]
 
-    def items(self, connections: Collection[int], start: int, end: int) -> Iterator[Item]:
-        """Go through the messages of some connections from `start` to `end` [ns], both included, by time.
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+        """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
 
         Raises:
-            BagError: the file has changed since it was looked through, or cannot be read any more.
+            BagError: the file has changed since it was verified, or cannot be read any more.
         """
 
 
-def in_order(parts: Iterable[tuple[int, Callable[[], Iterator[Item]]]]) -> Iterator[Item]:
-    """Merge parts into one sequence by time; of parts that do not overlap, one is in memory at a time.
+def merge_by_time(parts: Iterable[tuple[int, Callable[[], Iterator[StoredMessage]]]]) -> Iterator[StoredMessage]:
+    """Yield the messages of all parts by time; of parts that do not overlap, one is in memory at a time.
 
     Args:
-        parts: the time before which a part holds nothing, and what gives its items by time. Sorted by that time.
+        parts: start time of each part, and a function that yields its messages by time. Sorted by start time.
     """
     waiting = iter(parts)
     following = next(waiting, None)
-    heap: list[tuple[int, int, Item, Iterator[Item]]] = []
+    heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
     number = 0
     while heap or following is not None:
         while following is not None and (not heap or following[0] <= heap[0][0]):

@@ -1,4 +1,4 @@
-"""Writes mcap bags that other tools open, in which damage is found, and that stay readable whatever ends them."""
+"""Writes mcap bags that stay readable after a crash or on a full disk."""
 
 from __future__ import annotations
 
@@ -12,19 +12,25 @@ from typing import Any
 
 import yaml
 
-from magnetosuture_thread.bags.damage import counted
-from magnetosuture_thread.bags.mcap.writing import INDEX_SIZE, McapWriter
-from magnetosuture_thread.bags.notes import NOTES, as_custom_data, sealed
-from magnetosuture_thread.bags.qos import OFFERED, in_words, profiles
-from magnetosuture_thread.bags.reserve import Reserve
-from magnetosuture_thread.bags.storage import Connection, Definition
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.damage_report import pluralize
+from magnetosuture_thread.bags.mcap.writer import MAX_INDEX_BYTES, McapWriter
+from magnetosuture_thread.bags.message_types import own_definition, typestore
+from magnetosuture_thread.bags.metadata import (
+    METADATA_FILE,
+    NOTES,
+    QOS,
+    TYPE_HASH,
+    add_checksum,
+    bag_information,
+    dump_qos_profiles,
+    parse_qos_profiles,
+)
+from magnetosuture_thread.bags.storage import Connection, MessageDefinition
 from magnetosuture_thread.errors import BagError
 
-FORMAT_VERSION = 9  # of rosbag2's metadata.yaml
-LATEST = (1 << 64) - 1  # ns, that mcap has room for
-FULL = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
-_SPARE = 256 * 1024  # bytes kept free for summary and metadata.yaml, besides what each chunk needs there
+MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
+DISK_FULL_TEXTS = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
+_RESERVE_BYTES = 256 * 1024  # for summary and metadata.yaml, besides the index of each chunk
 
 
 class RecordingEndedError(BagError):
@@ -34,14 +40,13 @@ class RecordingEndedError(BagError):
 class BagWriter:
     """A bag being written: a folder with one mcap file and its metadata.yaml.
 
-    Small chunks with checksums, so that damage to a message is found and what is intact can be recovered; full
-    message definitions and type hashes, so that any tool can decode it. Chunks go to the disk as they are full: a
-    recorder that is killed loses two seconds. When the disk is full, what was recorded before is finished as a
-    whole bag, in room that was kept for that.
+    Chunks are small and have checksums, so that damage is detected and intact messages can be salvaged. The bag holds
+    full message definitions and type hashes, so that any tool can decode it. A recorder that is killed loses two
+    seconds. When the disk is full, the bag is finished in disk space that was reserved for this.
 
     Args:
         folder: made by the writer if there is none; must be empty.
-        notes: words about the bag, kept in it, for example the set-up it was recorded with.
+        notes: entries kept in the bag, for example the setup it was recorded with.
         name: of the bag; the folder's if empty.
 
     Raises:
@@ -63,9 +68,9 @@ class BagWriter:
         except OSError as error:
             raise BagError(folder, f"cannot be written: {error.strerror}") from None
         try:
-            self._writer = McapWriter(self._stream, {NOTES: sealed(self._notes)} if self._notes else {})
-            self._reserve = Reserve(folder / ".reserve")
-            self._reserve.grow(_SPARE)
+            self._writer = McapWriter(self._stream, {NOTES: add_checksum(self._notes)} if self._notes else {})
+            self._reserve = _DiskReserve(folder / ".reserve")
+            self._reserve.grow(_RESERVE_BYTES)
         except OSError as error:
             self._stream.close()
             for name in (".reserve", self._file_name):
@@ -82,8 +87,8 @@ class BagWriter:
         """Close the bag, so that what was written can be read whatever happened."""
         self.close()
 
-    def add_topic(self, topic: str, type_name: str, definition: Definition | None = None) -> None:
-        """Say of which type a topic is, for example `nav_msgs/msg/Path`.
+    def add_topic(self, topic: str, type_name: str, definition: MessageDefinition | None = None) -> None:
+        """Add a topic of a type, for example `nav_msgs/msg/Path`.
 
         Args:
             topic: with its leading slash.
@@ -91,20 +96,20 @@ class BagWriter:
             definition: of the type; ours if None.
 
         Raises:
-            BagError: we do not know the type, and no definition is given.
+            BagError: the type is unknown, and no definition is given.
         """
         if definition is None:
-            definition = our_definition(type_name)
+            definition = own_definition(type_name)
             if not definition.text:
-                raise BagError(topic, f"nothing defines the type {type_name}")
-        offered = {OFFERED: "", "topic_type_hash": _type_hash(definition)}
-        self._topics[topic] = self.add_connection(Connection(topic, definition, offered=offered))
+                raise BagError(topic, f"the type {type_name} has no definition")
+        metadata = {QOS: "", TYPE_HASH: _type_hash(definition)}
+        self._topics[topic] = self.add_connection(Connection(topic, definition, metadata=metadata))
 
     def add_connection(self, connection: Connection) -> int:
-        """Say what one publisher says on a topic, and return its number for `write_to`."""
-        if OFFERED in connection.offered:
-            words = {**connection.offered, OFFERED: in_words(profiles(connection.offered[OFFERED]))}
-            connection = replace(connection, offered=words)
+        """Add a connection, and return its number for `write_to`."""
+        if QOS in connection.metadata:
+            profiles = dump_qos_profiles(parse_qos_profiles(connection.metadata[QOS]))
+            connection = replace(connection, metadata={**connection.metadata, QOS: profiles})
         number = self._writer.add_channel(connection)
         self._connections[number] = connection
         return number
@@ -124,13 +129,15 @@ class BagWriter:
 
     def write_to(self, number: int, time: int, data: bytes) -> None:
         """Write one serialised message of a connection; otherwise as `write`."""
-        if not 0 <= time <= LATEST:
-            raise BagError(self._connections[number].topic, f"a message of the time {time} ns; expected 0 to {LATEST}")
+        if not 0 <= time <= MAX_TIME:
+            raise BagError(
+                self._connections[number].topic, f"a message of the time {time} ns; expected 0 to {MAX_TIME}"
+            )
         if self._closed:
             raise BagError(self.folder, "is closed; nothing more can be written to it")
         try:
             if self._writer.add_message(number, time, data):
-                self._reserve.grow(_SPARE + INDEX_SIZE * self._writer.chunks)
+                self._reserve.grow(_RESERVE_BYTES + MAX_INDEX_BYTES * self._writer.state.chunks)
         except OSError as error:
             raise self._end_early(error) from None
 
@@ -160,7 +167,7 @@ class BagWriter:
             raise self._refusal(error) from None
 
     def _end_early(self, problem: OSError) -> RecordingEndedError:
-        """Make a whole bag of what is on the disk, if there is room for its summary; return what to raise."""
+        """Finish the bag with what is on the disk, if there is space for its summary; return the error to raise."""
         self._closed = True
         self._reserve.release()
         try:
@@ -170,71 +177,53 @@ class BagWriter:
         return self._refusal(problem)
 
     def _refusal(self, problem: OSError) -> RecordingEndedError:
-        kept = counted(self._writer.counts.total(), "message")
-        what = FULL.get(problem.errno or 0, f"fails ({problem.strerror})")
+        kept = pluralize(self._writer.state.counts.total(), "message")
+        what = DISK_FULL_TEXTS.get(problem.errno or 0, f"fails ({problem.strerror})")
         file = self.folder / self._file_name
         text = f"the disk {what} after {kept}; what was recorded before can be read: {file}"
         return RecordingEndedError(self.folder, text)
 
     def _finish(self) -> None:
-        information = self._information()
-        inside = {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)}
-        self._writer.finish({"rosbag2": inside})
+        information = bag_information(self._file_name, self._writer.state, self._connections, self._notes)
+        self._writer.finish({"rosbag2": {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)}})
         text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
-        with (self.folder / "metadata.yaml").open("w", encoding="utf-8") as stream:
+        with (self.folder / METADATA_FILE).open("w", encoding="utf-8") as stream:
             stream.write(text)
             stream.flush()
             os.fsync(stream.fileno())
 
-    def _information(self) -> dict[str, Any]:
-        counts = self._writer.counts
-        start = self._writer.start or 0
-        duration = self._writer.end - start
-        topics = [
-            {
-                "topic_metadata": {
-                    "name": connection.topic,
-                    "type": connection.type_name,
-                    "serialization_format": connection.serialization,
-                    "offered_qos_profiles": profiles(connection.offered.get(OFFERED, "")),
-                    "type_description_hash": connection.offered.get("topic_type_hash", ""),
-                },
-                "message_count": counts[number],
-            }
-            for number, connection in self._connections.items()
-        ]
-        file = {
-            "path": self._file_name,
-            "starting_time": {"nanoseconds_since_epoch": start},
-            "duration": {"nanoseconds": duration},
-            "message_count": counts.total(),
-        }
-        return {
-            "version": FORMAT_VERSION,
-            "storage_identifier": "mcap",
-            "duration": {"nanoseconds": duration},
-            "starting_time": {"nanoseconds_since_epoch": start},
-            "message_count": counts.total(),
-            "topics_with_message_count": topics,
-            "compression_format": "",
-            "compression_mode": "",
-            "relative_file_paths": [self._file_name],
-            "files": [file],
-            "custom_data": as_custom_data(self._notes),
-            "ros_distro": "jazzy",
-        }
 
-
-def our_definition(type_name: str) -> Definition:
-    """Return our definition of a type; without a text if we have none."""
-    store = typestore()
-    if type_name not in store.fielddefs:
-        return Definition(type_name)
-    return Definition(type_name, "ros2msg", store.generate_msgdef(type_name, ros_version=2)[0])
-
-
-def _type_hash(definition: Definition) -> str:
-    """Return the hash of a type, by ROS's rule, where its definition is ours."""
-    if definition != our_definition(definition.type_name) or not definition.text:
+def _type_hash(definition: MessageDefinition) -> str:
+    """Return the RIHS01 hash of a type, where its definition is ours."""
+    if definition != own_definition(definition.type_name) or not definition.text:
         return ""
     return typestore().hash_rihs01(definition.type_name)
+
+
+class _DiskReserve:
+    """A file that reserves disk space for finishing the bag when the disk is full.
+
+    Args:
+        path: the file; created by `grow`, deleted by `release`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._size = 0
+
+    def grow(self, size: int) -> None:
+        """Reserve at least this many bytes.
+
+        Raises:
+            OSError: the disk has no more space.
+        """
+        if size <= self._size:
+            return
+        size = 2 * size  # so that it grows rarely
+        with self._path.open("ab") as stream:
+            os.posix_fallocate(stream.fileno(), 0, size)
+        self._size = size
+
+    def release(self) -> None:
+        """Free the reserved space."""
+        self._path.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from magnetosuture_thread.bags.remap import parse_remap
 from magnetosuture_thread.errors import ConfigurationError
 
 
@@ -73,9 +74,7 @@ def add_source(parser: argparse._ActionsContainer) -> None:
 
 def remap(text: str) -> tuple[str, str]:
     """Return a topic's name and its new one: an argument type."""
-    from magnetosuture_thread.bags.remap import remapping
-
     try:
-        return remapping(text)
+        return parse_remap(text)
     except ConfigurationError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not {error.expectation}") from None

@@ -15,10 +15,10 @@ from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibra
 from magnetosuture_thread.coils.field import CoilProperties, coils_around, make_coils
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 REACH_RATIO = 0.9  # of the reach to the coils' distance
 MIN_TIMEOUT_PERIODS = 4.0  # of the loop; two of them are the lookahead of the bridge
@@ -68,7 +68,7 @@ class CoilBridgeSettings(Configuration):
         1000.0, "maximum slew rate of a current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
     )
 
-    scene: str = shared("scene")
+    scene: str = shared_parameter("scene")
     keep_out: float = quantity(
         0.0005,
         "minimum clearance of the needle's axis to wall and obstacles, half of its width included",
@@ -119,9 +119,9 @@ class CoilBridgeSettings(Configuration):
     aligning_field: float = quantity(
         0.008, "field along the needle that holds its direction", unit="T", minimum=1e-4, maximum=1.0
     )
-    needle_length: float = shared("needle_length")
-    needle_width: float = shared("needle_width")
-    needle_curvature: float = shared("needle_curvature")
+    needle_length: float = shared_parameter("needle_length")
+    needle_width: float = shared_parameter("needle_width")
+    needle_curvature: float = shared_parameter("needle_curvature")
     needle_moment: float = quantity(
         8.8e-4, "magnetic moment of the straight needle", unit="A m^2", minimum=1e-6, maximum=1.0
     )
@@ -152,7 +152,7 @@ class CoilBridgeSettings(Configuration):
     roboclaw_ports: tuple[str, ...] = quantity((), "serial port of each board, which has two coils in a row")
     roboclaw_addresses: tuple[int, ...] = quantity((), "address of each board, 128 if empty", minimum=128, maximum=135)
     roboclaw_baud_rate: int = quantity(115200, "of the serial lines; USB has none", minimum=2400, maximum=1000000)
-    driver_timeout: float = shared("driver_timeout")
+    driver_timeout: float = shared_parameter("driver_timeout")
     roboclaw_answer_timeout: float = quantity(
         0.03,
         "timeout of a board's answer, which takes 1 or 2 ms over USB; one timeout is tolerated",
@@ -230,7 +230,7 @@ class CoilBridgeSettings(Configuration):
 
     def check(self) -> None:
         """Reject too few coils, a coiled needle, and limits that cannot be kept."""
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
             name = f"{self.GROUP}.coil_angles"
             raise ConfigurationError(name, list(self.coil_angles), "at least 3 coils' angles [rad]")

@@ -8,8 +8,8 @@ from typing import ClassVar
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.console.access import is_loopback
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import require_needle
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.geometry.needle_arc import check_needle
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 MIN_COMMANDS_PER_TIMEOUT = 2.0
 MIN_TOKEN_LENGTH = 16  # characters
@@ -25,9 +25,9 @@ class ConsoleSettings(Configuration):
     port: int = quantity(8090, "of that address; 0 selects a free one", minimum=0, maximum=65535)
     token: str = quantity("", "permits commands; empty generates a random one at every start")
     image_transport: str = quantity("compressed", "camera topic to show", choices=("compressed", "raw"))
-    scene: str = shared("scene")
-    needle_length: float = shared("needle_length")
-    needle_curvature: float = shared("needle_curvature")
+    scene: str = shared_parameter("scene")
+    needle_length: float = shared_parameter("needle_length")
+    needle_curvature: float = shared_parameter("needle_curvature")
     frame_rate: float = quantity(30.0, "of the states sent to the page", unit="Hz", minimum=1.0, maximum=120.0)
     speed: float = quantity(0.003, "initial jog speed of the needle's tip", unit="m/s", minimum=1e-5, maximum=0.5)
     max_speed: float = quantity(0.01, "maximum jog speed", unit="m/s", minimum=1e-5, maximum=0.5)
@@ -38,7 +38,7 @@ class ConsoleSettings(Configuration):
 
     def check(self) -> None:
         """Reject a public page without a token, a speed above the maximum, a short timeout, and a coiled needle."""
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if not self.address:
             raise ConfigurationError(
                 f"{self.GROUP}.address", self.address, "an address, 0.0.0.0 for all of this machine"

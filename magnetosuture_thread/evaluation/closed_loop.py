@@ -12,7 +12,7 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, nanoseconds, planar_pose
 from magnetosuture_thread.evaluation.metrics import Percentiles
-from magnetosuture_thread.geometry.arc import needle_axis
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     CURRENTS,

@@ -149,7 +149,7 @@ def draw_threads(
 def _draw_close_up(
     scene: Axes, frame: NDArray[np.uint8], view: DishView, chosen: FrameResult, obstacles: Sequence[Obstacle]
 ) -> None:
-    """Draw the surroundings of the node nearest to an obstacle, or of the thread's end, magnified."""
+    """Draw the workspace of the node nearest to an obstacle, or of the thread's end, magnified."""
     vertices = view.to_pixels(chosen.vertices)
     clearance = chosen.clearance
     nearest = int(np.argmin(clearance)) if np.isfinite(clearance).any() else len(vertices) - 1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
 from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory, read_reference
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations import PaperOptions
 from magnetosuture_thread.model.medium import Medium
@@ -150,7 +150,7 @@ def score(
         thread, paper = reference_thread(reference, path, segments)
         predictor = ThreadPredictor(
             thread,
-            Surroundings(reference.discs, NEAR),
+            Workspace(reference.discs, NEAR),
             formulation=formulation,
             solver=solver,
             paper=paper,

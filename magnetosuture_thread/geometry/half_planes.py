@@ -1,4 +1,4 @@
-"""The point of a convex region, bounded by straight lines, that is nearest to a given one; compiled."""
+"""Projection of a point onto an intersection of half planes, compiled."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 
 ROUNDING = 1e-12
-"""Of the size of what is projected: by so much a result may be on the wrong side of a line."""
+"""Tolerance of a result beyond a line, relative to the size of the projected point."""
 SLACK = 1e-14
-"""The same, on the way: without it, of two lines that are nearly one, rounding would let each forbid the other."""
+"""Tolerance of intermediate results: without it, rounding would make two nearly equal lines exclude each other."""
 
 
 @compiled
-def project_within(
+def project_onto_half_planes(
     point: NDArray[np.float64], given: Points, bounds: NDArray[np.float64], work: Points, found: NDArray[np.float64]
 ) -> bool:
     """Write the nearest point; `work` (k, 3) has room for rows of length one; return whether there is one."""
@@ -63,7 +63,9 @@ def project_within(
     return inside or best < np.inf
 
 
-def nearest_within(point: NDArray[np.float64], rows: Points, least: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def nearest_in_half_planes(
+    point: NDArray[np.float64], rows: Points, bounds: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
     """Return the point of an intersection of half planes that is nearest to a given one, exactly.
 
         min |q - p|^2    such that    a_i . q >= b_i
@@ -74,14 +76,14 @@ def nearest_within(point: NDArray[np.float64], rows: Points, least: NDArray[np.f
     Args:
         point: p, shape (2,).
         rows: a_i, of any length; a row of zeros says nothing; shape (k, 2).
-        least: b_i, shape (k,).
+        bounds: b_i, shape (k,).
 
     Returns:
         q, shape (2,), p itself where it is within; it may miss a line by 1e-12 of |p|. None where no
         candidate passes that: the half planes have no point in common, or only rounding tells.
 
-    Source: none; the nearest point has at least one of the lines crossed as an active constraint.
+    Source: none; the nearest point has at bounds one of the lines crossed as an active constraint.
     """
     found = np.empty(2)
-    point, rows, least = (np.ascontiguousarray(array, dtype=np.float64) for array in (point, rows, least))
-    return found if project_within(point, rows, least, np.empty((len(rows), 3)), found) else None
+    point, rows, bounds = (np.ascontiguousarray(array, dtype=np.float64) for array in (point, rows, bounds))
+    return found if project_onto_half_planes(point, rows, bounds, np.empty((len(rows), 3)), found) else None

@@ -1,4 +1,4 @@
-"""Between headings in the dish plane and the unit quaternions that messages have."""
+"""Conversion between headings in the dish plane and the unit quaternions of messages."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError
 
 
-def turned(angle: float) -> tuple[float, float]:
+def yaw_quaternion(angle: float) -> tuple[float, float]:
     """Return z and w of the quaternion that turns about z by an angle [rad]; its x and y are 0.
 
-    >>> turned(0.0)
+    >>> yaw_quaternion(0.0)
     (0.0, 1.0)
     """
     return math.sin(0.5 * angle), math.cos(0.5 * angle)
 
 
-def angle_of(heading: NDArray[np.float64]) -> float:
+def heading_angle(heading: NDArray[np.float64]) -> float:
     """Return the angle of a direction of shape (2,), from the x axis on [rad]."""
     return math.atan2(heading[1], heading[0])
 
 
-def heading_of(x: float, y: float, z: float, w: float, field: str) -> NDArray[np.float64]:
+def heading_from_quaternion(x: float, y: float, z: float, w: float, field: str) -> NDArray[np.float64]:
     """Return the unit vector, shape (2,), along the x axis that a unit quaternion turns.
 
     Args:
@@ -48,10 +48,10 @@ def heading_of(x: float, y: float, z: float, w: float, field: str) -> NDArray[np
     return np.asarray(along / length)
 
 
-def as_told(heading: NDArray[np.float64], field: str) -> NDArray[np.float64]:
-    """Return a direction of shape (2,) as it is read from a message, whose quaternion costs the last bits.
+def round_trip_heading(heading: NDArray[np.float64], field: str) -> NDArray[np.float64]:
+    """Return a direction of shape (2,) after a round trip through a quaternion, which rounds its last bits.
 
-    Whoever passes a heading on without a message passes it on by this, so that what comes of it is the same.
+    Code that passes a heading on without a message applies this, so that results equal those with a message.
     """
-    z, w = turned(angle_of(heading))
-    return heading_of(0.0, 0.0, z, w, field)
+    z, w = yaw_quaternion(heading_angle(heading))
+    return heading_from_quaternion(0.0, 0.0, z, w, field)

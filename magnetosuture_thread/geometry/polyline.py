@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Points = NDArray[np.float64]
-TIGHTEST = 0.3  # of the radius of a circle that a polyline turns in
+MIN_TURN_RATIO = 0.3  # of the radius of a circle that a polyline turns in
 
 
 def arc_lengths(points: Points) -> NDArray[np.float64]:
@@ -105,10 +105,10 @@ def chain_inside(points: Points, segments: int, segment_length: float, radius: f
     return chain
 
 
-def laid_behind(tail: Points, heading: Points, length: float, radius: float) -> Points:
+def lay_behind_needle(tail: Points, heading: Points, length: float, radius: float) -> Points:
     """Return a polyline of a length behind a needle in the plane: straight, and where a circle is in the way, turning.
 
-    It turns by arcs of `TIGHTEST` of the circle's radius, so early that it comes to lie along the circle.
+    It turns by arcs of `MIN_TURN_RATIO` of the circle's radius, so early that it comes to lie along the circle.
 
     Args:
         tail: of the needle, shape (2,) [m].
@@ -121,7 +121,7 @@ def laid_behind(tail: Points, heading: Points, length: float, radius: float) -> 
     """
     if not math.hypot(*(tail - length * heading).tolist()) > radius:
         return np.array([tail, tail - length * heading])
-    arc = TIGHTEST * radius
+    arc = MIN_TURN_RATIO * radius
     spacing = 0.05 * arc
     # In complex numbers: to turn is to multiply. The origin is to the left where the side is 1.
     way, place = complex(*(-heading).tolist()), complex(*tail.tolist())

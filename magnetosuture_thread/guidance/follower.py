@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.arc import needle_chord
+from magnetosuture_thread.geometry.needle_arc import needle_chord
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.guidance.path import SmoothPath
 

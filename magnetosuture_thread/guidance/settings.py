@@ -9,10 +9,10 @@ import numpy as np
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import require_needle
+from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.guidance.follower import PathFollower
-from magnetosuture_thread.scene import WALL, Scene, occupant
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.scene import WALL_NAME, Scene, find_collision
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ class PathFollowerSettings(Configuration):
         minimum=1e-5,
         maximum=0.1,
     )
-    scene: str = shared("scene")
-    needle_length: float = shared("needle_length")
-    needle_curvature: float = shared("needle_curvature")
+    scene: str = shared_parameter("scene")
+    needle_length: float = shared_parameter("needle_length")
+    needle_curvature: float = shared_parameter("needle_curvature")
 
     def check(self) -> None:
         """Reject a coiled needle."""
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
     def check_path(self, scene: Scene) -> None:
         """Reject a waypoint beyond the wall or inside a shape.
@@ -70,9 +70,10 @@ class PathFollowerSettings(Configuration):
             ConfigurationError: the message names the waypoint and the shape.
         """
         for point in np.reshape(self.waypoints, (-1, 2)):
-            what = occupant(scene, point[None])
+            what = find_collision(scene, point[None])
             if what:
-                expected = f"within the dish, {scene.dish.radius:g} m" if what == WALL else f"a point outside of {what}"
+                within = f"within the dish, {scene.dish.radius:g} m"
+                expected = within if what == WALL_NAME else f"a point outside of {what}"
                 raise ConfigurationError(f"{self.GROUP}.waypoints", point.tolist(), expected)
 
     def follower(self) -> PathFollower:

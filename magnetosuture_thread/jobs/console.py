@@ -17,7 +17,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.jobs.judge import DEFAULT_SETUP, opened
 from magnetosuture_thread.jobs.playing import SHORTEST_LOOP, Playing
 from magnetosuture_thread.jobs.simulate import Say
-from magnetosuture_thread.resources import share
+from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.setups import read_setup
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def _simulated(
 
     name = scenario or DEFAULT_SETUP
     settings = _settings(read_setup(name).console, given)
-    shipped = sorted(path.stem for path in (share("magnetosuture_thread") / "config").glob("*.yaml"))
+    shipped = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
     domain, environment, logs = _alone(stack)
     graph = ConsoleGraph(stack.enter_context(joined(domain=domain)), settings)
     scenarios = dict.fromkeys([*shipped, name])

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from magnetosuture_thread.bags.folder import STORAGES, bag_files
+from magnetosuture_thread.bags.bag_files import STORAGE_SUFFIXES, find_bag_files
 from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
 from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv, table_json
 from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable
@@ -128,7 +128,7 @@ def find_bags(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         bags = _bags(path, DEPTH)
         if not bags:
-            endings = " or ".join(STORAGES)
+            endings = " or ".join(STORAGE_SUFFIXES)
             raise BagError(
                 path, f"holds no bags ({endings}), nor do the folders in it" if path.is_dir() else "is no bag"
             )
@@ -146,7 +146,7 @@ def _bags(path: Path, depth: int) -> list[Path]:
         inside = sorted(path.iterdir())
     except (OSError, ValueError) as error:
         raise BagError(path, f"cannot be read: {error}") from None
-    files = [file for file in inside if file.suffix in STORAGES and file.is_file()]
+    files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
     if (path / "metadata.yaml").is_file() or len(files) == 1:
         return [path]
     if files and not _is_one(path):
@@ -159,7 +159,7 @@ def _bags(path: Path, depth: int) -> list[Path]:
 def _is_one(path: Path) -> bool:
     """Return whether the files in a folder are parts of one bag."""
     try:
-        bag_files(path)
+        find_bag_files(path)
     except BagError:
         return False
     return True

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.recording import CHANNELS
-from magnetosuture_thread.configuration import Configuration, described
+from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.bag_table import Row, row_of
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation
@@ -227,7 +227,7 @@ def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter
         start=recording.start,
         begin=given.start,
         duration=given.duration,
-        damage=tuple(str(place) for place in recording.damage.places) if recording.damage else (),
+        damage=tuple(str(place) for place in recording.damage.regions) if recording.damage else (),
         refused=dict(refused.most_common()),
         topics={
             channel.recorded: (channel.type_name, recording.counts[channel.recorded])
@@ -241,7 +241,7 @@ def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter
 
 
 def _settings(settings: Configuration) -> Iterator[tuple[str, str, str]]:
-    for field in described(type(settings)):
+    for field in configuration_fields(type(settings)):
         value = getattr(settings, field.name)
         shown = ", ".join(f"{entry}" for entry in value) if isinstance(value, tuple) else f"{value}"
         yield f"{field.group}.{field.name}", shown, field.quantity.unit

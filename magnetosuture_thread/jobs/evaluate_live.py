@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.metrics import Percentiles
@@ -53,7 +53,7 @@ def live_figures(recording: Recording, start: float, duration: float | None) -> 
     return LiveFigures(found)
 
 
-def _stamp(record: Record) -> int:
+def _stamp(record: RecordedMessage) -> int:
     """Return the stamp of what a message answers [ns]; 0 for currents that answer no command or are broken."""
     if record.topic != CURRENTS.recorded:
         return stamp_of(record)
@@ -76,8 +76,8 @@ class RecordedPredictions:
     def __init__(self, recording: Recording, start: float, duration: float | None) -> None:
         there = bool(recording.counts.get(PREDICTED_THREAD.recorded))
         channels = [PREDICTED_THREAD] if there else []
-        self._records: Iterator[Record] = recording.records(channels, start=start, duration=duration)
-        self._held: dict[int, Record] = {}
+        self._records: Iterator[RecordedMessage] = recording.records(channels, start=start, duration=duration)
+        self._held: dict[int, RecordedMessage] = {}
         self._latest = -1
 
     def of(self, stamp: int) -> Points | None:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from magnetosuture_thread.bags.damage import counted
-from magnetosuture_thread.bags.folder import PACKED, STORAGES
-from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.bags.bag_files import COMPRESSED_SUFFIXES, STORAGE_SUFFIXES
+from magnetosuture_thread.bags.damage_report import pluralize
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.interface import CAMERA
@@ -80,7 +80,7 @@ class FrameSource:
     def refused(self) -> list[str]:
         """Return why frames of a bag could not be taken, a line each, once all have been gone through."""
         reasons = self._recording.refused if self._recording is not None else {}
-        return [f"{reason}: {counted(count, 'frame')} left out" for reason, count in reasons.items()]
+        return [f"{reason}: {pluralize(count, 'frame')} left out" for reason, count in reasons.items()]
 
     def _add(self, path: Path, remap: Mapping[str, str] | None, alone: bool) -> None:
         try:
@@ -91,7 +91,7 @@ class FrameSource:
             raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
         except (OSError, ValueError) as error:
             raise BagError(path, f"cannot be read: {error}") from None
-        if any(file.name.endswith((*STORAGES, *PACKED)) for file in (path, *inside)):
+        if any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside)):
             if not alone:
                 raise BagError(path, "is a bag; expected it alone, without other frames")
             bag = Bag(path, remap=remap)
@@ -136,7 +136,7 @@ class FrameSource:
         # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
         return min(HIGHEST_RATE, max(LOWEST_RATE, round(1.0 / float(np.median(intervals)), 2)))
 
-    def _recorded(self, record: Record) -> Frame:
+    def _recorded(self, record: RecordedMessage) -> Frame:
         """Return a recorded frame; it is broken where message or picture are."""
         stamp = record.time * 1e-9
         try:
@@ -182,7 +182,7 @@ def _names(files: Sequence[Path]) -> list[str]:
     return numbered([names[own] for own in parts], "{} ({})")
 
 
-def _stamp(record: Record) -> float:
+def _stamp(record: RecordedMessage) -> float:
     """Return when a frame was taken [s]; when it was recorded, where it is broken."""
     try:
         stamp = record.decode().header.stamp

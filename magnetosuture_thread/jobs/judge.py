@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
@@ -24,7 +24,7 @@ from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import NEEDLE_COMMAND, SCENE, SEEN_THREAD, TRUTH_THREAD
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.offline.predictions import chosen_source
 from magnetosuture_thread.offline.sights import pixels
 from magnetosuture_thread.scene import Scene
@@ -127,7 +127,7 @@ def scene_at(recording: Recording, start: float) -> Scene | None:
             if found is not None and record.time > recording.start + round(start * 1e9):
                 break
             try:
-                found = scene_of(record.decode())
+                found = parse_scene_message(record.decode())
             except InvalidInputError as error:
                 raise BagError(recording.path, str(error)) from None
     return found

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from magnetosuture_thread.bags.reader import Record
-from magnetosuture_thread.bags.types import MESSAGES, typestore
+from magnetosuture_thread.bags.message_types import MESSAGES, typestore
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.interface import (
     CAMERA,
     CAMERA_INFO,
@@ -100,13 +100,13 @@ class Playing:
             arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
         return arguments
 
-    def records(self) -> Iterator[Record]:
+    def records(self) -> Iterator[RecordedMessage]:
         """Give the messages to play, by time."""
         given = self.given
         # The scene comes first: the one that the bag tells to be in force, or else the set-up's.
         message = MESSAGES.scene_message(given.begin, given.setup.scene)
         data = bytes(typestore().serialize_cdr(message, SCENE.type_name))
-        yield Record(SCENE.recorded, SCENE.type_name, given.begin, data)
+        yield RecordedMessage(SCENE.recorded, SCENE.type_name, given.begin, data)
         if given.start > 0.0:  # what was said before of the thread is in force
             told = [channel for channel in CHANGING if channel != SCENE]
             for record in given.recording.records(told, duration=given.start):

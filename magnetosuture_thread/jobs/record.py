@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.types import MESSAGES
+from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory

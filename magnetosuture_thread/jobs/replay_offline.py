@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from magnetosuture_thread.bags.reader import Record
-from magnetosuture_thread.bags.types import MESSAGES
+from magnetosuture_thread.bags.message_types import MESSAGES
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import FrameResult
@@ -184,7 +184,7 @@ class _Output:
                 self._bag.write(SEEN_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
         self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), MESSAGES.tracker_state(stamp, track))
 
-    def _record(self, stamp: int, record: Record) -> None:
+    def _record(self, stamp: int, record: RecordedMessage) -> None:
         if record.topic == SCENE.recorded:
             version = record.decode().version
             if version == self._version:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, triangulate
-from magnetosuture_thread.geometry.orientation import angle_of, turned
+from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     BRIDGE_STATE,
@@ -107,7 +107,7 @@ class MessageBuilder:
 
     def flat_pose(self, point: Vector, angle: float) -> Any:
         """Return a pose in the dish plane: a point of shape (2,) [m] and an angle from the x axis on [rad]."""
-        return self.pose(point, (0.0, 0.0, *turned(angle)))
+        return self.pose(point, (0.0, 0.0, *yaw_quaternion(angle)))
 
     def pose_stamped(self, header: Any, pose: Any) -> Any:
         """Return a PoseStamped."""
@@ -135,7 +135,9 @@ class MessageBuilder:
         whole = np.zeros((6, 6))
         if covariance is not None:
             whole[np.ix_(IN_PLANE, IN_PLANE)] = covariance
-        return self.pose_with_covariance(self.header(stamp), self.flat_pose(tail, angle_of(heading)), whole.ravel())
+        return self.pose_with_covariance(
+            self.header(stamp), self.flat_pose(tail, heading_angle(heading)), whole.ravel()
+        )
 
     def path(self, header: Any, poses: Sequence[Any]) -> Any:
         """Return a Path of poses."""

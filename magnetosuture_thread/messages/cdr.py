@@ -109,7 +109,7 @@ def stamp_and_frame(topic: str, data: bytes) -> tuple[int, str]:
     raise BagError(topic, "a message has no header that can be read")
 
 
-def is_in_dish(data: bytes) -> bool:
+def is_in_dish_frame(data: bytes) -> bool:
     """Return whether a message that begins with a header is in the dish frame, as `stamp_and_frame` would say."""
     return data[_LENGTH:DISH_END] == _DISH.get(data[:2])
 

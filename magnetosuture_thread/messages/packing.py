@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.orientation import angle_of, turned
+from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.building import ADD, IN_PLANE, LINE_STRIP
 from magnetosuture_thread.messages.cdr import (
@@ -65,7 +65,7 @@ def packed_pose(
     if covariance is not None:
         for place, value in zip(_PLACES, covariance.ravel().tolist(), strict=True):
             whole[place] = value
-    z, w = turned(angle_of(heading))
+    z, w = yaw_quaternion(heading_angle(heading))
     return BEGIN + _POSE.pack(*time, *DISH, tail[0], tail[1], 0.0, 0.0, 0.0, z, w, *whole)
 
 

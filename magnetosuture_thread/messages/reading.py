@@ -11,12 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.orientation import as_told, heading_of
+from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import DISH_FRAME, MARGINS, NEEDLE_POSE, SEEN_THREAD
 from magnetosuture_thread.messages.building import IN_PLANE
-from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish
+from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
 from magnetosuture_thread.model.friction import Friction, FrictionState
 from magnetosuture_thread.model.margins import BarrierMargins, Margins
 from magnetosuture_thread.model.predictor import NeedlePose
@@ -63,7 +64,7 @@ def needle_pose(message: Any) -> NeedlePose:
     stamp = message.header.stamp
     checked_nanoseconds(stamp, NEEDLE_POSE.name)  # the prediction could not be stamped by another
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    heading = heading_of(q.x, q.y, q.z, q.w, _ORIENTATION)
+    heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
 
 
@@ -74,7 +75,7 @@ def tracked_pose(stamp: Any, tail: NDArray[np.float64], heading: NDArray[np.floa
         InvalidInputError: no stamp.
     """
     checked_nanoseconds(stamp, NEEDLE_POSE.name)
-    along = as_told(heading, _ORIENTATION)
+    along = round_trip_heading(heading, _ORIENTATION)
     return NeedlePose(seconds(stamp), np.array([float(tail[0]), float(tail[1])]), along)
 
 
@@ -175,13 +176,13 @@ class Record(Protocol):
         """
 
 
-def stamp_of(record: Record) -> int:
+def stamp_of(record: RecordedMessage) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
     stamp = header_stamp(record.data)
     return record.time if stamp is None else stamp
 
 
-def read_pose(record: Record) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_pose(record: RecordedMessage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return tail and heading of a recorded needle pose, each of shape (2,), as `thread_model` gets them.
 
     Raises:
@@ -191,14 +192,14 @@ def read_pose(record: Record) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     data = record.data
     if _is_plain(data) and len(data) >= _POSE_AT + _POSE.size:
         x, y, _, qx, qy, qz, qw = _POSE.unpack_from(data, _POSE_AT)
-        return np.array([x, y]), heading_of(qx, qy, qz, qw, _ORIENTATION)
+        return np.array([x, y]), heading_from_quaternion(qx, qy, qz, qw, _ORIENTATION)
     message = record.decode()
     require_dish_frame(message.header.frame_id, record.topic)
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    return np.array([position.x, position.y]), heading_of(q.x, q.y, q.z, q.w, _ORIENTATION)
+    return np.array([position.x, position.y]), heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
 
 
-def read_path(record: Record) -> Points:
+def read_path(record: RecordedMessage) -> Points:
     """Return a recorded path as an array of shape (m, 2) [m].
 
     Raises:
@@ -231,4 +232,4 @@ def _plain_path(data: bytes) -> Points | None:
 
 def _is_plain(data: bytes) -> bool:
     """Return whether a message is in the dish frame, and written as our machines write it."""
-    return data[:2] == LITTLE_ENDIAN and is_in_dish(data)
+    return data[:2] == LITTLE_ENDIAN and is_in_dish_frame(data)

@@ -6,6 +6,7 @@ from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
+from magnetosuture_thread.geometry.obstacles.polygon import Ring
 from magnetosuture_thread.interface import DISH_FRAME, SCENE
 from magnetosuture_thread.scene.scene import (
     MAX_HOLES,
@@ -18,11 +19,9 @@ from magnetosuture_thread.scene.scene import (
     SceneShape,
 )
 
-Ring = tuple[tuple[float, float], ...]
-
 
 def scene_fields(scene: Scene) -> dict[str, Any]:
-    """Return what a message says of a scene, in plain values by the names of the fields, all but the header.
+    """Return the fields of a scene message as built-in values by name, without the header.
 
     A shape has `disc`, a list of none or one of x, y, radius, and `polygon`, a list of none or one of `outline` and
     `holes`. An outline is a dictionary whose `corners` are dictionaries of x, y and z.
@@ -35,7 +34,7 @@ def scene_fields(scene: Scene) -> dict[str, Any]:
     }
 
 
-def scene_of(message: Any) -> Scene:
+def parse_scene_message(message: Any) -> Scene:
     """Return the scene that a message tells, once it is known to be whole.
 
     Args:
@@ -76,11 +75,11 @@ def _outline_fields(ring: Ring) -> dict[str, Any]:
 
 
 def _require_bounds(message: Any) -> None:
-    """Refuse more than a scene may have before anything is made of it, which takes time."""
+    """Refuse an oversized message before anything is built from it."""
 
-    def require(field: str, count: int, most: int) -> None:
-        if count > most:
-            raise InvalidInputError(f"{SCENE.name}.{field}", count, f"at most {most}")
+    def require(field: str, count: int, maximum: int) -> None:
+        if count > maximum:
+            raise InvalidInputError(f"{SCENE.name}.{field}", count, f"at most {maximum}")
 
     require("shapes", len(message.shapes), MAX_SHAPES)
     vertices = 0

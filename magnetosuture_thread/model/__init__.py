@@ -1,6 +1,6 @@
 """Model: predicts the thread behind the needle."""
 
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
 from magnetosuture_thread.model.factory import make_formulation, make_solver
 from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
@@ -16,9 +16,9 @@ __all__ = [
     "NeedlePose",
     "Polygon",
     "Prediction",
-    "Surroundings",
     "Thread",
     "ThreadPredictor",
+    "Workspace",
     "make_formulation",
     "make_solver",
 ]

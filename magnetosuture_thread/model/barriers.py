@@ -20,7 +20,7 @@ from magnetosuture_thread.barrier import (
 )
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
-from magnetosuture_thread.geometry.obstacles import Surroundings, wall_contact
+from magnetosuture_thread.geometry.obstacles import Workspace, wall_contact
 from magnetosuture_thread.geometry.polyline import Points
 
 
@@ -170,7 +170,7 @@ class ObstacleAvoidance(CompiledBarrier):
         h_obs,i,O = sd_O(x_i) - rho,    i = 0 ... n,  O = 1 ... M
 
     with the signed distance sd_O, negative inside. Unit of h: that of the positions. A pair of node and
-    obstacle that is farther apart than the surroundings' reach has no row.
+    obstacle that is farther apart than the workspace' reach has no row.
 
     Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: the paper
     has (|x_i - p_O|^2 - rho^2) / 2 with the closest point p_O, see `SquaredObstacleAvoidance`. Outside of
@@ -179,17 +179,17 @@ class ObstacleAvoidance(CompiledBarrier):
     gradient everywhere.
 
     Attributes:
-        surroundings: the obstacles, in the unit of the positions.
+        workspace: the obstacles, in the unit of the positions.
         distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
     name = OBSTACLE
-    surroundings: Surroundings
+    workspace: Workspace
     distance: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
-        found = self.surroundings.near(positions)
+        found = self.workspace.near(positions)
         chosen = found.nearest & (found.obstacle != DISH_WALL)
         value = found.distance[chosen] - self.distance
         return BarrierRows(
@@ -215,17 +215,17 @@ class SquaredObstacleAvoidance(CompiledBarrier):
     vanishes on the surface: the formulation `paper` takes `ObstacleAvoidance` for nodes that are too near.
 
     Attributes:
-        surroundings: the obstacles, in the unit of the positions.
+        workspace: the obstacles, in the unit of the positions.
         distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
     name = OBSTACLE
-    surroundings: Surroundings
+    workspace: Workspace
     distance: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
-        found = self.surroundings.near(positions)
+        found = self.workspace.near(positions)
         chosen = found.nearest & (found.obstacle != DISH_WALL)
         signed = found.distance[chosen]
         value, slope = np.empty(len(signed)), np.empty(len(signed))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from magnetosuture_thread.barrier import Barrier, check_barriers
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.model.formulations import Formulation, PaperFormulation, PaperOptions, RodFormulation
 from magnetosuture_thread.model.program import Solver
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver, QpsolversSolver
@@ -18,11 +18,11 @@ SOLVERS = (BandedSolver.name, OsqpSolver.name)
 """Those that need no other package; besides, any that qpsolvers knows."""
 
 
-def surroundings_of(scene: Scene | None, reach: float) -> Surroundings:
+def workspace_of(scene: Scene | None, reach: float) -> Workspace:
     """Return a scene's obstacles and wall for the barriers, which see as far as a reach [m]; none of no scene."""
     if scene is None:
-        return Surroundings((), reach)
-    return Surroundings(scene.obstacles, reach, wall_radius=scene.dish.radius)
+        return Workspace((), reach)
+    return Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius)
 
 
 def make_solver(name: str, tolerance: float) -> Solver:
@@ -45,7 +45,7 @@ def make_solver(name: str, tolerance: float) -> Solver:
 def make_formulation(
     name: str,
     thread: Thread,
-    surroundings: Surroundings,
+    workspace: Workspace,
     solver: Solver,
     tolerance: float,
     paper: PaperOptions | None = None,
@@ -58,7 +58,7 @@ def make_formulation(
     """
     check_barriers(tuple(barriers))
     if name == PaperFormulation.name:
-        return PaperFormulation(thread, surroundings, solver, tolerance, paper, barriers)
+        return PaperFormulation(thread, workspace, solver, tolerance, paper, barriers)
     if name != RodFormulation.name:
         raise ConfigurationError("formulation", name, f"one of {', '.join(FORMULATIONS)}")
-    return RodFormulation(thread, surroundings, solver, tolerance, barriers)
+    return RodFormulation(thread, workspace, solver, tolerance, barriers)

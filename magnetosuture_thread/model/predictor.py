@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.factory import make_formulation, make_solver, surroundings_of
+from magnetosuture_thread.model.factory import make_formulation, make_solver, workspace_of
 from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
@@ -100,7 +100,7 @@ class ThreadPredictor:
 
     Args:
         thread: the thread.
-        scene: dish and shapes; in space `Surroundings` of three dimensions; None for neither wall nor shapes.
+        scene: dish and shapes; in space `Workspace` of three dimensions; None for neither wall nor shapes.
         barriers: what is enforced besides the formulation's own barriers, see `Barrier`.
         formulation: `rod`, the accurate one, or `paper`, as printed; or one that is made already, which then knows
             scene and barriers itself.
@@ -124,7 +124,7 @@ class ThreadPredictor:
     def __init__(
         self,
         thread: Thread,
-        scene: Scene | Surroundings | None = None,
+        scene: Scene | Workspace | None = None,
         barriers: Sequence[Barrier] = (),
         *,
         formulation: str | Formulation = "rod",
@@ -139,18 +139,16 @@ class ThreadPredictor:
     ) -> None:
         for node in fixed_nodes:
             _check_node("fixed node", node, thread)
-        surroundings = scene if isinstance(scene, Surroundings) else surroundings_of(scene, margin_range)
+        workspace = scene if isinstance(scene, Workspace) else workspace_of(scene, margin_range)
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)
-            formulation = make_formulation(
-                formulation, thread, surroundings, chosen, residual_tolerance, paper, barriers
-            )
+            formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
         self.thread = thread
         self._formulation, self._contact_tolerance = formulation, contact_tolerance
         self._longest_step = max_step
         self._most_substeps = max_substeps
         self._fixed = tuple(sorted(set(fixed_nodes)))
-        self._room_radius = surroundings.wall_radius - 0.5 * thread.diameter
+        self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
         self._scene_version = scene.version if isinstance(scene, Scene) else ""
         self._pose: NeedlePose | None = None
         self._state: ThreadState | None = None
@@ -162,7 +160,7 @@ class ThreadPredictor:
         *,
         length: float,
         segments: int,
-        scene: Scene | Surroundings | None = None,
+        scene: Scene | Workspace | None = None,
         barriers: Sequence[Barrier] = (),
         attachment: str = "pinned",
         viscosity: float = 1.0,

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
-from magnetosuture_thread.geometry.polyline import Points, laid_behind
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
+from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
 from magnetosuture_thread.model.friction import FrictionLaw
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction
@@ -83,7 +83,7 @@ class ThreadSession:
         self.settings, self.scene = settings, scene
         self._predictor = settings.predictor(scene)
         # Obstacles may come later, and no callback shall wait for the compiler of what they need.
-        Surroundings(_OBSTACLES, settings.margin_range)
+        Workspace(_OBSTACLES, settings.margin_range)
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
@@ -183,7 +183,7 @@ class ThreadSession:
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":
             radius = self.scene.dish.radius - 0.5 * self.thread.diameter if self.scene is not None else math.inf
-            return laid_behind(attached.tail, attached.heading, self.thread.length, radius)
+            return lay_behind_needle(attached.tail, attached.heading, self.thread.length, radius)
         if self._seen is None or self._seen[0] != stamp:
             return None
         centreline = self._seen[1]

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from magnetosuture_thread.barrier import load_barriers
-from magnetosuture_thread.configuration import Configuration, described, quantity
+from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.factory import FORMULATIONS, SOLVERS, make_solver
@@ -19,7 +19,7 @@ from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 MEDIA = ("liquid", "air")
 OF_MEDIUM = {
@@ -46,7 +46,7 @@ class ThreadModelSettings(Configuration):
 
     GROUP: ClassVar[str] = "thread_model"
 
-    scene: str = shared("scene")
+    scene: str = shared_parameter("scene")
     formulation: str = quantity(
         "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS
     )
@@ -59,7 +59,7 @@ class ThreadModelSettings(Configuration):
     elastic_modulus: float = quantity(
         0.0, "effective modulus of the thread in bending; 0 takes the material's", unit="Pa", minimum=0.0, maximum=1e12
     )
-    thread_length: float = shared("thread_length")
+    thread_length: float = shared_parameter("thread_length")
     segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
     attachment: str = quantity(
         Attachment.PINNED.value,
@@ -81,7 +81,7 @@ class ThreadModelSettings(Configuration):
         "what the thread moves in: liquid drags it, in air its inertia and weight count; for rod",
         choices=MEDIA,
     )
-    viscosity: float = shared("viscosity")
+    viscosity: float = shared_parameter("viscosity")
     wetted_fraction: float = quantity(
         0.5, "part of the thread's surface in the liquid; half for a floating thread", minimum=0.05, maximum=1.0
     )
@@ -204,7 +204,7 @@ class ThreadModelSettings(Configuration):
             sharpest = MAX_REST_ANGLE * self.segments / self.thread_length
             words = f"at most {sharpest:.0f} 1/m with {self.segments} segments, which turn by half a radian then"
             raise ConfigurationError(f"{self.GROUP}.rest_curvature", self.rest_curvature, words)
-        for about in described(type(self)):
+        for about in configuration_fields(type(self)):
             other = OF_MEDIUM.get(about.name, self.medium)
             if other != self.medium and getattr(self, about.name) != about.default:
                 name, value = f"{self.GROUP}.{about.name}", getattr(self, about.name)

@@ -18,9 +18,9 @@ from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
 
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.orientation import angle_of
+from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.margins import node_clearance
 from magnetosuture_thread.scene import Scene, SceneShape
 
@@ -58,7 +58,7 @@ def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
         InvalidInputError: the pose is none in the dish plane.
     """
     pose = needle_pose(message)
-    return {"tail": pose.tail.tolist(), "heading": angle_of(pose.heading)}
+    return {"tail": pose.tail.tolist(), "heading": heading_angle(pose.heading)}
 
 
 def tracker(message: TrackerState) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def scene(message: SceneMessage) -> dict[str, Any]:
     Raises:
         InvalidInputError: the message is damaged.
     """
-    return shown_scene(scene_of(message))
+    return shown_scene(parse_scene_message(message))
 
 
 def shown_scene(known: Scene) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.configuration import OF_ROS, Configuration
+from magnetosuture_thread.configuration import ROS_PARAMETERS, Configuration
 from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
@@ -150,7 +150,7 @@ class ManagedNode(LifecycleNode, Generic[C]):
 
     def _keep(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse to change settings under a configured node."""
-        held = [p.name for p in parameters if p.name.split(".")[0] not in OF_ROS]
+        held = [p.name for p in parameters if p.name.split(".")[0] not in ROS_PARAMETERS]
         if self.settings is None or not held:
             return SetParametersResult(successful=True)
         error = ConfigurationError(held[0], "a change while configured", "a cleaned-up node")

@@ -20,9 +20,16 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.utilities import get_default_context
 
-from magnetosuture_thread.configuration import parse_yaml
+from magnetosuture_thread.configuration import parse_parameter_value
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.parameter_files import EVERY_NODE, check_list, last_name, matches, read_sections, shown
+from magnetosuture_thread.parameter_files import (
+    EVERY_NODE,
+    check_list_value,
+    format_key,
+    key_matches,
+    node_of_key,
+    read_sections,
+)
 
 _ARGUMENTS: WeakKeyDictionary[Context, list[str]] = WeakKeyDictionary()  # of each context, where it is known
 
@@ -140,10 +147,10 @@ def _parameters(line: RosArguments, kind: str, node: str) -> dict[str, Any]:
             for key, values in _sections_for(entry, kind, node):
                 flat = _flat("", values)
                 for name, value in flat.items():
-                    check_list(f"{key}.{name}", value, str(entry))
+                    check_list_value(f"{key}.{name}", value, str(entry))
                 given.update(flat)
-        elif entry[0] in ("", kind, last_name(node)):
-            given[entry[1]] = parse_yaml(entry[2])
+        elif entry[0] in ("", kind, node_of_key(node)):
+            given[entry[1]] = parse_parameter_value(entry[2])
     return given
 
 
@@ -151,13 +158,13 @@ def _sections_for(path: Path, kind: str, node: str) -> list[tuple[str, dict[str,
     """Return the sections of a file that are for a node, by its own name or the one that it was given."""
     sections, space = read_sections(path), node.rpartition("/")[0]
     names = {node, f"{space}/{kind}"}
-    fitting = [(key, values) for key, values in sections if any(matches(key, name) for name in names)]
-    own = {key for key, _ in sections if last_name(key) in (kind, last_name(node))}
+    fitting = [(key, values) for key, values in sections if any(key_matches(key, name) for name in names)]
+    own = {key for key, _ in sections if node_of_key(key) in (kind, node_of_key(node))}
     # A section of its kind that is for another namespace only is as bad as none: the rest would be its defaults.
     if not fitting or (own and not any(key in own for key, _ in fitting)):
         expected = f"one for {node}: {EVERY_NODE}/{kind} or {node}" + ("" if own else f" or {EVERY_NODE}")
         raise ConfigurationError(
-            "sections", ", ".join(shown(key) for key, _ in sections) or "none", expected, str(path)
+            "sections", ", ".join(format_key(key) for key, _ in sections) or "none", expected, str(path)
         )
     return fitting
 

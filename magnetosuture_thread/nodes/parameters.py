@@ -9,9 +9,16 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.configuration import OF_ROS, Configuration, Described, described, from_mapping, to_mapping
+from magnetosuture_thread.configuration import (
+    ROS_PARAMETERS,
+    Configuration,
+    ConfigurationField,
+    configuration_fields,
+    from_mapping,
+    to_mapping,
+)
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.shared_parameters import SHARED
+from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
 C = TypeVar("C", bound=Configuration)
 
@@ -30,7 +37,7 @@ LONGEST_LIST = 1000  # entries that a parameter may be set to while the node run
 _LONGEST_REASON = 400  # characters
 
 
-def _type(about: Described) -> Parameter.Type:
+def _type(about: ConfigurationField) -> Parameter.Type:
     return _ARRAYS[about.entry] if about.kind is tuple else _TYPES[about.kind]
 
 
@@ -53,15 +60,15 @@ def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[
     given = {
         name: parameter.value
         for name, parameter in node.get_parameters_by_prefix("").items()
-        if name.split(".")[0] not in OF_ROS
+        if name.split(".")[0] not in ROS_PARAMETERS
     }
-    known = {about.name for about in described(cls)}
-    for name in sorted(given.keys() & set(SHARED) - known):
+    known = {about.name for about in configuration_fields(cls)}
+    for name in sorted(given.keys() & set(SHARED_PARAMETERS) - known):
         node.undeclare_parameter(name)
         del given[name]
     settings = from_mapping(cls, {name: _plain(value) for name, value in given.items()})
     values = to_mapping(settings)
-    for about in described(cls):
+    for about in configuration_fields(cls):
         if about.name in given:
             node.undeclare_parameter(about.name)
         descriptor = _descriptor(about, read_only, (fixed or {}).get(about.name, ""))
@@ -91,7 +98,7 @@ class Changeable(Generic[C]):
     def __init__(self, node: Node, settings: C, prepare: Callable[[C], Callable[[], None]]) -> None:
         self.settings = settings
         self._node, self._prepare = node, prepare
-        self._about = {about.name: about for about in described(type(settings))}
+        self._about = {about.name: about for about in configuration_fields(type(settings))}
         self._agreed: tuple[C, Callable[[], None]] | None = None
         node.add_pre_set_parameters_callback(self._as_declared)
         node.add_on_set_parameters_callback(self._check)
@@ -162,7 +169,7 @@ def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
     )
 
 
-def _declare_empty(node: Node, about: Described, descriptor: ParameterDescriptor) -> None:
+def _declare_empty(node: Node, about: ConfigurationField, descriptor: ParameterDescriptor) -> None:
     """Declare a list that is empty: by its value alone rclpy would take it for one of bytes, for good."""
     node.declare_parameter(about.name, _type(about), ParameterDescriptor(), ignore_override=True)
     node.set_parameters([Parameter(about.name, _type(about), [])])
@@ -174,7 +181,7 @@ def _plain(value: Any) -> Any:
     return list(value) if hasattr(value, "typecode") or isinstance(value, tuple) else value
 
 
-def _descriptor(about: Described, read_only: bool, fixed: str) -> ParameterDescriptor:
+def _descriptor(about: ConfigurationField, read_only: bool, fixed: str) -> ParameterDescriptor:
     quantity = about.quantity
     expectation = quantity.expectation(about.kind)
     descriptor = ParameterDescriptor(

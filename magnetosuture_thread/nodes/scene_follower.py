@@ -7,7 +7,7 @@ from collections.abc import Callable
 from rclpy.node import Node
 
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import decoded
@@ -87,4 +87,4 @@ def received_scene(data: bytes) -> Scene:
     """
     if len(data) > MAX_MESSAGE_BYTES:
         raise InvalidInputError(topics.SCENE.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}")
-    return scene_of(decoded(topics.SCENE, data))
+    return parse_scene_message(decoded(topics.SCENE, data))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 
-from magnetosuture_thread.configuration import described
+from magnetosuture_thread.configuration import configuration_fields
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.session import ThreadSession
@@ -32,7 +32,7 @@ class ThreadSettings:
 
     def __init__(self, node: Node, session: ThreadSession, health: Health) -> None:
         self._node, self._session, self._health = node, session, health
-        self._names = [about.name for about in described(ThreadModelSettings)]
+        self._names = [about.name for about in configuration_fields(ThreadModelSettings)]
         self._parameters = Changeable(node, session.settings, self._prepare)
         topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.interface import MATERIAL, SCENE
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
@@ -14,7 +14,7 @@ CHANGING = (SCENE, MATERIAL)
 
 
 def changed(
-    settings: ThreadModelSettings, scene: Scene | None, record: Record
+    settings: ThreadModelSettings, scene: Scene | None, record: RecordedMessage
 ) -> tuple[ThreadModelSettings, Scene | None]:
     """Return settings and scene after a recorded message on one of these channels.
 
@@ -24,6 +24,6 @@ def changed(
         InvalidInputError: it is of another frame, or damaged.
     """
     if record.topic == SCENE.recorded:
-        return settings, scene_of(record.decode())
+        return settings, parse_scene_message(record.decode())
     values = changes.told_material(record.decode())
     return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values}), scene

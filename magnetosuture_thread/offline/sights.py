@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.bags.reader import Record
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError, MagnetosutureError
 from magnetosuture_thread.evaluation.frames import Observation
-from magnetosuture_thread.geometry.orientation import as_told
+from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
@@ -24,7 +24,7 @@ from magnetosuture_thread.interface import (
     Channel,
 )
 from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.session import MAX_WAITING_POSES
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.setups import Setup
@@ -72,7 +72,7 @@ class Sights(Iterator[Observation]):
         self.count = self.found = 0
         self.refused: Counter[str] = Counter()
         self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
-        self.on_record: Callable[[int, Record], None] = lambda stamp, record: None
+        self.on_record: Callable[[int, RecordedMessage], None] = lambda stamp, record: None
         self._scene = setup.scene
         self._length = setup.model.thread_length
         self._threads = self._measured = self._odd = 0
@@ -102,7 +102,7 @@ class Sights(Iterator[Observation]):
         """
         return next(self._going)
 
-    def changes(self) -> list[Record]:
+    def changes(self) -> list[RecordedMessage]:
         """Return, once, what the bag says of scene and thread before the sight that was given last."""
         changes, self._changes = self._changes, []
         for record in changes:
@@ -119,9 +119,9 @@ class Sights(Iterator[Observation]):
             f"shorter than {SHORTEST:g} times the set-up's {self._length:g} m: is it another thread?"
         )
 
-    def _go(self, records: Iterator[Record], awaited: set[Channel]) -> Iterator[Observation]:
+    def _go(self, records: Iterator[RecordedMessage], awaited: set[Channel]) -> Iterator[Observation]:
         """Give a sight once what belongs to it has come, or cannot be expected any more."""
-        waiting: deque[Observation | Record] = deque()
+        waiting: deque[Observation | RecordedMessage] = deque()
         parts: dict[str, dict[int, Points]] = {channel.recorded: {} for channel in awaited}
         for record in records:
             if record.topic in parts:
@@ -133,32 +133,32 @@ class Sights(Iterator[Observation]):
                 waiting.append(self._pose(record) if self.source == "poses" else self._frame(record))
             while waiting and (
                 len(waiting) > MAX_WAITING_POSES
-                or isinstance(head := waiting[0], Record)
+                or isinstance(head := waiting[0], RecordedMessage)
                 or all(head.stamp in known for known in parts.values())
             ):
                 yield from self._next(waiting.popleft(), parts)
         while waiting:
             yield from self._next(waiting.popleft(), parts)
 
-    def _follow(self, record: Record) -> None:
+    def _follow(self, record: RecordedMessage) -> None:
         """Look for the needle in a recorded scene from here on, as `vision_tracker` does."""
         if record.topic != SCENE.recorded:
             return
         try:
-            scene = scene_of(record.decode())
+            scene = parse_scene_message(record.decode())
             if scene.version != self._scene.version and self._tracker is not None:
                 self._tracker.set_scene(scene)
         except MagnetosutureError:
             return  # counted and reported where the model takes it
         self._scene = scene
 
-    def _next(self, head: Observation | Record, parts: dict[str, dict[int, Points]]) -> Iterator[Observation]:
-        if isinstance(head, Record):
+    def _next(self, head: Observation | RecordedMessage, parts: dict[str, dict[int, Points]]) -> Iterator[Observation]:
+        if isinstance(head, RecordedMessage):
             self._changes.append(head)
         else:
             yield self._whole(head, parts)
 
-    def _keep(self, known: dict[int, Points], record: Record) -> None:
+    def _keep(self, known: dict[int, Points], record: RecordedMessage) -> None:
         stamp = stamp_of(record)
         if record.topic == _SEEN:
             self.on_record(stamp, record)
@@ -186,7 +186,7 @@ class Sights(Iterator[Observation]):
         seen = seen if self.source == "poses" else sight.seen
         return Observation(sight.stamp, sight.tail, sight.heading, seen, truth, sight.reason, sight.processing)
 
-    def _pose(self, record: Record) -> Observation:
+    def _pose(self, record: RecordedMessage) -> Observation:
         """Return what a recorded pose says."""
         self.count += 1
         stamp = stamp_of(record)
@@ -200,7 +200,7 @@ class Sights(Iterator[Observation]):
         self.found += 1
         return Observation(stamp, tail, heading, _NOTHING, _NOTHING)
 
-    def _frame(self, record: Record) -> Observation:
+    def _frame(self, record: RecordedMessage) -> Observation:
         """Return what a camera frame says, as `thread_model` would get it."""
         assert self._tracker is not None
         self.count += 1
@@ -222,7 +222,7 @@ class Sights(Iterator[Observation]):
             self.refused[kind] += 1
             return Observation(stamp, reason=seen.track.reason, processing=taken)
         self.found += 1
-        heading = as_told(seen.track.heading, NEEDLE_POSE.name)
+        heading = round_trip_heading(seen.track.heading, NEEDLE_POSE.name)
         return Observation(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
 
     def _check_place(self, topic: str, points: Points) -> None:
@@ -245,7 +245,9 @@ def pixels(message: Any, type_name: str) -> Any:
     return np.asarray(unpack_image(message.data, message.height, message.width, message.step, message.encoding))
 
 
-def _telling(records: Iterator[Record], begin: int, whole: float, progress: Progress) -> Iterator[Record]:
+def _telling(
+    records: Iterator[RecordedMessage], begin: int, whole: float, progress: Progress
+) -> Iterator[RecordedMessage]:
     """Go through records and tell how far, a thousand times at the most: showing it takes longer than a step."""
     following, pause = begin, max(round(whole * 1e6), 1)
     for record in records:

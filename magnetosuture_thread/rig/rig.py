@@ -13,7 +13,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.rig.camera.dish_camera import Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings
-from magnetosuture_thread.scene import Scene, occupant
+from magnetosuture_thread.scene import Scene, find_collision
 
 Vector = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ class Rig:
         # A thread around a post that stays may cut its edge by a chord, which is no reason to refuse.
         new = replace(scene, shapes=tuple(shape for shape in scene.shapes if shape not in self.scene.shapes))
         for name, points in {"needle": self._dynamics.body, "thread": self._dynamics.thread}.items():
-            if what := occupant(new, points, holes=False):
+            if what := find_collision(new, points, holes=False):
                 raise InvalidInputError("scene", f"{what} where the {name} is", "shapes off needle and thread")
         camera, surface = self._settings.camera(scene), self._settings.surface(scene)
         self._dynamics.set_surface(surface)

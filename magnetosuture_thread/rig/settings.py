@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arc import needle_axis, require_needle
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
@@ -25,8 +25,8 @@ from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
 from magnetosuture_thread.rig.power.process import StageProcess
-from magnetosuture_thread.scene import Scene, occupant
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.scene import Scene, find_collision
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 LARGEST_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
 
@@ -48,8 +48,8 @@ class RigSettings(Configuration):
         (), "what goes wrong: KIND START DURATION each, in seconds since the first current"
     )
 
-    scene: str = shared("scene")
-    viscosity: float = shared("viscosity")
+    scene: str = shared_parameter("scene")
+    viscosity: float = shared_parameter("viscosity")
     obstacle_looks: tuple[str, ...] = quantity(
         (), f"of what each shape of the scene seems to be made, in order: {', '.join(LOOKS)}; none given: by its kind"
     )
@@ -70,7 +70,7 @@ class RigSettings(Configuration):
     coil_max_current: float = quantity(
         30.0, "that the power stage gives, in either direction", unit="A", minimum=0.01, maximum=1000.0
     )
-    driver_timeout: float = shared("driver_timeout")
+    driver_timeout: float = shared_parameter("driver_timeout")
 
     power_stage: str = quantity(
         "topic",
@@ -84,9 +84,9 @@ class RigSettings(Configuration):
     coil_inductance: float = quantity(0.01, "of a coil on a board", unit="H", minimum=1e-6, maximum=10.0)
     supply_voltage: float = quantity(24.0, "of the boards", unit="V", minimum=1.0, maximum=80.0)
 
-    needle_length: float = shared("needle_length")
-    needle_width: float = shared("needle_width")
-    needle_curvature: float = shared("needle_curvature")
+    needle_length: float = shared_parameter("needle_length")
+    needle_width: float = shared_parameter("needle_width")
+    needle_curvature: float = shared_parameter("needle_curvature")
     needle_magnetisation: float = quantity(
         1.0e6, "of the needle, NdFeB, along its body", unit="A/m", minimum=1e3, maximum=2e6
     )
@@ -98,7 +98,7 @@ class RigSettings(Configuration):
         multiple=3,
     )
 
-    thread_length: float = shared("thread_length")
+    thread_length: float = shared_parameter("thread_length")
     thread_diameter: float = quantity(60e-6, "of the thread", unit="m", minimum=1e-6, maximum=0.005)
     thread_segments: int = quantity(60, "that the simulated thread is cut into", minimum=8, maximum=400)
     thread_attachment: str = quantity("pinned", "to the needle", choices=("pinned", "clamped"))
@@ -134,7 +134,7 @@ class RigSettings(Configuration):
         if self.power_stage == "roboclaw" and (not ports or 2 * ports != len(self.coil_angles)):
             expectation = f"a path for two of the {len(self.coil_angles)} coils"
             raise ConfigurationError(f"{self.GROUP}.power_stage_ports", list(self.power_stage_ports), expectation)
-        require_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         for fault in self.faults:
             Fault.parse(fault)
 
@@ -153,7 +153,7 @@ class RigSettings(Configuration):
         x, y, heading = self.needle_start
         needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
         for name, points in {"a needle": needle, "a thread": self.thread_at_start(at)}.items():
-            what = occupant(scene, points, holes=False)
+            what = find_collision(scene, points, holes=False)
             if what:
                 start = f"{list(self.needle_start)}, thread curvature {self.thread_start_curvature:g}"
                 expectation = f"{name} in the dish, off the obstacles: it would be in {what}"

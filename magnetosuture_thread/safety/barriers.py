@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.half_planes import project_within
+from magnetosuture_thread.geometry.half_planes import project_onto_half_planes
 from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
 from magnetosuture_thread.geometry.obstacles.search import search_edges
 from magnetosuture_thread.geometry.polyline import Points
@@ -176,7 +176,7 @@ def _projected(
             given[used, 0], given[used, 1], bounds[used] = x, y, least[k]
             used += 1
     found = np.empty(2)
-    holds = project_within(np.array([vx, vy]), given[:used], bounds[:used], work[:used], found)
+    holds = project_onto_half_planes(np.array([vx, vy]), given[:used], bounds[:used], work[:used], found)
     if not holds:
         return False, 0.0, 0.0
     size = math.hypot(found[0], found[1])

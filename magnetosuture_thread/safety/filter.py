@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier, check_barriers
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.arc import needle_points
+from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, AddedRows, measure, nearest_clear
 from magnetosuture_thread.safety.certificate import NOTHING, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics

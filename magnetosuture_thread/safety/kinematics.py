@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.arc import needle_chord
+from magnetosuture_thread.geometry.needle_arc import needle_chord
 
 Vector = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Looks through a scene for what is allowed and yet is often a slip: overlaps, narrow gaps, shapes across the wall."""
+"""Checks of a scene: collisions, and warnings on overlaps, narrow gaps and shapes across the wall."""
 
 from __future__ import annotations
 
@@ -11,14 +11,36 @@ import numpy as np
 import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.scene.scene import Scene, SceneShape
 
-LEAST_OVERLAP = 1e-12  # m^2; shapes that share a boundary do not overlap
+MIN_OVERLAP_AREA = 1e-12  # m^2; shapes that share a boundary do not overlap
+WALL_NAME = "wall"
+
+
+def find_collision(scene: Scene, points: Points, *, holes: bool = True) -> str:
+    """Return the name of what a line through points collides with: `wall`, a shape, or empty for nothing.
+
+    It collides with the wall at or beyond it.
+
+    Args:
+        scene: dish and shapes.
+        points: of the line; of a point alone, shape (1, 2); shape (m, 2) [m].
+        holes: whether the holes of a shape are open; else they are taken for part of it.
+    """
+    if (np.linalg.norm(points, axis=1) >= scene.dish.radius).any():
+        return WALL_NAME
+    line = shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
+    for shape in scene.shapes:
+        solid = shape.solid if holes else shapely.Polygon(shapely.get_exterior_ring(shape.solid))
+        if solid.intersects(line):
+            return shape.name
+    return ""
 
 
 @dataclass(frozen=True)
 class SceneWarning:
-    """Something to look at.
+    """A warning on a scene that is valid but may be a mistake.
 
     Attributes:
         what: overlap, gap, hole or wall.
@@ -36,17 +58,17 @@ class SceneWarning:
 
 
 def scene_warnings(scene: Scene, needle_width: float) -> list[SceneWarning]:
-    """Return what is to be looked at, shape by shape, then pair by pair.
+    """Return the warnings on a scene, shape by shape, then pair by pair.
 
     Args:
         scene: to look through.
         needle_width: a gap or a hole narrower than this lets no needle pass [m].
     """
-    found = [warning for shape in scene.shapes for warning in _alone(shape, scene.dish.radius, needle_width)]
+    found = [warning for shape in scene.shapes for warning in _shape_warnings(shape, scene.dish.radius, needle_width)]
     solids = [(shape, shape.solid) for shape in scene.shapes]
     for (first, one), (second, other) in combinations(solids, 2):
         if shapely.box(*one.bounds).distance(shapely.box(*other.bounds)) < needle_width:
-            found += _together(first, one, second, other, needle_width)
+            found += _pair_warnings(first, one, second, other, needle_width)
     return found
 
 
@@ -63,7 +85,7 @@ def farthest_point(shape: SceneShape) -> tuple[float, float]:
     return x, y
 
 
-def _alone(shape: SceneShape, dish_radius: float, needle_width: float) -> Iterator[SceneWarning]:
+def _shape_warnings(shape: SceneShape, dish_radius: float, needle_width: float) -> Iterator[SceneWarning]:
     place = farthest_point(shape)
     room = dish_radius - math.hypot(*place)
     if room < 0.0:
@@ -81,12 +103,12 @@ def _alone(shape: SceneShape, dish_radius: float, needle_width: float) -> Iterat
             yield SceneWarning("hole", (shape.name,), width, (x, y), text)
 
 
-def _together(
+def _pair_warnings(
     first: SceneShape, one: shapely.Geometry, second: SceneShape, other: shapely.Geometry, needle_width: float
 ) -> Iterator[SceneWarning]:
     names = (first.name, second.name)
     common = one.intersection(other)
-    if common.area > LEAST_OVERLAP:
+    if common.area > MIN_OVERLAP_AREA:
         inside = common.representative_point()
         place = float(inside.x), float(inside.y)
         text = f"{first.name} and {second.name} overlap by {1e6 * common.area:.3g} mm^2 at {_at(place)}"

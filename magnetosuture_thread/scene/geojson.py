@@ -1,4 +1,4 @@
-"""Scenes as GeoJSON, so that they can be drawn and looked at in other programs.
+"""Scenes as GeoJSON, for drawing programs and viewers.
 
 A FeatureCollection in the dish frame, in metres. Its member `dish` has diameter and depth. A polygon is a Polygon, a
 disc a Point with the property `radius`; the properties `name`, `kind` and `corner_radius` are those of a scene file.
@@ -16,12 +16,12 @@ import shapely
 import shapely.geometry
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.definitions import dish_from_mapping, scene_of_parts, shape_from_mapping
-from magnetosuture_thread.scene.refusal import refusal
+from magnetosuture_thread.scene.errors import scene_error
+from magnetosuture_thread.scene.mapping import dish_from_mapping, make_scene, shape_from_mapping
 from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape
 
 DISH = "dish"  # kind of the feature that is the dish
-SAME = 1e-7  # m; drawing programs round coordinates to no less
+GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less
 PROPERTIES = ("name", "kind", "corner_radius", "radius", "diameter", "depth", "definition")
 
 
@@ -39,7 +39,7 @@ def scene_from_geojson(content: Any, source: str = "") -> Scene:
 
     The dish is the member `dish`, or a feature of kind `dish`: a Point at the origin with the property `diameter`,
     and `depth` if it is known. Of a MultiPolygon with several parts each becomes a shape, named `name_1`, `name_2`
-    and so on. Other geometry is refused. Properties that are not known here are of other programs and left aside.
+    and so on. Other geometry is refused. Unknown properties belong to other programs and are ignored.
 
     Args:
         content: what the file holds.
@@ -50,12 +50,12 @@ def scene_from_geojson(content: Any, source: str = "") -> Scene:
     """
     if not isinstance(content, Mapping) or content.get("type") != "FeatureCollection":
         given = content.get("type") if isinstance(content, Mapping) else content
-        raise refusal("type", given, "FeatureCollection, in metres in the dish frame", source)
+        raise scene_error("type", given, "FeatureCollection, in metres in the dish frame", source)
     features = content.get("features")
     if not isinstance(features, Sequence) or isinstance(features, str):
-        raise refusal("features", features, "a list of features", source)
+        raise scene_error("features", features, "a list of features", source)
     if len(features) > MAX_SHAPES + 1:
-        raise refusal("features", f"{len(features)} features", f"at most {MAX_SHAPES} and the dish", source)
+        raise scene_error("features", f"{len(features)} features", f"at most {MAX_SHAPES} and the dish", source)
     dishes = [dish_from_mapping(content[DISH], source)] if DISH in content else []
     shapes: list[SceneShape] = []
     for index, feature in enumerate(features):
@@ -66,8 +66,8 @@ def scene_from_geojson(content: Any, source: str = "") -> Scene:
             shapes += part.shapes()
     if len(dishes) != 1:
         expectation = f"one: the member {DISH}, or a feature of kind {DISH}"
-        raise refusal(DISH, f"{len(dishes)} dishes" if dishes else "no dish", expectation, source)
-    return scene_of_parts(dishes[0], tuple(shapes), source)
+        raise scene_error(DISH, f"{len(dishes)} dishes" if dishes else "no dish", expectation, source)
+    return make_scene(dishes[0], tuple(shapes), source)
 
 
 def _feature(shape: SceneShape) -> dict[str, Any]:
@@ -100,72 +100,74 @@ class _FeatureReader:
     def __init__(self, where: str, feature: Any, source: str) -> None:
         self._source = source
         if not isinstance(feature, Mapping) or feature.get("type") != "Feature":
-            raise refusal(where, feature, "a Feature", source)
+            raise scene_error(where, feature, "a Feature", source)
         properties, geometry = feature.get("properties"), feature.get("geometry")
         if not isinstance(properties, Mapping):
-            raise refusal(f"{where}.properties", properties, "properties, of which name is needed", source)
+            raise scene_error(f"{where}.properties", properties, "properties, of which name is needed", source)
         self.properties: Mapping[str, Any] = properties
         if properties.get("kind") != DISH:
             name = properties.get("name")
             if not isinstance(name, str):
-                raise refusal(f"{where}.properties.name", name, "a name", source)
+                raise scene_error(f"{where}.properties.name", name, "a name", source)
             where = name
         self._where = where
         for given in properties:
             close = difflib.get_close_matches(given[:40], PROPERTIES, n=1, cutoff=0.85)
-            if given not in PROPERTIES and close:  # a slip of the pen; others may be any program's
-                raise refusal(
+            if given not in PROPERTIES and close:  # a spelling error; others may belong to any program
+                raise scene_error(
                     f"{where}.properties.{given}", properties[given], f"no such property: {close[0]}?", source
                 )
         if not isinstance(geometry, Mapping):
-            raise refusal(f"{where}.geometry", geometry, "a Point, Polygon or MultiPolygon", source)
+            raise scene_error(f"{where}.geometry", geometry, "a Point, Polygon or MultiPolygon", source)
         self._type, self._coordinates = geometry.get("type"), geometry.get("coordinates")
 
     def dish(self) -> Dish:
         """Return the dish."""
-        if self._type != "Point" or _flat(self._coordinates) != [0.0, 0.0]:
+        if self._type != "Point" or _planar(self._coordinates) != [0.0, 0.0]:
             value = [self._type, self._coordinates]
-            raise refusal(f"{self._where}.geometry", value, "a Point at 0, 0, the dish's centre", self._source)
+            raise scene_error(f"{self._where}.geometry", value, "a Point at 0, 0, the dish's centre", self._source)
         given = self.properties
         fields = {name: given[name] for name in ("diameter", "depth") if given.get(name) is not None}
         if "diameter" not in fields and "radius" in given:
-            raise refusal(f"{self._where}.properties.radius", given["radius"], "diameter, for a dish", self._source)
+            raise scene_error(f"{self._where}.properties.radius", given["radius"], "diameter, for a dish", self._source)
         return dish_from_mapping(fields, self._source)
 
     def shapes(self) -> Iterator[SceneShape]:
-        """Give the shapes that the feature stands for: one, or those of the parts of a MultiPolygon."""
+        """Yield the shapes of the feature: one, or one for each part of a MultiPolygon."""
         common = {"kind": self.properties.get("kind") or "tissue"}
         if self._type == "Point":
-            fields = {"center": _flat(self._coordinates), "radius": self.properties.get("radius")}
-            yield self._as_defined(self._shape(self._where, {**common, "disc": fields}))
+            fields = {"center": _planar(self._coordinates), "radius": self.properties.get("radius")}
+            yield self._from_definition(self._shape(self._where, {**common, "disc": fields}))
             return
         parts: Any = [self._coordinates] if self._type == "Polygon" else self._coordinates
         if self._type not in ("Polygon", "MultiPolygon"):
-            raise refusal(f"{self._where}.geometry.type", self._type, "Point, Polygon or MultiPolygon", self._source)
+            raise scene_error(
+                f"{self._where}.geometry.type", self._type, "Point, Polygon or MultiPolygon", self._source
+            )
         if (
             not _is_list(parts)
             or not 0 < len(parts) <= MAX_SHAPES
             or not all(_is_list(part) and part for part in parts)
         ):
-            raise refusal(f"{self._where}.geometry.coordinates", parts, "lists of rings of points", self._source)
+            raise scene_error(f"{self._where}.geometry.coordinates", parts, "lists of rings of points", self._source)
         if self.properties.get("corner_radius") is not None:
             common["corner_radius"] = self.properties["corner_radius"]
         for number, rings in enumerate(parts, 1):
-            outline, *holes = ([_flat(p) for p in ring] if _is_list(ring) else ring for ring in rings)
+            outline, *holes = ([_planar(p) for p in ring] if _is_list(ring) else ring for ring in rings)
             name = self._where if len(parts) == 1 else f"{self._where}_{number}"
             shape = self._shape(name, {**common, "polygon": {"outline": outline, "holes": holes}})
-            yield self._as_defined(shape) if len(parts) == 1 else shape
+            yield self._from_definition(shape) if len(parts) == 1 else shape
 
     def _shape(self, name: str, description: Mapping[str, Any]) -> SceneShape:
         return shape_from_mapping(name, description, self._source)
 
-    def _as_defined(self, shape: SceneShape) -> SceneShape:
-        """Return the shape as the property `definition` has it, where that is still the shape."""
+    def _from_definition(self, shape: SceneShape) -> SceneShape:
+        """Return the shape of the property `definition`, where it still matches the geometry."""
         definition = self.properties.get("definition")
         if definition is None:
             return shape
         if not isinstance(definition, Mapping):
-            raise refusal(
+            raise scene_error(
                 f"{self._where}.properties.definition", definition, "a shape as in a scene file", self._source
             )
         defined = self._shape(shape.name, {**definition, "kind": shape.kind})
@@ -176,17 +178,17 @@ def _is_list(value: Any) -> bool:
     return isinstance(value, Sequence) and not isinstance(value, str)
 
 
-def _flat(position: Any) -> Any:
-    """Return a position without its height, which is not looked at; anything else as it is, to be refused."""
+def _planar(position: Any) -> Any:
+    """Return a position without its height; anything else unchanged, to be refused."""
     return list(position[:2]) if _is_list(position) and len(position) in (2, 3) else position
 
 
 def _same(one: Disc | Polygon, other: Disc | Polygon) -> bool:
-    """Return whether two shapes are the same to the rounding of drawing programs."""
+    """Return whether two shapes are equal to the rounding of drawing programs."""
     if isinstance(one, Disc) or isinstance(other, Disc):
         if not (isinstance(one, Disc) and isinstance(other, Disc)):
             return False
         pairs = zip((*one.centre, one.radius), (*other.centre, other.radius), strict=True)
-        return all(abs(a - b) <= SAME for a, b in pairs)
+        return all(abs(a - b) <= GEOMETRY_TOLERANCE for a, b in pairs)
     first, second = (shapely.Polygon(shape.outline, shape.holes) for shape in (one, other))
-    return bool(first.symmetric_difference(second).area <= SAME * first.length)
+    return bool(first.symmetric_difference(second).area <= GEOMETRY_TOLERANCE * first.length)

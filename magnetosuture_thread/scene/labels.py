@@ -1,4 +1,4 @@
-"""Places for the names of a scene's shapes in a drawing."""
+"""Placement of the names of shapes in a drawing."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import shapely
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene.scene import Scene, SceneShape
 
-DIRECTIONS = 16  # in which a name can stand beside its shape
-STEPS = (1.0, 1.6, 2.4)  # times the name's height, from the shape
+LABEL_DIRECTIONS = 16  # in which a name can stand beside its shape
+LABEL_DISTANCES = (1.0, 1.6, 2.4)  # times the name's height, from the shape
 
 
 @dataclass(frozen=True)
-class LabelPlace:
-    """Where a name stands.
+class LabelPosition:
+    """Position of a name.
 
     Attributes:
         middle: of the name [m].
@@ -28,10 +28,10 @@ class LabelPlace:
     line: tuple[tuple[float, float], ...] = ()
 
 
-def label_places(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[LabelPlace]:
-    """Return a place for each shape's name: in the shape, in a hole of it, or else beside it, clear of the others.
+def place_labels(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[LabelPosition]:
+    """Return a position for the name of each shape: in the shape, in a hole of it, or beside it without overlap.
 
-    Where no place is clear, a name stands in its shape all the same.
+    Where no position is free, the name is placed in its shape.
 
     Args:
         scene: that is drawn.
@@ -40,15 +40,15 @@ def label_places(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[Lab
     solids = [shape.solid for shape in scene.shapes]
     dish = shapely.Point(0.0, 0.0).buffer(scene.dish.radius)
     taken: list[shapely.Geometry] = []
-    places: list[LabelPlace] = []
+    places: list[LabelPosition] = []
     for shape, solid, (width, height) in zip(scene.shapes, solids, sizes, strict=True):
-        place = LabelPlace(shape.label_point)
+        place = LabelPosition(shape.label_point)
         if not solid.contains(_box(place.middle, width, height)):
-            for candidate in _beside(shape, solid, width, height):
+            for candidate in _candidates(shape, solid, width, height):
                 box = _box(candidate, 1.1 * width, 1.2 * height)
                 if dish.contains(box) and not any(box.intersects(other) for other in (*solids, *taken)):
                     start, end = shapely.shortest_line(_box(candidate, width, height), solid).coords
-                    place = LabelPlace(candidate, (start, end))
+                    place = LabelPosition(candidate, (start, end))
                     break
         taken.append(_box(place.middle, width, height))
         places.append(place)
@@ -60,17 +60,19 @@ def _box(place: tuple[float, float], width: float, height: float) -> shapely.Pol
     return shapely.box(x - 0.5 * width, y - 0.5 * height, x + 0.5 * width, y + 0.5 * height)
 
 
-def _beside(shape: SceneShape, solid: shapely.Geometry, width: float, height: float) -> Iterator[tuple[float, float]]:
+def _candidates(
+    shape: SceneShape, solid: shapely.Geometry, width: float, height: float
+) -> Iterator[tuple[float, float]]:
     if not isinstance(shape.geometry, Disc):
         for hole in shape.geometry.holes:
             middle = shapely.Polygon(hole).centroid
             yield middle.x, middle.y
     left, bottom, right, top = solid.bounds
     x, y = 0.5 * (left + right), 0.5 * (bottom + top)
-    for step in STEPS:
-        for index in range(DIRECTIONS):
+    for step in LABEL_DISTANCES:
+        for index in range(LABEL_DIRECTIONS):
             # Right and left first, then above and below, then between.
-            angle = math.pi * (index % 2) + 2.0 * math.pi * (index // 2) / DIRECTIONS
+            angle = math.pi * (index % 2) + 2.0 * math.pi * (index // 2) / LABEL_DIRECTIONS
             across = 0.5 * (right - left + width) + step * height
             upward = 0.5 * (top - bottom + height) + step * height
             yield x + across * math.cos(angle), y + upward * math.sin(angle)

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.refusal import refusal
+from magnetosuture_thread.scene.errors import scene_error
 from magnetosuture_thread.scene.text import is_number
 
 KINDS = ("tissue", "instrument", "wall")
@@ -25,7 +25,7 @@ MAX_SHAPES = 200
 MAX_VERTICES = 10_000  # of all polygons of a scene together
 MAX_HOLES = 100  # of a polygon: each is compared with each
 MAX_NAME_CHARS = 64
-MAX_COORDINATE = 1.0  # m; what is farther away is given in another unit
+MAX_COORDINATE = 1.0  # m; anything larger is in another unit
 MIN_RADIUS = 1e-6  # m
 VERSION_CHARS = 16
 
@@ -50,7 +50,7 @@ class Dish:
         for name, low, high in (("diameter", 0.005, 0.5), ("depth", 1e-5, 0.1)):
             value = getattr(self, name)
             if not (is_number(value) and low <= value <= high):
-                raise refusal(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
+                raise scene_error(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
 
     @property
     def radius(self) -> float:
@@ -81,18 +81,18 @@ class SceneShape:
     def __post_init__(self) -> None:
         """Check name, kind and bounds."""
         if not is_name(self.name):
-            raise refusal("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
+            raise scene_error("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
         if self.kind not in KINDS:
-            raise refusal(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
+            raise scene_error(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
         if isinstance(self.geometry, Disc):
             object.__setattr__(self, "geometry", _checked_disc(self.name, self.geometry))
             return
         farthest = float(np.abs(self.geometry.outline).max())
         if farthest > MAX_COORDINATE:
             expectation = f"coordinates of at most {MAX_COORDINATE:g}, in metres"
-            raise refusal(f"{self.name}.polygon.outline", farthest, expectation)
+            raise scene_error(f"{self.name}.polygon.outline", farthest, expectation)
         if len(self.geometry.holes) > MAX_HOLES:
-            raise refusal(f"{self.name}.polygon.holes", f"{len(self.geometry.holes)} holes", f"at most {MAX_HOLES}")
+            raise scene_error(f"{self.name}.polygon.holes", f"{len(self.geometry.holes)} holes", f"at most {MAX_HOLES}")
 
     @property
     def solid(self) -> shapely.Geometry:
@@ -146,25 +146,27 @@ class Scene:
     def __post_init__(self) -> None:
         """Check the shapes together."""
         if len(self.shapes) > MAX_SHAPES:
-            raise refusal("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
+            raise scene_error("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
         vertices = sum(
             sum(map(len, shape.geometry.rings)) for shape in self.shapes if isinstance(shape.geometry, Polygon)
         )
         if vertices > MAX_VERTICES:
-            raise refusal("shapes", f"{vertices} vertices", f"at most {MAX_VERTICES} in all")
+            raise scene_error("shapes", f"{vertices} vertices", f"at most {MAX_VERTICES} in all")
         names = Counter(shape.name for shape in self.shapes)
         for shape in self.shapes:
             if names[shape.name] > 1:
-                raise refusal(shape.name, "a name given twice", "a name of its own for each shape")
-            near, far = _reach(shape.geometry, self.dish.radius)
+                raise scene_error(shape.name, "a name given twice", "a name of its own for each shape")
+            near, far = _distance_and_coverage(shape.geometry, self.dish.radius)
             if near >= self.dish.radius:
-                raise refusal(
+                raise scene_error(
                     shape.name,
                     f"a shape outside of the dish, {near:.4g} m from its centre",
                     f"a part of it within the dish, less than {self.dish.radius:g} m",
                 )
             if not far:
-                raise refusal(shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres")
+                raise scene_error(
+                    shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres"
+                )
 
     @classmethod
     def create(cls, *, dish_diameter: float = 0.035, shapes: Mapping[str, Disc | Polygon] | None = None) -> Scene:
@@ -233,7 +235,7 @@ class Scene:
     def _require(self, name: str) -> None:
         if name not in self.names:
             known = ", ".join(self.names) or "none: the scene has no shapes"
-            raise refusal("shape.name", name, f"one of {known}"[:400])
+            raise scene_error("shape.name", name, f"one of {known}"[:400])
 
 
 def is_name(text: Any) -> bool:
@@ -242,19 +244,21 @@ def is_name(text: Any) -> bool:
 
 
 def _checked_disc(name: str, disc: Disc) -> Disc:
-    """Return a disc in plain numbers, once it is known to be within the bounds."""
+    """Return a disc with built-in floats, after checking its bounds."""
     values = (*disc.centre, disc.radius)
     if len(values) != 3 or not all(math.isfinite(value) for value in values):
-        raise refusal(f"{name}.disc", list(values), "finite x, y and radius")
+        raise scene_error(f"{name}.disc", list(values), "finite x, y and radius")
     x, y, radius = map(float, values)
     if max(abs(x), abs(y)) > MAX_COORDINATE:
-        raise refusal(f"{name}.disc.center", [x, y], f"two coordinates x, y of at most {MAX_COORDINATE:g}, in metres")
+        raise scene_error(
+            f"{name}.disc.center", [x, y], f"two coordinates x, y of at most {MAX_COORDINATE:g}, in metres"
+        )
     if not MIN_RADIUS <= radius <= MAX_COORDINATE:
-        raise refusal(f"{name}.disc.radius", radius, f"a number from {MIN_RADIUS:g} to {MAX_COORDINATE:g} m")
+        raise scene_error(f"{name}.disc.radius", radius, f"a number from {MIN_RADIUS:g} to {MAX_COORDINATE:g} m")
     return Disc((x, y), radius)
 
 
-def _reach(geometry: Disc | Polygon, dish_radius: float) -> tuple[float, bool]:
+def _distance_and_coverage(geometry: Disc | Polygon, dish_radius: float) -> tuple[float, bool]:
     """Return a shape's distance from the dish's centre [m], and whether it leaves any of the dish uncovered."""
     if isinstance(geometry, Disc):
         away = math.hypot(*geometry.centre)

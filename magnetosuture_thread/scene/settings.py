@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from magnetosuture_thread.configuration import Configuration
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
@@ -15,4 +15,4 @@ class SceneServerSettings(Configuration):
 
     GROUP: ClassVar[str] = "scene_server"
 
-    scene: str = shared("scene")
+    scene: str = shared_parameter("scene")

@@ -1,4 +1,4 @@
-"""The shapes that a scene file knows: what makes the geometry of each from its fields."""
+"""Shapes of scene files: a function for each builds its geometry from its fields."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.fields import Fields
+from magnetosuture_thread.scene.fields import ShapeFields
 
 ARC_TOLERANCE = 2e-6  # m; greatest distance of an arc from its chords
 MAX_ARC_STEP = math.pi / 18  # rad; of one chord
@@ -32,7 +32,7 @@ def arc(
     if closed:
         count = 4 * math.ceil(count / 4)  # so that a full circle reaches as far as it does along x and y
     angles = np.linspace(start, end, count + 1)[: count if closed else count + 1]
-    return [_exact(center[0] + radius * math.cos(a), center[1] + radius * math.sin(a)) for a in angles.tolist()]
+    return [_rounded_point(center[0] + radius * math.cos(a), center[1] + radius * math.sin(a)) for a in angles.tolist()]
 
 
 def arc_step(radius: float) -> float:
@@ -40,53 +40,53 @@ def arc_step(radius: float) -> float:
     return min(MAX_ARC_STEP, 2.0 * math.acos(max(0.0, 1.0 - ARC_TOLERANCE / radius)))
 
 
-def _exact(x: float, y: float) -> tuple[float, float]:
+def _rounded_point(x: float, y: float) -> tuple[float, float]:
     """Return a computed point with its rounding errors taken off; + 0.0 makes a negative zero a zero."""
     return round(x, DECIMALS) + 0.0, round(y, DECIMALS) + 0.0
 
 
-def _disc(fields: Fields, corner_radius: float) -> Disc:
+def _disc(fields: ShapeFields, corner_radius: float) -> Disc:
     return Disc(fields.point("center"), fields.length("radius"))
 
 
-def _annulus(fields: Fields, corner_radius: float) -> Polygon:
+def _annulus(fields: ShapeFields, corner_radius: float) -> Polygon:
     center, inner, outer = fields.point("center"), fields.length("inner_radius"), fields.length("outer_radius")
     if inner >= outer:
-        raise fields.refuse("inner_radius", inner, f"less than outer_radius, {outer:g} m")
+        raise fields.error("inner_radius", inner, f"less than outer_radius, {outer:g} m")
     turn = 2.0 * math.pi
     return Polygon(
         tuple(arc(center, outer, 0.0, turn, closed=True)), (tuple(arc(center, inner, 0.0, turn, closed=True)),)
     )
 
 
-def _annular_sector(fields: Fields, corner_radius: float) -> Polygon:
+def _annular_sector(fields: ShapeFields, corner_radius: float) -> Polygon:
     """Return the part of an annulus between two angles, less a strip of width `inset` along both straight sides."""
     center, inner, outer = fields.point("center"), fields.length("inner_radius"), fields.length("outer_radius")
     start = fields.number("start_angle", -2.0 * math.pi, 4.0 * math.pi, "rad")
     end = fields.number("end_angle", -2.0 * math.pi, 4.0 * math.pi, "rad")
     inset = fields.length("inset", 0.0)
     if inner >= outer:
-        raise fields.refuse("inner_radius", inner, f"less than outer_radius, {outer:g} m")
+        raise fields.error("inner_radius", inner, f"less than outer_radius, {outer:g} m")
     if not 0.0 < end - start < 2.0 * math.pi:
-        raise fields.refuse("end_angle", end, "more than start_angle by less than a turn [rad]")
+        raise fields.error("end_angle", end, "more than start_angle by less than a turn [rad]")
     if inset >= inner:
-        raise fields.refuse("inset", inset, f"less than inner_radius, {inner:g} m")
+        raise fields.error("inset", inset, f"less than inner_radius, {inner:g} m")
     trim = [math.asin(inset / radius) for radius in (inner, outer)]
     if end - start <= 2.0 * trim[0]:
-        raise fields.refuse("inset", inset, "less than half of the gap between both straight sides")
+        raise fields.error("inset", inset, "less than half of the gap between both straight sides")
     outline = [
         *arc(center, outer, start + trim[1], end - trim[1]),
         *arc(center, inner, end - trim[0], start + trim[0]),
     ]
     if corner_radius > 0.0:
-        return _opened(fields, shapely.Polygon(outline), corner_radius)
+        return _rounded_convex(fields, shapely.Polygon(outline), corner_radius)
     return Polygon(tuple(outline))
 
 
-def _capsule(fields: Fields, corner_radius: float) -> Polygon:
+def _capsule(fields: ShapeFields, corner_radius: float) -> Polygon:
     start, end, radius = fields.point("start"), fields.point("end"), fields.length("radius")
     if start == end:
-        raise fields.refuse("end", list(end), "another point than start; else it is a disc")
+        raise fields.error("end", list(end), "another point than start; else it is a disc")
     along = math.atan2(end[1] - start[1], end[0] - start[0])
     quarter = 0.5 * math.pi
     return Polygon(
@@ -97,23 +97,23 @@ def _capsule(fields: Fields, corner_radius: float) -> Polygon:
     )
 
 
-def _rectangle(fields: Fields, corner_radius: float) -> Polygon:
+def _rectangle(fields: ShapeFields, corner_radius: float) -> Polygon:
     center, width, height = fields.point("center"), fields.length("width"), fields.length("height")
     angle = fields.number("angle", -2.0 * math.pi, 2.0 * math.pi, "rad", 0.0)
     greatest = 0.49 * min(width, height)
     if corner_radius > greatest:
-        raise fields.refuse_corners(corner_radius, f"at most 0.49 of the shorter side, {greatest:.4g} m")
+        raise fields.corner_error(corner_radius, f"at most 0.49 of the shorter side, {greatest:.4g} m")
     c, s = math.cos(angle), math.sin(angle)
     corners = [(0.5 * width * x, 0.5 * height * y) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-    outline = tuple(_exact(center[0] + c * x - s * y, center[1] + s * x + c * y) for x, y in corners)
+    outline = tuple(_rounded_point(center[0] + c * x - s * y, center[1] + s * x + c * y) for x, y in corners)
     return _rounded(Polygon(outline), corner_radius)
 
 
-def _polygon(fields: Fields, corner_radius: float) -> Polygon:
+def _polygon(fields: ShapeFields, corner_radius: float) -> Polygon:
     """Return a polygon; a corner at an edge too short for the corner radius gets a smaller one."""
     polygon = Polygon(fields.ring("outline"), tuple(fields.rings("holes", ())))
     if corner_radius > 0.0 and not Polygon(polygon.outline).has_room_for(corner_radius):
-        raise fields.refuse_corners(corner_radius, "a radius of which a disc fits into the outline [m]")
+        raise fields.corner_error(corner_radius, "a radius of which a disc fits into the outline [m]")
     return _rounded(polygon, corner_radius)
 
 
@@ -124,22 +124,22 @@ def _rounded(polygon: Polygon, corner_radius: float) -> Polygon:
     given = {vertex for ring in (polygon.outline, *polygon.holes) for vertex in ring}
     smooth = polygon.smoothed(corner_radius, step=arc_step(corner_radius))
     rings = [
-        tuple(vertex if vertex in given else _exact(*vertex) for vertex in ring)
+        tuple(vertex if vertex in given else _rounded_point(*vertex) for vertex in ring)
         for ring in (smooth.outline, *smooth.holes)
     ]
     return Polygon(rings[0], tuple(rings[1:]))
 
 
-def _opened(fields: Fields, solid: shapely.Polygon, radius: float) -> Polygon:
+def _rounded_convex(fields: ShapeFields, solid: shapely.Polygon, radius: float) -> Polygon:
     """Return a shape with its convex corners rounded: the union of all discs of a radius that fit into it."""
     segments = max(8, math.ceil(0.25 * 2.0 * math.pi / (2.0 * math.acos(max(0.0, 1.0 - ARC_TOLERANCE / radius)))))
     opened = solid.buffer(-radius, quad_segs=segments).buffer(radius, quad_segs=segments)
     if not isinstance(opened, shapely.Polygon) or opened.is_empty:
-        raise fields.refuse_corners(radius, "a radius with which the shape stays in one piece [m]")
-    return Polygon(tuple(_exact(x, y) for x, y in opened.simplify(0.1 * ARC_TOLERANCE).exterior.coords))
+        raise fields.corner_error(radius, "a radius with which the shape stays in one piece [m]")
+    return Polygon(tuple(_rounded_point(x, y) for x, y in opened.simplify(0.1 * ARC_TOLERANCE).exterior.coords))
 
 
-SHAPES: dict[str, Callable[[Fields, float], Disc | Polygon]] = {
+SHAPES: dict[str, Callable[[ShapeFields, float], Disc | Polygon]] = {
     "disc": _disc,
     "annulus": _annulus,
     "annular_sector": _annular_sector,

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.look import State, Track
 from magnetosuture_thread.vision.scene_mask import outlines

@@ -9,7 +9,7 @@ from typing import ClassVar
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.shared_parameters import shared
+from magnetosuture_thread.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,10 @@ class VisionTrackerSettings(Configuration):
     GROUP: ClassVar[str] = "vision_tracker"
 
     image_transport: str = quantity("compressed", "which camera topic to take", choices=("raw", "compressed"))
-    scene: str = shared("scene")
-    needle_length: float = shared("needle_length")
-    needle_width: float = shared("needle_width")
-    thread_length: float = shared("thread_length")
+    scene: str = shared_parameter("scene")
+    needle_length: float = shared_parameter("needle_length")
+    needle_width: float = shared_parameter("needle_width")
+    thread_length: float = shared_parameter("thread_length")
     outline_tolerance: float = quantity(
         0.0003,
         "what the outline of a shape of the scene and the visible one may differ by, for parallax and calibration",

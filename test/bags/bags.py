@@ -16,9 +16,9 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
+from magnetosuture_thread.bags.message_types import own_definition, typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.types import typestore
-from magnetosuture_thread.bags.writer import BagWriter, our_definition
+from magnetosuture_thread.bags.writer import BagWriter
 
 HEADER = "std_msgs/msg/Header"
 STRING = "std_msgs/msg/String"
@@ -68,7 +68,7 @@ def write_mcap(path: Path, messages: list[Message], types: dict[str, str], **opt
         writer.start("ros2")
         channels = {}
         for topic, name in types.items():
-            schema = writer.register_schema(name, "ros2msg", our_definition(name).text.encode())
+            schema = writer.register_schema(name, "ros2msg", own_definition(name).text.encode())
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for topic, time, data in messages:
             writer.add_message(channels[topic], time, data, time)

@@ -9,8 +9,8 @@ import yaml
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import Reader
 
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
 

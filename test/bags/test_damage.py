@@ -174,7 +174,7 @@ def test_damage_says_where_and_when(whole: Whole, tmp_path: Path):
     assert bag is not None
     assert bag.damage is not None
     assert (bag.damage.chunks, bag.damage.messages) == (1, len(messages))
-    (place,) = bag.damage.places
+    (place,) = bag.damage.regions
     times = [time for _, time, _ in messages]
     assert (place.start, place.first, place.last) == (start, min(times), max(times))
     words = f"{len(messages)} messages in 1 chunk are lost"
@@ -287,7 +287,7 @@ def test_what_is_lost_is_never_before_the_bag(whole: Whole, tmp_path: Path):
     assert bag.start == SECOND + 0
     assert bag.damage is not None
     assert bag.damage.messages is None
-    assert "cut off" in str(bag.damage)
+    assert "truncated" in str(bag.damage)
 
 
 def test_a_cut_leaves_the_notes_at_the_head(whole: Whole, tmp_path: Path):

@@ -14,9 +14,9 @@ from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import Definition
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
@@ -75,7 +75,7 @@ def test_a_file_that_is_packed_as_a_whole_says_how_to_unpack_it(tmp_path: Path):
     file = write_mcap(tmp_path / "a.mcap", texts(5), {"/text": STRING})
     (folder / "a.mcap.zstd").write_bytes(zstandard.compress(file.read_bytes()))
     for path in (folder, folder / "a.mcap.zstd"):
-        with pytest.raises(BagError, match=r"packed as a whole; unpack it first: zstd -d a\.mcap\.zstd"):
+        with pytest.raises(BagError, match=r"compressed as a whole; decompress it first: zstd -d a\.mcap\.zstd"):
             Bag(path)
 
 
@@ -112,7 +112,7 @@ def test_a_split_bag_is_one_bag(tmp_path: Path, named: bool):
     (folder / "split_6.mcap").unlink()
     damage = Bag(folder).damage
     assert damage is not None
-    said = "\n".join(map(str, damage.places))
+    said = "\n".join(map(str, damage.regions))
     assert "split_4.mcap" in said
     assert "split_5.mcap, byte 0: is empty" in said
     assert ("split_6.mcap, byte 0: it is missing" in said) == named
@@ -128,8 +128,8 @@ def test_a_folder_with_several_bags_is_refused(tmp_path: Path):
 
 def test_the_bags_own_definitions_are_taken(tmp_path: Path):
     """Of a type that we do not know, and of one that was different once."""
-    theirs = Definition("their_msgs/msg/Thing", "ros2msg", "std_msgs/Header header\nint32 number\n")
-    older = Definition(STRING, "ros2msg", "int32 size\nstring data\n")
+    theirs = MessageDefinition("their_msgs/msg/Thing", "ros2msg", "std_msgs/Header header\nint32 number\n")
+    older = MessageDefinition(STRING, "ros2msg", "int32 size\nstring data\n")
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/thing", theirs.type_name, theirs)
         bag.add_topic("/older", STRING, older)
@@ -145,7 +145,7 @@ def test_the_bags_own_definitions_are_taken(tmp_path: Path):
 def test_definitions_as_idl(tmp_path: Path):
     text = "module their_msgs { module msg { struct Thing { long number; }; }; };"
     with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/thing", "their_msgs/msg/Thing", Definition("their_msgs/msg/Thing", "ros2idl", text))
+        bag.add_topic("/thing", "their_msgs/msg/Thing", MessageDefinition("their_msgs/msg/Thing", "ros2idl", text))
         bag.write("/thing", 1, b"\0\1\0\0\7\0\0\0")
     assert next(Bag(tmp_path / "bag").records()).decode().number == 7
 
@@ -154,8 +154,10 @@ def test_definitions_as_idl(tmp_path: Path):
 def test_a_definition_that_says_nothing(tmp_path: Path, text: str):
     """Of a type that we know ours is taken; of another one the messages cannot be decoded, but they are there."""
     with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/text", STRING, Definition(STRING, "ros2msg" if text else "", text if "at all" in text else ""))
-        bag.add_topic("/thing", "their_msgs/msg/Thing", Definition("their_msgs/msg/Thing", "ros2msg", text))
+        bag.add_topic(
+            "/text", STRING, MessageDefinition(STRING, "ros2msg" if text else "", text if "at all" in text else "")
+        )
+        bag.add_topic("/thing", "their_msgs/msg/Thing", MessageDefinition("their_msgs/msg/Thing", "ros2msg", text))
         bag.write("/text", 1, cdr(STRING, "b"))
         bag.write("/thing", 2, cdr(STRING, "b"))
     known, unknown = Bag(tmp_path / "bag").records()

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.remap import remapping
-from magnetosuture_thread.bags.storage import Definition
-from magnetosuture_thread.bags.transforms import Transforms
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.remap import parse_remap
+from magnetosuture_thread.bags.storage import MessageDefinition
+from magnetosuture_thread.bags.transforms import TransformTree
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.interface import (
@@ -28,7 +28,7 @@ from magnetosuture_thread.interface import (
     TRUTH_NEEDLE,
     TRUTH_THREAD,
 )
-from magnetosuture_thread.messages.cdr import DISH_END, is_in_dish, stamp_and_frame
+from magnetosuture_thread.messages.cdr import DISH_END, is_in_dish_frame, stamp_and_frame
 from test.bags.bags import STRING, make, stamped
 
 SECOND = 10**9
@@ -205,9 +205,9 @@ def test_what_is_ours_is_passed_on_byte_for_byte(tmp_path: Path):
 def test_the_dish_frame_is_told_from_the_bytes(frame: str, little: bool):
     data = bytes(typestore().serialize_cdr(pose_stamped(frame=frame), TRUTH_NEEDLE.type_name, little_endian=little))
     assert stamp_and_frame("/topic", data) == (SECOND, frame)
-    assert is_in_dish(data) == (frame == "dish")
-    assert not is_in_dish(b"\0\7" + data[2:])  # an order that nobody knows
-    assert not any(is_in_dish(data[:length]) for length in range(DISH_END))
+    assert is_in_dish_frame(data) == (frame == "dish")
+    assert not is_in_dish_frame(b"\0\7" + data[2:])  # an order that nobody knows
+    assert not any(is_in_dish_frame(data[:length]) for length in range(DISH_END))
 
 
 def image(compressed: bool) -> Any:
@@ -311,10 +311,10 @@ def test_a_type_that_is_defined_in_another_way_is_converted_or_refused(tmp_path:
     parts = "================\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
     own = "geometry_msgs/Vector3 angular\ngeometry_msgs/Vector3 linear\n" + "=" * 64 + parts
     with BagWriter(tmp_path / "bag") as bag:
-        definition = Definition("geometry_msgs/msg/Twist", "ros2msg", own)
+        definition = MessageDefinition("geometry_msgs/msg/Twist", "ros2msg", own)
         bag.add_topic(NEEDLE_COMMAND.recorded, definition.type_name, definition)
         bag.write(NEEDLE_COMMAND.recorded, 1, b"\0\1\0\0" + np.arange(6.0).tobytes())
-        bag.add_topic(IMAGE.recorded, IMAGE.type_name, Definition(IMAGE.type_name, "ros2msg", "int32 number\n"))
+        bag.add_topic(IMAGE.recorded, IMAGE.type_name, MessageDefinition(IMAGE.type_name, "ros2msg", "int32 number\n"))
         bag.write(IMAGE.recorded, 2, b"\0\1\0\0\1\0\0\0")
     recording = Recording(Bag(tmp_path / "bag"))
     found = only(recording, NEEDLE_COMMAND)
@@ -324,10 +324,10 @@ def test_a_type_that_is_defined_in_another_way_is_converted_or_refused(tmp_path:
 
 
 def test_remapping_is_written_as_in_ros():
-    assert remapping("cam/image:=/camera/image_raw") == ("/cam/image", "/camera/image_raw")
+    assert parse_remap("cam/image:=/camera/image_raw") == ("/cam/image", "/camera/image_raw")
     for text in ("", ":=", "/a:=", ":=/b", "/a=/b", "/a:=/b:=/c", "/a b:=/c"):
         with pytest.raises(ConfigurationError, match="FROM:=TO"):
-            remapping(text)
+            parse_remap(text)
 
 
 def test_a_remap_that_cannot_be_is_refused(tmp_path: Path):
@@ -361,18 +361,18 @@ def test_transforms_agree_with_matrices(data: st.DataObject):
         own = np.eye(4)
         own[:3, :3], own[0, 3] = turn.as_matrix(), x
         matrices[name] = matrices[parent] @ own
-    tree = Transforms([("/tf_static", tf(*told))])
+    tree = TransformTree([("/tf_static", tf(*told))])
     before, after = random.choice(names, 2)
     point = random.normal(size=3)
-    rigid = tree.between(str(before), str(after), 0)
+    rigid = tree.lookup(str(before), str(after), 0)
     assert rigid is not None
     expected = np.linalg.inv(matrices[str(after)]) @ matrices[str(before)] @ [*point, 1.0]
-    assert np.allclose(rigid.points(point), expected[:3])
-    assert np.allclose(rigid.inverse().points(rigid.points(point)), point)
+    assert np.allclose(rigid.apply(point), expected[:3])
+    assert np.allclose(rigid.inverse().apply(rigid.apply(point)), point)
 
 
 def test_frames_in_a_circle_and_broken_transforms_lead_nowhere():
     broken = transform("a", "b", float("nan"))
-    tree = Transforms([("/tf_static", tf(transform("c", "d", 1.0), transform("d", "c", 1.0), broken))])
-    assert not tree.lead("c", "a")
-    assert not tree.lead("b", "a")
+    tree = TransformTree([("/tf_static", tf(transform("c", "d", 1.0), transform("d", "c", 1.0), broken))])
+    assert not tree.is_connected("c", "a")
+    assert not tree.is_connected("b", "a")

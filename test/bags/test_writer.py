@@ -13,7 +13,7 @@ import yaml
 from rosbags.rosbag2 import Reader
 
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import Definition
+from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter, RecordingEndedError
 from magnetosuture_thread.errors import BagError
 from test.bags.bags import STRING, cdr, read
@@ -120,7 +120,7 @@ def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
         recorder.wait()
     bag = Bag(folder)
     assert bag.damage is not None
-    assert "cut off" in str(bag.damage)
+    assert "truncated" in str(bag.damage)
     assert bag.counts["/noise"] >= said - 7  # a chunk holds seven
     assert [time for _, time, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
 
@@ -152,9 +152,9 @@ def test_every_chunk_can_be_read_on_its_own(tmp_path: Path):
 
 def test_a_type_that_nobody_knows_needs_a_definition(tmp_path: Path):
     with BagWriter(tmp_path / "bag") as bag:
-        with pytest.raises(BagError, match="nothing defines the type their_msgs/msg/Thing"):
+        with pytest.raises(BagError, match="the type their_msgs/msg/Thing has no definition"):
             bag.add_topic("/thing", "their_msgs/msg/Thing")
-        definition = Definition("their_msgs/msg/Thing", "ros2msg", "int32 number\n")
+        definition = MessageDefinition("their_msgs/msg/Thing", "ros2msg", "int32 number\n")
         bag.add_topic("/thing", "their_msgs/msg/Thing", definition)
         bag.write("/thing", 1, b"\0\1\0\0\7\0\0\0")
     (record,) = Bag(tmp_path / "bag").records()

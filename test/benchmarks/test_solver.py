@@ -19,7 +19,7 @@ from benchmarks.solver.cases import SEGMENT, case
 from benchmarks.solver.measurements import SIMULATORS, Plan, SolverReport, SolverRow, measure_solver
 from benchmarks.solver.table import solver_lines, solver_table
 from benchmarks.solver.timing import run, time_solves, timed
-from magnetosuture_thread.geometry.obstacles import Mesh, Polygon, Surroundings, triangulate
+from magnetosuture_thread.geometry.obstacles import Mesh, Polygon, Workspace, triangulate
 from magnetosuture_thread.model.solvers.banded import BandedSolver
 from magnetosuture_thread.model.solvers.osqp import OsqpSolver
 
@@ -69,11 +69,11 @@ def test_obstacles_have_200_triangles_and_are_met_by_the_thread_but_not_by_the_n
     for shape in motion.shapes:
         assert isinstance(shape, (Mesh, Polygon))
         assert len(shape.faces if isinstance(shape, Mesh) else triangulate(shape).triangles) == 200
-    surroundings = Surroundings(motion.shapes, 5e-3, dimension)
-    assert surroundings.near(motion.tails).distance.min() > 1e-4
+    workspace = Workspace(motion.shapes, 5e-3, dimension)
+    assert workspace.near(motion.tails).distance.min() > 1e-4
     walked = run(motion, BandedSolver())
     assert walked.contact_steps >= 30
-    assert surroundings.near(walked.positions.reshape(-1, dimension)).distance.min() < motion.thread.diameter
+    assert workspace.near(walked.positions.reshape(-1, dimension)).distance.min() < motion.thread.diameter
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, ViewportSize, expect
 
-from magnetosuture_thread.geometry.arc import needle_axis
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from test.console.conftest import ServedConsole
 from test.console.scene import picture, state, thread
 

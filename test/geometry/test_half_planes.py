@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.geometry.half_planes import ROUNDING, nearest_within
+from magnetosuture_thread.geometry.half_planes import ROUNDING, nearest_in_half_planes
 
 NUMBERS = st.floats(-1.0, 1.0)
 
@@ -32,7 +32,7 @@ def missing(rows: np.ndarray, least: np.ndarray, points: np.ndarray) -> np.ndarr
 @given(problem=half_planes())
 def test_what_is_found_is_within_and_nothing_within_is_nearer(problem: tuple[np.ndarray, np.ndarray, np.ndarray]):
     point, rows, least = problem
-    found = nearest_within(point, rows, least)
+    found = nearest_in_half_planes(point, rows, least)
     assert found is not None
     assert missing(rows, least, found[None]).max() <= 1.01 * ROUNDING * np.linalg.norm(point) + 1e-18
     angle = np.linspace(0.0, 2.0 * np.pi, 721)
@@ -49,29 +49,29 @@ def test_the_way_to_what_is_found_is_square_to_all_that_is_within(
 ):
     """(p - q) . (z - q) <= 0 for every z within: what makes q the nearest point of a convex region."""
     point, rows, least = problem
-    found = nearest_within(point, rows, least)
+    found = nearest_in_half_planes(point, rows, least)
     assert found is not None
     for target in (np.zeros(2), point[::-1] * (1.0, -1.0), -point):
-        inside = nearest_within(share * target, rows, least)
+        inside = nearest_in_half_planes(share * target, rows, least)
         assert inside is not None
         assert (point - found) @ (inside - found) <= 1e-9
 
 
 def test_a_point_within_is_left_bit_for_bit():
     point = np.array([0.1, 0.3])
-    found = nearest_within(point, np.array([[1.0, 0.0], [0.0, 0.0]]), np.array([0.1, 5.0]))
+    found = nearest_in_half_planes(point, np.array([[1.0, 0.0], [0.0, 0.0]]), np.array([0.1, 5.0]))
     assert found is not None
     assert found.tolist() == point.tolist()
 
 
 def test_half_planes_without_a_common_point_have_none():
     rows = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    assert nearest_within(np.zeros(2), rows, np.array([1.0, 1.0])) is None
+    assert nearest_in_half_planes(np.zeros(2), rows, np.array([1.0, 1.0])) is None
 
 
 def test_a_slot_lets_what_is_along_it_through():
     rows = np.array([[0.0, 1.0], [0.0, -1.0]])
-    found = nearest_within(np.array([2.0, 1.0]), rows, np.zeros(2))
+    found = nearest_in_half_planes(np.array([2.0, 1.0]), rows, np.zeros(2))
     assert found is not None
     np.testing.assert_allclose(found, [2.0, 0.0], atol=1e-15)
 
@@ -79,10 +79,10 @@ def test_a_slot_lets_what_is_along_it_through():
 def test_however_large_or_small_a_point_is_it_is_taken_to_the_line():
     rows, least = np.array([[1.0, 0.0], [0.6, 0.8]]), np.zeros(2)
     for size in (1e-300, 1e-30, 1e30, 1e300):
-        found = nearest_within(np.array([-size, size]), rows, least)
+        found = nearest_in_half_planes(np.array([-size, size]), rows, least)
         assert found is not None
         np.testing.assert_allclose(found / size, [0.0, 1.0], atol=1e-12)
 
 
 def test_what_is_no_number_has_no_nearest_point():
-    assert nearest_within(np.array([np.nan, 0.0]), np.array([[1.0, 0.0]]), np.zeros(1)) is None
+    assert nearest_in_half_planes(np.array([np.nan, 0.0]), np.array([[1.0, 0.0]]), np.zeros(1)) is None

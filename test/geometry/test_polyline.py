@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magnetosuture_thread.geometry.polyline import arc_lengths, chain_along, chain_inside, laid_behind, points_at
+from magnetosuture_thread.geometry.polyline import arc_lengths, chain_along, chain_inside, lay_behind_needle, points_at
 
 
 def test_arc_lengths_and_points_of_a_corner():
@@ -81,7 +81,7 @@ def test_only_the_first_vertex_may_be_outside():
 
 def test_what_is_laid_behind_a_needle_turns_in_before_the_circle():
     tail, heading = np.array([0.0, 0.0]), np.array([0.6, 0.8])
-    laid = laid_behind(tail, heading, 0.15, CIRCLE)
+    laid = lay_behind_needle(tail, heading, 0.15, CIRCLE)
     assert arc_lengths(laid)[-1] >= 0.15
     assert np.linalg.norm(laid, axis=1).max() < CIRCLE
     edges = np.diff(laid, axis=0)
@@ -89,4 +89,4 @@ def test_what_is_laid_behind_a_needle_turns_in_before_the_circle():
     assert (turns / np.linalg.norm(edges[0])).max() < 1.01 / (0.3 * CIRCLE)
     np.testing.assert_allclose(edges[0] / np.linalg.norm(edges[0]), -heading, atol=1e-12)
     for length, radius in ((0.01, CIRCLE), (0.15, math.inf)):
-        np.testing.assert_array_equal(laid_behind(tail, heading, length, radius), [tail, tail - length * heading])
+        np.testing.assert_array_equal(lay_behind_needle(tail, heading, length, radius), [tail, tail - length * heading])

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import Definition
+from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, make, read, stamped, texts, write_many_chunks, write_mcap
@@ -118,7 +118,7 @@ def test_repair_makes_a_whole_bag_of_what_is_intact(damaged: Path, tmp_path: Pat
 
 def test_repair_keeps_notes_definitions_and_topics_with_two_types(tmp_path: Path):
     path = tmp_path / "bag"
-    theirs = Definition("their_msgs/msg/Thing", "ros2msg", "int32 number\n")
+    theirs = MessageDefinition("their_msgs/msg/Thing", "ros2msg", "int32 number\n")
     with BagWriter(path, {"setup": "example"}) as bag:
         bag.add_topic("/thing", theirs.type_name, theirs)
         bag.write("/thing", 1, b"\0\1\0\0\7\0\0\0")
@@ -194,7 +194,7 @@ def test_the_frame_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[st
         bag.write_message("/ground_truth/needle", 1, make("geometry_msgs/msg/PoseStamped", stamped(1, "world"), pose))
     for words, is_told in (([], True), (["--frame", "world"], False)):
         assert cli.main(["bag", "check", str(tmp_path / "bag"), *words]) == 0
-        assert ("nothing leads to dish" in capsys.readouterr().out) == is_told
+        assert ("is not connected to dish" in capsys.readouterr().out) == is_told
 
 
 def test_the_table_is_readable_at_80_columns(

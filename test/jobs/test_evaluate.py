@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.bags.reader import Bag, Record
-from magnetosuture_thread.bags.types import MESSAGES, typestore
+from magnetosuture_thread.bags.message_types import MESSAGES, typestore
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.bag_table import TIMES, Row
@@ -231,12 +231,12 @@ def test_why_nothing_was_predicted_is_said(tmp_path: Path, short_bag: Path):
 
 
 def test_recorded_predictions_of_frames_that_nobody_asks_for_hide_none(monkeypatch: pytest.MonkeyPatch):
-    def record(stamp: int) -> Record:
+    def record(stamp: int) -> RecordedMessage:
         seconds, rest = divmod(stamp, 10**9)
-        return Record("/thread/predicted", "", stamp, struct.pack("<4sIII", b"\0\1\0\0", seconds, rest, 0))
+        return RecordedMessage("/thread/predicted", "", stamp, struct.pack("<4sIII", b"\0\1\0\0", seconds, rest, 0))
 
     points = [SimpleNamespace(x=0.0, y=0.0), SimpleNamespace(x=1.0, y=0.0)]
-    monkeypatch.setattr(Record, "decode", lambda self: SimpleNamespace(positions=points))
+    monkeypatch.setattr(RecordedMessage, "decode", lambda self: SimpleNamespace(positions=points))
     recording: Any = SimpleNamespace(
         counts={PREDICTED_THREAD.recorded: 1}, records=lambda *a, **n: (record(k * 10**6) for k in range(2000))
     )

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
@@ -16,7 +16,7 @@ from magnetosuture_thread.interface import SCENE
 from magnetosuture_thread.jobs.judge import opened
 from magnetosuture_thread.jobs.playing import Playing
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
 POST = Scene(Dish(0.035), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.001)),))
@@ -101,7 +101,7 @@ def test_the_scene_is_played_first_and_nodes_begin_in_it(copied, tmp_path: Path)
         first, *rest = playing.records()
         assert first.topic == SCENE.recorded
         assert first.time == found.begin <= rest[0].time
-        assert scene_of(first.decode()) == POST
+        assert parse_scene_message(first.decode()) == POST
         assert SCENE in playing.channels
         arguments = playing.arguments(tmp_path / "qos.yaml")
         assert f"scene:={tmp_path / 'scene.yaml'}" in arguments
@@ -112,5 +112,5 @@ def test_a_scene_that_changes_on_the_way_is_played_when_it_does(copied):
     path = copied([(0.0, Scene()), (0.4, POST)], setup="petri_35mm_polyamide")
     with given(path) as found:
         told = [record for record in Playing(found).records() if record.topic == SCENE.recorded]
-        assert [scene_of(record.decode()) for record in told] == [Scene(), POST]
+        assert [parse_scene_message(record.decode()) for record in told] == [Scene(), POST]
         assert told[1].time == pytest.approx(found.begin + 4e8, abs=1e8)

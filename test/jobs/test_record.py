@@ -14,7 +14,7 @@ from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.record import record
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.images import decode_image
 
@@ -178,5 +178,5 @@ def test_a_bag_begins_with_the_scene(tmp_path: Path, straight_pull: ReferenceTra
     first = next(iter(bag.records(set(bag.topics))))
     assert first.topic == "/scene"
     assert first.time == bag.start
-    assert scene_of(first.decode()) == setup.scene
+    assert parse_scene_message(first.decode()) == setup.scene
     assert sum(1 for _ in bag.records({"/scene"})) == 1

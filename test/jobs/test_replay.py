@@ -25,8 +25,8 @@ from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
+from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.types import make, typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory

@@ -16,9 +16,9 @@ from magnetosuture_thread.cli import main
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.jobs.replay import replay
 from magnetosuture_thread.jobs.simulate import simulate
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.reproduce.thread_behavior import thread_behavior
-from magnetosuture_thread.resources import setup_file
+from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.scene import read_scene
 
 pytestmark = pytest.mark.whole_graph
@@ -120,7 +120,7 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     ):
         assert bag.counts[topic] > 0, topic
     (told,) = bag.records({"/scene"})
-    assert scene_of(told.decode()) == read_scene("dish_35mm")
+    assert parse_scene_message(told.decode()) == read_scene("dish_35mm")
     assert told.time == bag.start
     first = min(record.time for record in bag.records({"/ground_truth/needle"}))
     assert first - bag.start < 0.5e9  # the nodes' start is not in it
@@ -243,7 +243,7 @@ def test_thread_behavior_draws_each_scenario(scenario: Path, tmp_path: Path):
 
 def test_the_scenarios_of_the_paper_ship():
     for name in ("petri_35mm_polyamide", "petri_150mm_silk"):
-        assert setup_file(name).exists()
+        assert find_setup_file(name).exists()
 
 
 def test_an_interrupted_run_that_has_begun_keeps_what_was_recorded(scenario: Path, tmp_path: Path):

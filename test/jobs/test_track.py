@@ -13,8 +13,8 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.types import typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.cli.commands.calibrate_camera import calibrate_camera
 from magnetosuture_thread.cli.commands.track import track_table

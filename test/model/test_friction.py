@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.barrier import BarrierRows
-from magnetosuture_thread.geometry.obstacles import Disc, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.model.barriers import Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.friction import (
     UNKNOWN,
@@ -24,7 +24,7 @@ NODES = np.column_stack([np.arange(0.0, -8e-3, -1e-3), np.zeros(8)])  # 0 is the
 
 def barriers(*discs: tuple[float, float, float], others: tuple[BarrierRows, ...] = ()) -> Margins:
     """Return the margins of the nodes among discs x, y, radius."""
-    around = Surroundings([Disc((x, y), radius) for x, y, radius in discs], 5e-3)
+    around = Workspace([Disc((x, y), radius) for x, y, radius in discs], 5e-3)
     return Margins.of([Connectivity(1e-3).rows(NODES), ObstacleAvoidance(around, 0.0).rows(NODES), *others], 0.0)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 
@@ -24,7 +24,7 @@ def new(
     obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = (), formulation: str = "rod"
 ) -> ThreadPredictor:
     """Return a predictor that has not started."""
-    return ThreadPredictor(THREAD, Surroundings(obstacles, 5e-3), formulation=formulation, fixed_nodes=fixed_nodes)
+    return ThreadPredictor(THREAD, Workspace(obstacles, 5e-3), formulation=formulation, fixed_nodes=fixed_nodes)
 
 
 def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = ()) -> ThreadPredictor:
@@ -234,7 +234,7 @@ def test_any_motion_keeps_the_promises(
         if polygon.has_room_for(0.5 * THREAD.segment_length):
             obstacles.append(polygon.smoothed(1e-4))
     predictor = started(tuple(obstacles))
-    around = Surroundings(obstacles, 5e-3)
+    around = Workspace(obstacles, 5e-3)
     where, angle = np.zeros(2), 0.0
     for k, turn in enumerate(turns, start=1):
         angle += turn
@@ -272,7 +272,7 @@ def test_any_thread_at_any_times_stays_whole(
     thread = Thread.of(
         MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=attachment, rest_curvature=curvature
     )
-    predictor = ThreadPredictor(thread, Surroundings((), 5e-3, dimension), fixed_nodes=fixed_nodes)
+    predictor = ThreadPredictor(thread, Workspace((), 5e-3, dimension), fixed_nodes=fixed_nodes)
     east = np.eye(dimension)[0]
     where, time = np.zeros(dimension), 0.0
     # Not quite straight: what is, in theory, can be pushed together and does not know to which side to bend.

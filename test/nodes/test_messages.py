@@ -16,8 +16,8 @@ from magnetosuture_msgs.msg import CoilBridgeState, ThreadMaterial, TrackerState
 from rclpy.serialization import deserialize_message, serialize_message
 from visualization_msgs.msg import Marker
 
-from magnetosuture_thread.bags.types import MESSAGES as BAG_MESSAGES
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.message_types import MESSAGES as BAG_MESSAGES
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.coils.latch import ArmingState
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView

@@ -20,7 +20,7 @@ from magnetosuture_thread.nodes import parameter_files
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
-from magnetosuture_thread.resources import setup_file
+from magnetosuture_thread.resources import find_setup_file
 
 COMMON = "/**: {ros__parameters: {needle_length: 0.006, thread_length: 0.05}}\n"
 OWN = "/**/path_follower: {ros__parameters: {speed: 0.004}}\n"
@@ -200,7 +200,7 @@ def test_a_bridge_that_is_pushed_into_a_namespace_has_its_setup(domain: int, nam
     """Found from outside: it was active with no obstacles, another dish and another needle, without a warning."""
     extra = tmp_path / "launch.yaml"  # what launch writes of parameters that it is given itself
     extra.write_text("/**: {ros__parameters: {use_sim_time: false, max_speed: 0.011}}")
-    files = ("--params-file", str(setup_file("hernia_ring")), "--params-file", str(extra))
+    files = ("--params-file", str(find_setup_file("hernia_ring")), "--params-file", str(extra))
     process = started("coil_bridge", "-r", f"__node:={name}", "-r", "__ns:=/lab1", *files)
     expected = {
         "scene": "hernia_ring",

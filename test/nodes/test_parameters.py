@@ -14,7 +14,7 @@ from rcl_interfaces.srv import DescribeParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.configuration import Configuration, described, quantity, to_mapping
+from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity, to_mapping
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes.parameters import Changeable, declare
@@ -24,7 +24,7 @@ from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 
 def test_every_setting_is_a_described_parameter(graph):
     node = graph.add(ThreadModelNode, segments=30, thread_length=0.02)
-    for about in described(ThreadModelSettings):
+    for about in configuration_fields(ThreadModelSettings):
         descriptor = node.describe_parameter(about.name)
         assert descriptor.read_only == (about.name in FIXED)
         assert about.quantity.description in descriptor.description
@@ -86,7 +86,7 @@ class Kitchen:
         given = [Parameter(name, value=value) for name, value in values.items()]
         result = self.node.set_parameters_atomically(given)
         assert self.changeable.settings == self.in_force
-        told = {about.name: self.node.get_parameter(about.name).value for about in described(Oven)}
+        told = {about.name: self.node.get_parameter(about.name).value for about in configuration_fields(Oven)}
         assert {name: list(v) if hasattr(v, "typecode") else v for name, v in told.items()} == to_mapping(self.in_force)
         assert result.successful == (not result.reason)
         return str(result.reason)

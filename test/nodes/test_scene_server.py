@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE
-from magnetosuture_thread.messages.scene import scene_of
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
@@ -58,7 +58,7 @@ class Server:
         answer = self.ask(name, **fields)
         assert (answer.success, answer.message) == (True, "")
         self.graph.wait(lambda: len(self.scenes) > before, "another scene")
-        scene = scene_of(self.scenes[-1])
+        scene = parse_scene_message(self.scenes[-1])
         assert answer.version == scene.version
         return scene
 
@@ -70,7 +70,7 @@ class Server:
 def test_the_scene_of_the_parameter_is_latched(graph):
     server = Server(graph, scene="dish_35mm_post")
     graph.wait(lambda: bool(server.scenes and server.markers), "the scene, published before anybody listened")
-    assert scene_of(server.scenes[0]) == POST
+    assert parse_scene_message(server.scenes[0]) == POST
     assert server.scenes[0].header.frame_id == "dish"
     assert server.scenes[0].header.stamp.sec > 0
     graph.wait(lambda: server.said(f"scene {POST.version}: dish of 35 mm, 1 shape"), "its report")

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.bags.reader import Bag, Record
+from magnetosuture_thread.bags.message_types import MESSAGES, make, typestore
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.types import MESSAGES, make, typestore
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
@@ -51,7 +51,7 @@ def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceT
     return path
 
 
-def changed(bag: Path, folder: Path, change: Callable[[Record, Any], Any]) -> Path:
+def changed(bag: Path, folder: Path, change: Callable[[RecordedMessage, Any], Any]) -> Path:
     """Write a bag again, each message as it comes out of a function; those that come out as None are left out."""
     source = Bag(bag)
     with BagWriter(folder, source.notes) as writer:
@@ -152,12 +152,12 @@ def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
 
 
 def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path):
-    def pose(old: Record, message: Any) -> Any:
+    def pose(old: RecordedMessage, message: Any) -> Any:
         if old.topic == NEEDLE_POSE.recorded:
             message.pose.pose.position.x *= 1e3
         return message
 
-    def thread(old: Record, message: Any) -> Any:
+    def thread(old: RecordedMessage, message: Any) -> Any:
         if old.topic == SEEN_THREAD.recorded:
             for each in message.poses:
                 each.pose.position.x *= 1e3
@@ -173,7 +173,7 @@ def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path):
 
 
 def test_a_thread_of_another_length_is_said(pose_bag: Path, tmp_path: Path):
-    def short(old: Record, message: Any) -> Any:
+    def short(old: RecordedMessage, message: Any) -> Any:
         if old.topic == SEEN_THREAD.recorded:
             message.poses = message.poses[:8]
         return message
@@ -186,7 +186,7 @@ def test_a_thread_of_another_length_is_said(pose_bag: Path, tmp_path: Path):
 
 
 def test_stamps_that_go_back_are_refused_and_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):
-    def back(old: Record, message: Any) -> Any:
+    def back(old: RecordedMessage, message: Any) -> Any:
         stamp = stamp_of(old)
         late = old.topic in (NEEDLE_POSE.recorded, COMPRESSED_IMAGE.recorded) and stamp > round(1.9e9)
         return at(message, stamp - 500_000_000) if late else message
@@ -199,7 +199,7 @@ def test_stamps_that_go_back_are_refused_and_counted(pose_bag: Path, short_bag: 
 
 
 def test_time_that_goes_back_by_more_begins_anew(pose_bag: Path, tmp_path: Path):
-    def back(old: Record, message: Any) -> Any:
+    def back(old: RecordedMessage, message: Any) -> Any:
         stamp = stamp_of(old)
         return at(message, stamp + (3 * 10**9 if stamp < 1.5e9 else 0))
 
@@ -210,7 +210,7 @@ def test_time_that_goes_back_by_more_begins_anew(pose_bag: Path, tmp_path: Path)
 
 
 def test_broken_pictures_and_poses_are_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):
-    def torn(old: Record, message: Any) -> Any:
+    def torn(old: RecordedMessage, message: Any) -> Any:
         if old.topic == COMPRESSED_IMAGE.recorded and stamp_of(old) > round(1.9e9):
             message.data = message.data[:7]
         if old.topic == NEEDLE_POSE.recorded and stamp_of(old) > round(1.9e9):
@@ -265,7 +265,7 @@ def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
     for pose in message.poses:
         pose.header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id=frame)
     data = bytes(typestore().serialize_cdr(message, SEEN_THREAD.type_name))
-    given = Record(SEEN_THREAD.recorded, SEEN_THREAD.type_name, 3, data)
+    given = RecordedMessage(SEEN_THREAD.recorded, SEEN_THREAD.type_name, 3, data)
     assert np.array_equal(read_path(given), points)
     assert stamp_of(given) == 5 * 10**9 + 7
     if count > 1:
@@ -281,7 +281,7 @@ def test_poses_are_read_as_a_node_gets_them():
     heading = np.array([np.cos(2.5), np.sin(2.5)])
     message = MESSAGES.pose_message(10**9, np.array([1e-3, -2e-3]), heading, None)
     data = bytes(typestore().serialize_cdr(message, NEEDLE_POSE.type_name))
-    given = Record(NEEDLE_POSE.recorded, NEEDLE_POSE.type_name, 3, data)
+    given = RecordedMessage(NEEDLE_POSE.recorded, NEEDLE_POSE.type_name, 3, data)
     tail, along = read_pose(given)
     assert tail.tolist() == [1e-3, -2e-3]
     assert along == pytest.approx(heading, abs=1e-15)

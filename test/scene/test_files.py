@@ -166,7 +166,7 @@ def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
 def test_a_pipe_that_takes_the_place_of_a_file_at_the_last_moment_holds_nobody_up(tmp_path: Path, monkeypatch):
     fifo = tmp_path / "fifo.yaml"
     os.mkfifo(fifo)
-    monkeypatch.setattr("magnetosuture_thread.scene.files.scene_file", lambda name: fifo)
+    monkeypatch.setattr("magnetosuture_thread.scene.files.find_scene_file", lambda name: fifo)
     with pytest.raises(ConfigurationError, match="got 'a folder, pipe or device', expected a regular file"):
         read_scene(str(fifo))
 

@@ -10,8 +10,8 @@ import pytest
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from rclpy.serialization import deserialize_message, serialize_message
 
-from magnetosuture_thread.bags.types import MESSAGES as BAG_MESSAGES
-from magnetosuture_thread.bags.types import typestore
+from magnetosuture_thread.bags.message_types import MESSAGES as BAG_MESSAGES
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.interface import SCENE
@@ -45,7 +45,7 @@ def written(scene: Scene) -> Any:
     """Return a scene as a bag gives it that rosbags has written itself."""
     store = typestore()
     data = store.serialize_cdr(BAG_MESSAGES.scene_message(7, scene), SCENE.type_name)
-    assert messages.scene_of(deserialize_message(bytes(data), SceneMessage)) == scene  # a node reads it too
+    assert messages.parse_scene_message(deserialize_message(bytes(data), SceneMessage)) == scene  # a node reads it too
     return store.deserialize_cdr(data, SCENE.type_name)
 
 
@@ -55,7 +55,7 @@ WAYS = pytest.mark.parametrize("way", [sent, recorded, written])
 @WAYS
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_goes_there_and_back(way: Callable[[Scene], Any], name: str):
-    again = messages.scene_of(way(SCENES[name]))
+    again = messages.parse_scene_message(way(SCENES[name]))
     assert again == SCENES[name]
     assert again.version == SCENES[name].version
 
@@ -129,7 +129,7 @@ def test_a_damaged_message_is_refused_in_one_line(way: Callable[[Scene], Any], h
     message = way(every_shape())
     harm(message)
     with pytest.raises(InvalidInputError) as caught:
-        messages.scene_of(message)
+        messages.parse_scene_message(message)
     assert str(caught.value).startswith(words)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
@@ -141,13 +141,13 @@ def test_more_than_a_scene_may_have_is_refused_before_anything_is_made_of_it(way
     ring = message.shapes[1].polygon[0]
     ring.holes = [ring.holes[0]] * 101
     with pytest.raises(InvalidInputError, match=r"^scene\.shapes\[1\]\.polygon\.holes: got 101, expected at most 100$"):
-        messages.scene_of(message)
+        messages.parse_scene_message(message)
     ring.holes = []
     ring.outline.corners = [ring.outline.corners[0]] * 10_001
     with pytest.raises(
         InvalidInputError, match=r"^scene\.shapes\.polygon\.corners: got 10\d\d\d, expected at most 10000$"
     ):
-        messages.scene_of(message)
+        messages.parse_scene_message(message)
     message.shapes = [message.shapes[0]] * 201
     with pytest.raises(InvalidInputError, match=r"^scene\.shapes: got 201, expected at most 200$"):
-        messages.scene_of(message)
+        messages.parse_scene_message(message)

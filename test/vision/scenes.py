@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.rig.camera.dish_camera import Cover, DishCamera
 from magnetosuture_thread.rig.camera.scene import Lighting, Scene

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.arc import needle_axis
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.look import State

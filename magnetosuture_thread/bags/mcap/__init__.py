@@ -1,1 +1,1 @@
-"""The mcap format: looked through with every checksum, read by an index of what is intact, and written."""
+"""The mcap format: scanning with every checksum, salvage of intact data, and writing."""

@@ -1,4 +1,4 @@
-"""An mcap file, looked through as it is opened, and read by the index of what is intact."""
+"""Scans an mcap file as it is opened, and reads the messages of its intact blocks."""
 
 from __future__ import annotations
 
@@ -11,23 +11,27 @@ from typing import BinaryIO
 
 from mcap.opcode import Opcode
 
-from magnetosuture_thread.bags.damage import counted
-from magnetosuture_thread.bags.mcap.chunk import unpack
-from magnetosuture_thread.bags.mcap.index import Piece
-from magnetosuture_thread.bags.mcap.layout import MAGIC, MESSAGE, BrokenError, records_in
-from magnetosuture_thread.bags.mcap.scan import Scan
+from magnetosuture_thread.bags.damage_report import pluralize
+from magnetosuture_thread.bags.mcap.records import (
+    MAGIC,
+    MESSAGE_HEADER,
+    CorruptRecordError,
+    decompress_chunk,
+    iterate_records,
+)
+from magnetosuture_thread.bags.mcap.salvage import salvage
+from magnetosuture_thread.bags.mcap.scan import Block, Scanner
 from magnetosuture_thread.bags.mcap.summary import read_summary
-from magnetosuture_thread.bags.mcap.verdict import judge
-from magnetosuture_thread.bags.storage import Item, in_order
+from magnetosuture_thread.bags.storage import StoredMessage, merge_by_time
 from magnetosuture_thread.errors import BagError
 
 
 class McapFile:
-    """An mcap file; a `Storage`, where the attributes are told.
+    """An mcap file, open for reading; implements `BagStorage`, where the attributes are described.
 
     Args:
         path: the file.
-        progress: called with the number of bytes looked through since the last call.
+        progress: called with the number of bytes scanned since the last call.
 
     Raises:
         BagError: it cannot be read, is empty, or is no mcap file.
@@ -41,86 +45,90 @@ class McapFile:
                 if not size:
                     raise BagError(path, "is empty, expected an mcap file")
                 summary = read_summary(stream, size)
-                found = Scan(path, stream, size, summary, progress).walk()
+                scan = Scanner(path, stream, size, summary, progress).scan()
                 stream.seek(0)
-                if stream.read(len(MAGIC)) != MAGIC and not found.pieces and summary is None:
+                if stream.read(len(MAGIC)) != MAGIC and not scan.blocks and summary is None:
                     raise BagError(path, "is no mcap file")
-                verdict = judge(path.name, size, found, summary, partial(_recount, stream))
+                salvaged = salvage(path.name, size, scan, summary, partial(_count_messages, stream))
         except OSError as error:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from None
-        self.connections = verdict.connections
-        self.counts = verdict.counts
-        self.notes = verdict.notes
-        self.damage = verdict.damage
-        self.unchecked = verdict.unchecked
+        self.connections = salvaged.connections
+        self.counts = salvaged.counts
+        self.notes = salvaged.notes
+        self.damage = salvaged.damage
+        self.unchecked = salvaged.unchecked
         used = set(self.counts)
-        self._pieces = [piece for piece in verdict.pieces if piece.channels & used]
-        self.start = min((piece.start for piece in self._pieces), default=0)
-        self.end = max((piece.end for piece in self._pieces), default=0)
-        self._pieces.sort(key=lambda piece: piece.start)
-        checked = sum(piece.checked for piece in self._pieces)
-        chunks = sum(piece.is_chunk for piece in self._pieces)
-        data = "; of all data too" if found.data_is_right else ""
+        self._blocks = [block for block in salvaged.blocks if block.channels & used]
+        self.start = min((block.start for block in self._blocks), default=0)
+        self.end = max((block.end for block in self._blocks), default=0)
+        self._blocks.sort(key=lambda block: block.start)
+        checked = sum(block.has_checksum for block in self._blocks)
+        chunks = sum(block.is_chunk for block in self._blocks)
+        data = "; of all data too" if scan.data_crc_matches else ""
         self.facts = {
             "format": "mcap",
             "bytes": str(size),
             "chunks": str(chunks),
-            "compression": ", ".join(sorted(name or "none" for name in found.compressions)) or "none",
-            "checksums": f"of {checked} of {counted(chunks, 'chunk')}{data}",
+            "compression": ", ".join(sorted(name or "none" for name in scan.compressions)) or "none",
+            "checksums": f"of {checked} of {pluralize(chunks, 'chunk')}{data}",
         }
 
-    def items(self, connections: Collection[int], start: int, end: int) -> Iterator[Item]:
-        """Go through the messages of some connections from `start` to `end` [ns], both included, by time.
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+        """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
 
         Raises:
-            BagError: the file has changed since it was looked through, or cannot be read any more.
+            BagError: the file has changed since it was scanned, or cannot be read any more.
         """
         wanted = frozenset(connections) & set(self.counts)
         try:
             with self.path.open("rb") as stream:
-                yield from in_order(
-                    (piece.start, partial(self._items_of, stream, piece, wanted, start, end))
-                    for piece in self._pieces
-                    if piece.start <= end and piece.end >= start and piece.channels & wanted
+                yield from merge_by_time(
+                    (block.start, partial(self._read_block, stream, block, wanted, start, end))
+                    for block in self._blocks
+                    if block.start <= end and block.end >= start and block.channels & wanted
                 )
         except OSError as error:
             raise BagError(self.path, f"cannot be read: {error.strerror or error}") from None
 
-    def _items_of(self, stream: BinaryIO, piece: Piece, wanted: frozenset[int], start: int, end: int) -> Iterator[Item]:
+    def _read_block(
+        self, stream: BinaryIO, block: Block, wanted: frozenset[int], start: int, end: int
+    ) -> Iterator[StoredMessage]:
         try:
-            data = _load(stream, piece)
-        except BrokenError:
+            data = _load(stream, block)
+        except CorruptRecordError:
             raise BagError(self.path, "has changed while it was read") from None
-        places = []
-        for opcode, first, last in records_in(data):
+        found = []
+        for opcode, first, last in iterate_records(data):
             if opcode == Opcode.MESSAGE:
-                channel, _, time, _ = MESSAGE.unpack_from(data, first)
+                channel, _, time, _ = MESSAGE_HEADER.unpack_from(data, first)
                 if channel in wanted and start <= time <= end:
-                    places.append((time, first + MESSAGE.size, last, channel))
-        places.sort()
-        for time, first, last, channel in places:
-            yield Item(time, self.connections[channel], data[first:last])
+                    found.append((time, first + MESSAGE_HEADER.size, last, channel))
+        found.sort()
+        for time, first, last, channel in found:
+            yield StoredMessage(time, self.connections[channel], data[first:last])
 
 
-def _load(stream: BinaryIO, piece: Piece) -> bytes:
-    """Return the records of a piece.
+def _load(stream: BinaryIO, block: Block) -> bytes:
+    """Return the records of a block.
 
     Raises:
-        BrokenError: they are not what they were when the file was looked through.
+        CorruptRecordError: they have changed since the file was scanned.
     """
-    stream.seek(piece.offset)
-    data = stream.read(piece.length)
+    stream.seek(block.offset)
+    data = stream.read(block.length)
     crc = zlib.crc32(data)
-    if piece.is_chunk:
-        content = unpack(data)
+    if block.is_chunk:
+        content = decompress_chunk(data)
         data, crc = content.data, content.crc
-    if crc != piece.crc:
-        raise BrokenError("other bytes than before")
+    if crc != block.crc:
+        raise CorruptRecordError("other bytes than before")
     return data
 
 
-def _recount(stream: BinaryIO, piece: Piece) -> Counter[int]:
-    data = _load(stream, piece)
+def _count_messages(stream: BinaryIO, block: Block) -> Counter[int]:
+    data = _load(stream, block)
     return Counter(
-        MESSAGE.unpack_from(data, first)[0] for opcode, first, _ in records_in(data) if opcode == Opcode.MESSAGE
+        MESSAGE_HEADER.unpack_from(data, first)[0]
+        for opcode, first, _ in iterate_records(data)
+        if opcode == Opcode.MESSAGE
     )

@@ -1,8 +1,7 @@
-"""Goes through an mcap file once, record by record, checks every checksum, and finds what is intact.
+"""Scans an mcap file record by record, verifies every checksum, and finds what is intact.
 
-Where what follows is no record, or a chunk is broken, the walk goes on at the next place that is sound: by the
-summary's index of chunks, if the summary's own checksum is right, else where the next chunk with a right
-checksum begins.
+Where a record or chunk is corrupt, the scan continues at the next intact data: at an offset from the chunk index, if
+the checksum of the summary is correct, else where the next chunk with a correct checksum begins.
 """
 
 from __future__ import annotations
@@ -11,223 +10,296 @@ import zlib
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
+from mcap.records import Metadata
 
-from magnetosuture_thread.bags.damage import Place
-from magnetosuture_thread.bags.mcap.chunk import unpack
-from magnetosuture_thread.bags.mcap.index import Findings, Piece
-from magnetosuture_thread.bags.mcap.layout import (
-    HEAD,
-    LARGEST,
+from magnetosuture_thread.bags.damage_report import CorruptRegion
+from magnetosuture_thread.bags.mcap.channels import ChannelTable
+from magnetosuture_thread.bags.mcap.records import (
     MAGIC,
-    MESSAGE,
-    PRIVATE,
-    BrokenError,
-    is_kind,
-    parse,
-    records_in,
+    MAX_CHUNK_BYTES,
+    MESSAGE_HEADER,
+    MIN_PRIVATE_OPCODE,
+    RECORD_HEADER,
+    CorruptRecordError,
+    decompress_chunk,
+    find_chunk,
+    is_intact_chunk,
+    is_opcode,
+    iterate_records,
+    parse_record,
 )
-from magnetosuture_thread.bags.mcap.search import is_intact, next_chunk
-from magnetosuture_thread.bags.mcap.summary import Summary
+from magnetosuture_thread.bags.mcap.summary import McapSummary
 
-_BLOCK = 1 << 20  # bytes skipped at a time
-_RUN = 1 << 20  # bytes of messages without a chunk that make a piece
-_SILENT = frozenset[int]()
+_SKIP_BYTES = 1 << 20  # read at a time where a record is skipped
+_RUN_BYTES = 1 << 20  # of messages outside of chunks in one block
+_NO_CHANNELS = frozenset[int]()
 
 
-class Scan:
-    """A walk through the data of an mcap file.
+class Block(NamedTuple):
+    """A chunk, or a run of messages outside of chunks.
+
+    Attributes:
+        offset: where its bytes begin: those after a chunk's record header, or the first message's record header.
+        length: number of bytes.
+        is_chunk: whether it is a chunk.
+        has_checksum: whether it has a checksum of its own.
+        crc: checksum of its records, computed.
+        size: bytes of its records.
+        start: time of its first message [ns].
+        end: time of its last message [ns].
+        channels: channels with messages in it.
+    """
+
+    offset: int
+    length: int
+    is_chunk: bool
+    has_checksum: bool
+    crc: int
+    size: int
+    start: int
+    end: int
+    channels: frozenset[int]
+
+
+@dataclass
+class ScanResult:
+    """What a scan of a file found.
+
+    Attributes:
+        blocks: in the order of the file.
+        counts: messages by channel, in all blocks.
+        unchecked_counts: those of them in blocks without a checksum.
+        checked_channels: channels defined in blocks with a checksum.
+        unchecked_channels: channels defined elsewhere.
+        metadata: metadata records.
+        compressions: of the chunks.
+        corrupt: regions that could not be read.
+        chunks_lost: number of chunks among them, as far as it can be seen.
+        ended: whether the data end record was reached.
+        stopped: where the scan ended.
+        data_crc: checksum of the data section as stored; 0 if there is none.
+        data_crc_matches: whether it is correct.
+        has_private_records: whether there are records of private opcodes.
+    """
+
+    blocks: list[Block] = field(default_factory=list)
+    counts: Counter[int] = field(default_factory=Counter)
+    unchecked_counts: Counter[int] = field(default_factory=Counter)
+    checked_channels: ChannelTable = field(default_factory=ChannelTable)
+    unchecked_channels: ChannelTable = field(default_factory=ChannelTable)
+    metadata: list[Metadata] = field(default_factory=list)
+    compressions: set[str] = field(default_factory=set)
+    corrupt: list[CorruptRegion] = field(default_factory=list)
+    chunks_lost: int = 0
+    ended: bool = False
+    stopped: int = 0
+    data_crc: int = 0
+    data_crc_matches: bool = False
+    has_private_records: bool = False
+
+
+class Scanner:
+    """Scans the data section of an mcap file.
 
     Args:
         path: the file.
         stream: the file, open.
         size: its length.
-        summary: what its summary says, if it has one.
-        progress: called with the number of bytes that the walk has come on.
+        summary: its summary, if it has one.
+        progress: called with the number of bytes scanned since the last call.
 
     Attributes:
-        found: what was found.
+        result: what was found.
     """
 
     def __init__(
-        self, path: Path, stream: BinaryIO, size: int, summary: Summary | None, progress: Callable[[int], None]
+        self, path: Path, stream: BinaryIO, size: int, summary: McapSummary | None, progress: Callable[[int], None]
     ) -> None:
-        self.found = Findings()
+        self.result = ScanResult()
         self._name = path.name
         self._stream = stream
         self._limit = summary.start if summary is not None else size
         self._progress = progress
         self._crc = 0
-        self._channel_sets = {_SILENT: _SILENT}
-        self._told: set[tuple[int, bytes, bool]] = set()
-        self._anchors: list[int] = []  # where the summary says that something begins
+        self._channel_sets = {_NO_CHANNELS: _NO_CHANNELS}
+        self._definitions: set[tuple[int, bytes, bool]] = set()
+        self._offsets: list[int] = []  # of records, by the summary
         if summary is not None and summary.trusted and not summary.shifted:
-            begins = [chunk.offset for chunk in summary.chunks]
-            begins += [record.offset for record in summary.metadata]
-            self._anchors = sorted([*begins, summary.start - HEAD.size - 4])
+            offsets = [chunk.offset for chunk in summary.chunks]
+            offsets += [record.offset for record in summary.metadata]
+            self._offsets = sorted([*offsets, summary.start - RECORD_HEADER.size - 4])
 
-    def walk(self) -> Findings:
-        """Go through the file and return what was found."""
+    def scan(self) -> ScanResult:
+        """Scan the file and return what was found."""
         magic = self._read(0, len(MAGIC))
         self._crc = zlib.crc32(magic)
         position = len(MAGIC)
         if magic != MAGIC:
-            position = self._break(0, "it does not begin as an mcap file")
-        while position < self._limit and not self.found.ended:
+            position = self._skip_corrupt(0, "the magic bytes are missing")
+        while position < self._limit and not self.result.ended:
             before = position
             try:
                 position = self._step(position)
-            except BrokenError as problem:
-                position = self._break(position, str(problem))
+            except CorruptRecordError as problem:
+                position = self._skip_corrupt(position, str(problem))
             self._progress(position - before)
-        self.found.stopped = position
-        return self.found
+        self.result.stopped = position
+        return self.result
 
     def _step(self, position: int) -> int:
-        """Take the record at a place and return where the next one begins."""
-        opcode, length = self._head(position)
-        start = position + HEAD.size
+        """Scan the record at a position and return where the next one begins."""
+        opcode, length = self._read_header(position)
+        start = position + RECORD_HEADER.size
         after = start + length
         if opcode == Opcode.MESSAGE:
-            return self._loose(position)
-        if opcode in (Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX) or opcode >= PRIVATE or length > LARGEST:
+            return self._scan_loose_messages(position)
+        if (
+            opcode in (Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX)
+            or opcode >= MIN_PRIVATE_OPCODE
+            or length > MAX_CHUNK_BYTES
+        ):
             return self._skip(position, opcode, length)
         before = self._crc
-        head, body = self._read(position, HEAD.size), self._read(start, length)
+        head, body = self._read(position, RECORD_HEADER.size), self._read(start, length)
         self._crc = zlib.crc32(body, zlib.crc32(head, before))
         if opcode == Opcode.CHUNK:
-            self._take_chunk(start, length, body)
+            self._scan_chunk(start, length, body)
             return after
-        record = parse(opcode, body)
+        record = parse_record(opcode, body)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self.found.tell(record, checked=False)
+            self.result.unchecked_channels.add(record)
         elif opcode == Opcode.METADATA:
-            self.found.metadata.append(record)
+            self.result.metadata.append(record)
         elif opcode == Opcode.DATA_END:
-            self.found.ended = True
-            self.found.data_crc = record.data_section_crc
-            self.found.data_is_right = bool(record.data_section_crc) and record.data_section_crc == before
+            self.result.ended = True
+            self.result.data_crc = record.data_section_crc
+            self.result.data_crc_matches = bool(record.data_section_crc) and record.data_section_crc == before
         return after
 
-    def _head(self, position: int) -> tuple[int, int]:
-        """Return kind and length of the record at a place, if one can be there."""
-        head = self._read(position, HEAD.size)
-        if len(head) < HEAD.size:
-            raise BrokenError("its end is missing")
-        opcode, length = HEAD.unpack(head)
-        if not is_kind(opcode):
-            raise BrokenError("no record where one should begin")
-        if position + HEAD.size + length > self._limit:
-            raise BrokenError("a record that would go on after the end")
+    def _read_header(self, position: int) -> tuple[int, int]:
+        """Return opcode and length of the record at a position, if one can be there."""
+        head = self._read(position, RECORD_HEADER.size)
+        if len(head) < RECORD_HEADER.size:
+            raise CorruptRecordError("the end is missing")
+        opcode, length = RECORD_HEADER.unpack(head)
+        if not is_opcode(opcode):
+            raise CorruptRecordError("no record where one is expected")
+        if position + RECORD_HEADER.size + length > self._limit:
+            raise CorruptRecordError("a record longer than the rest of the data")
         return opcode, length
 
     def _skip(self, position: int, opcode: int, length: int) -> int:
-        """Go past a record whose content is not needed; it has to end where another record can begin."""
-        start = position + HEAD.size
+        """Skip a record whose content is not needed; it has to end where another record can begin."""
+        start = position + RECORD_HEADER.size
         if opcode == Opcode.MESSAGE_INDEX:
-            # It tells nothing that the messages do not tell, but a chunk may have become one.
+            # Its content is redundant, but the opcode of a chunk may have been corrupted to this one.
             entries = int.from_bytes(self._read(start + 2, 4), "little")
             if entries + 6 != length or entries % 16:
-                raise BrokenError("a broken message index")
+                raise CorruptRecordError("a corrupt message index")
         if start + length < self._limit:
-            self._head(start + length)
-        self.found.private |= opcode >= PRIVATE
-        self._crc = zlib.crc32(self._read(position, HEAD.size), self._crc)
-        for at in range(start, start + length, _BLOCK):
-            self._crc = zlib.crc32(self._read(at, min(_BLOCK, start + length - at)), self._crc)
+            self._read_header(start + length)
+        self.result.has_private_records |= opcode >= MIN_PRIVATE_OPCODE
+        self._crc = zlib.crc32(self._read(position, RECORD_HEADER.size), self._crc)
+        for at in range(start, start + length, _SKIP_BYTES):
+            self._crc = zlib.crc32(self._read(at, min(_SKIP_BYTES, start + length - at)), self._crc)
         return start + length
 
-    def _take_chunk(self, start: int, length: int, body: bytes) -> None:
-        """Keep a chunk that is intact."""
-        content = unpack(body)
-        self._keep(content.data, Piece(start, length, True, content.checked, content.crc, 0, 0, 0, _SILENT))
-        self.found.compressions.add(content.compression)
+    def _scan_chunk(self, start: int, length: int, body: bytes) -> None:
+        """Add a chunk that is intact."""
+        content = decompress_chunk(body)
+        self._add_block(
+            content.data, Block(start, length, True, content.has_checksum, content.crc, 0, 0, 0, _NO_CHANNELS)
+        )
+        self.result.compressions.add(content.compression)
 
-    def _loose(self, position: int) -> int:
-        """Keep a run of messages that are in no chunk."""
+    def _scan_loose_messages(self, position: int) -> int:
+        """Add a run of messages outside of chunks."""
         after = position
-        while after - position < _RUN and after < self._limit:
+        while after - position < _RUN_BYTES and after < self._limit:
             try:
-                opcode, length = self._head(after)
-            except BrokenError:
+                opcode, length = self._read_header(after)
+            except CorruptRecordError:
                 if after == position:
                     raise
-                break  # The run ends here; what is broken is the next step's.
+                break  # The run ends here; the next step handles what is corrupt.
             if opcode != Opcode.MESSAGE:
                 break
-            if not MESSAGE.size <= length <= LARGEST:
-                raise BrokenError("a broken message")
-            after += HEAD.size + length
+            if not MESSAGE_HEADER.size <= length <= MAX_CHUNK_BYTES:
+                raise CorruptRecordError("a corrupt message")
+            after += RECORD_HEADER.size + length
         data = self._read(position, after - position)
         self._crc = zlib.crc32(data, self._crc)
-        self._keep(data, Piece(position, len(data), False, False, zlib.crc32(data), 0, 0, 0, _SILENT))
+        self._add_block(data, Block(position, len(data), False, False, zlib.crc32(data), 0, 0, 0, _NO_CHANNELS))
         return after
 
-    def _keep(self, data: bytes, piece: Piece) -> None:
-        """Keep a piece with what its records say; nothing of it where one is broken."""
+    def _add_block(self, data: bytes, block: Block) -> None:
+        """Add a block with its channels and counts; nothing of it where a record is corrupt."""
         counts: Counter[int] = Counter()
-        told = []
+        definitions = []
         first, last = 0, 0
-        for opcode, start, end in records_in(data):
+        for opcode, start, end in iterate_records(data):
             if opcode == Opcode.MESSAGE:
-                channel, _, time, _ = MESSAGE.unpack_from(data, start)
+                channel, _, time, _ = MESSAGE_HEADER.unpack_from(data, start)
                 first, last = (min(first, time), max(last, time)) if counts else (time, time)
                 counts[channel] += 1
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                told.append((opcode, data[start:end]))
-        for opcode, body in told:
-            self._tell(opcode, body, piece.checked)
+                definitions.append((opcode, data[start:end]))
+        for opcode, body in definitions:
+            self._add_definition(opcode, body, block.has_checksum)
         channels = self._channel_sets.setdefault(frozenset(counts), frozenset(counts))
-        self.found.pieces.append(piece._replace(size=len(data), start=first, end=last, channels=channels))
-        self.found.counts += counts
-        if not piece.checked:
-            self.found.unchecked_counts += counts
+        self.result.blocks.append(block._replace(size=len(data), start=first, end=last, channels=channels))
+        self.result.counts += counts
+        if not block.has_checksum:
+            self.result.unchecked_counts += counts
 
-    def _tell(self, opcode: int, body: bytes, checked: bool) -> None:
-        """Take what is told of a channel or a type; our own writer tells the same in every chunk."""
-        if (opcode, body, checked) not in self._told:
-            self.found.tell(parse(opcode, body), checked)
-            self._told.add((opcode, body, checked))
+    def _add_definition(self, opcode: int, body: bytes, checked: bool) -> None:
+        """Add a channel or schema; our own writer repeats them in every chunk."""
+        if (opcode, body, checked) not in self._definitions:
+            table = self.result.checked_channels if checked else self.result.unchecked_channels
+            table.add(parse_record(opcode, body))
+            self._definitions.add((opcode, body, checked))
 
-    def _break(self, position: int, what: str) -> int:
-        """Note a broken place, and return where something sound begins after it."""
-        after = self._next_sound(position)
+    def _skip_corrupt(self, position: int, what: str) -> int:
+        """Add a corrupt region, and return where the next intact data begins."""
+        after = self._find_intact(position)
         is_chunk = self._read(position, 1) == bytes([Opcode.CHUNK])
-        self.found.chunks_lost += is_chunk
-        first = self.found.pieces[-1].end if self.found.pieces else None
-        self.found.broken.append(Place(self._name, position, after, what, first))
+        self.result.chunks_lost += is_chunk
+        first = self.result.blocks[-1].end if self.result.blocks else None
+        self.result.corrupt.append(CorruptRegion(self._name, position, after, what, first))
         return after
 
-    def _next_sound(self, position: int) -> int:
-        """Return the next place where something sound begins: a chunk, the record after this one, or the end."""
+    def _find_intact(self, position: int) -> int:
+        """Return where the next intact data begins: a chunk, the record after this one, or the end."""
         after = self._limit
         try:
-            _, length = self._head(position)
-            following = position + HEAD.size + length
+            _, length = self._read_header(position)
+            following = position + RECORD_HEADER.size + length
             if following < self._limit:
-                self._head(following)
+                self._read_header(following)
             after = following
-        except BrokenError:
+        except CorruptRecordError:
             pass
-        for anchor in self._anchors[bisect_right(self._anchors, position) :]:
-            if anchor >= after or self._is_sound(anchor):
-                after = min(after, anchor)
+        for offset in self._offsets[bisect_right(self._offsets, position) :]:
+            if offset >= after or self._is_intact_record(offset):
+                after = min(after, offset)
                 break
-        # Even then: a head that leads astray may lead over chunks that are intact.
-        found = next_chunk(self._stream, position + 1, self._limit, after)
+        # Even then: a corrupt record header may skip chunks that are intact.
+        found = find_chunk(self._stream, position + 1, self._limit, after)
         return after if found is None else found
 
-    def _is_sound(self, position: int) -> bool:
-        """Return whether a record begins at a place where the summary says that one does."""
+    def _is_intact_record(self, position: int) -> bool:
+        """Return whether a record begins at an offset from the summary."""
         try:
-            opcode, length = self._head(position)
+            opcode, length = self._read_header(position)
             if opcode == Opcode.CHUNK:
-                return is_intact(self._stream, position, self._limit)
-            parse(opcode, self._read(position + HEAD.size, length))
-        except BrokenError:
+                return is_intact_chunk(self._stream, position, self._limit)
+            parse_record(opcode, self._read(position + RECORD_HEADER.size, length))
+        except CorruptRecordError:
             return False
         return opcode in (Opcode.METADATA, Opcode.DATA_END)
 

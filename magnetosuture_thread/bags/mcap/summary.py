@@ -1,6 +1,6 @@
-"""The summary at an mcap file's end: what the file holds, and where.
+"""Reads the summary at the end of an mcap file: its channels, chunk index and statistics.
 
-It has a checksum of its own, so it can be trusted where the rest is broken: it knows what is missing.
+It has a checksum of its own, so it can be trusted where the rest of the file is corrupt, and lists what is missing.
 """
 
 from __future__ import annotations
@@ -13,20 +13,27 @@ from dataclasses import dataclass, field
 from typing import BinaryIO, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, MetadataIndex, Schema, Statistics
+from mcap.records import MetadataIndex, Statistics
 
-from magnetosuture_thread.bags.mcap.layout import HEAD, MAGIC, BrokenError, parse, records_in
+from magnetosuture_thread.bags.mcap.channels import ChannelTable
+from magnetosuture_thread.bags.mcap.records import (
+    MAGIC,
+    RECORD_HEADER,
+    CorruptRecordError,
+    iterate_records,
+    parse_record,
+)
 
 _FOOTER = struct.Struct("<QQI")
-_END = HEAD.size + _FOOTER.size + len(MAGIC)  # bytes from the footer to the file's end
-_TAIL = 1 << 24  # bytes at the end in which a summary is looked for that is not where it should be
-_FOOTERS = re.compile(rb"\x02\x14\0{7}.{20}" + re.escape(MAGIC), re.DOTALL)
-_DATA_ENDS = re.compile(rb"\x0f\x04\0{7}", re.DOTALL)
-_DATA_END = HEAD.size + 4
+_FOOTER_BYTES = RECORD_HEADER.size + _FOOTER.size + len(MAGIC)  # bytes from the footer to the file's end
+_TAIL_BYTES = 1 << 24  # at the end, searched for a displaced summary
+_FOOTER_PATTERN = re.compile(rb"\x02\x14\0{7}.{20}" + re.escape(MAGIC), re.DOTALL)
+_DATA_END_PATTERN = re.compile(rb"\x0f\x04\0{7}", re.DOTALL)
+_DATA_END_BYTES = RECORD_HEADER.size + 4
 
 
-class ListedChunk(NamedTuple):
-    """A chunk as the summary lists it; there may be a hundred thousand of them.
+class IndexedChunk(NamedTuple):
+    """An entry of the chunk index; a file may have a hundred thousand of them.
 
     Attributes:
         offset: where its record begins.
@@ -44,86 +51,87 @@ class ListedChunk(NamedTuple):
 
 
 @dataclass
-class Summary:
-    """What a summary says.
+class McapSummary:
+    """The content of a summary section.
 
     Attributes:
-        start: where it begins in the file; where the data ends, its last record included.
+        start: where it begins in the file; the data ends there, its last record included.
         end: where its footer begins.
-        trusted: whether it has a checksum, and that is right.
-        shifted: whether it is not where its footer says, so that its offsets are of no use.
-        followed: number of bytes after the file's end that do not belong to it.
+        trusted: whether it has a checksum that is correct.
+        shifted: whether it is not at the offset in its footer, so that its offsets are useless.
+        trailing_bytes: number of bytes after the end of the mcap file.
+        channels: channels and their schemas.
+        chunks: the chunk index.
+        metadata: index of the metadata records.
+        statistics: counts and times of all messages, if present.
     """
 
     start: int
     end: int
     trusted: bool
     shifted: bool = False
-    followed: int = 0
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[ListedChunk] = field(default_factory=list)
+    trailing_bytes: int = 0
+    channels: ChannelTable = field(default_factory=ChannelTable)
+    chunks: list[IndexedChunk] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
 
 
-def read_summary(stream: BinaryIO, size: int) -> Summary | None:
-    """Return the summary of a file; None where there is none that is what its checksum says.
+def read_summary(stream: BinaryIO, size: int) -> McapSummary | None:
+    """Return the summary of a file; None where there is none with a correct checksum.
 
-    One without a checksum is taken if it is where the footer says and is made of records.
+    One without a checksum is accepted if it is at the offset in the footer and consists of valid records.
 
     Args:
         stream: the file.
         size: its length.
     """
-    begin = max(0, size - _TAIL)
-    stream.seek(max(begin, size - _END))
+    begin = max(0, size - _TAIL_BYTES)
+    stream.seek(max(begin, size - _FOOTER_BYTES))
     end = stream.read()
-    if _FOOTERS.fullmatch(end):
-        start = _FOOTER.unpack_from(end, HEAD.size)[0] or size - _END
-        if len(MAGIC) <= start <= size - _END:
+    if _FOOTER_PATTERN.fullmatch(end):
+        start = _FOOTER.unpack_from(end, RECORD_HEADER.size)[0] or size - _FOOTER_BYTES
+        if len(MAGIC) <= start <= size - _FOOTER_BYTES:
             stream.seek(start)
-            found = _summary(stream.read(size - len(MAGIC) - start), start, shifted=False)
+            found = _parse_summary(stream.read(size - len(MAGIC) - start), start, shifted=False)
             if found is not None:
                 return found
-    # Not there: something before it was taken away or put in, or something follows.
+    # Not there: bytes before it were removed or inserted, or bytes follow it.
     stream.seek(begin)
     tail = stream.read()
-    for footer in reversed(list(_FOOTERS.finditer(tail))):
+    for footer in reversed(list(_FOOTER_PATTERN.finditer(tail))):
         stop = footer.end() - len(MAGIC)
-        claimed = _FOOTER.unpack_from(tail, footer.start() + HEAD.size)[0] or begin + footer.start()
-        for start in _starts(tail, begin, footer.start(), claimed):
-            found = _summary(tail[start - begin : stop], start, shifted=start != claimed)
+        claimed = _FOOTER.unpack_from(tail, footer.start() + RECORD_HEADER.size)[0] or begin + footer.start()
+        for start in _candidate_starts(tail, begin, footer.start(), claimed):
+            found = _parse_summary(tail[start - begin : stop], start, shifted=start != claimed)
             if found is not None and found.trusted:
-                found.followed = size - begin - footer.end()
+                found.trailing_bytes = size - begin - footer.end()
                 return found
     return None
 
 
-def _starts(tail: bytes, begin: int, footer: int, claimed: int) -> Iterator[int]:
-    """Yield where a summary may begin: where its footer says, or after what looks like the data's last record."""
+def _candidate_starts(tail: bytes, begin: int, footer: int, claimed: int) -> Iterator[int]:
+    """Yield where a summary may begin: at the offset in its footer, or after what looks like a data end record."""
     if begin <= claimed <= begin + footer:
         yield claimed
-    ends = [match.start() + _DATA_END for match in _DATA_ENDS.finditer(tail, 0, footer)]
+    ends = [match.start() + _DATA_END_BYTES for match in _DATA_END_PATTERN.finditer(tail, 0, footer)]
     yield from (begin + end for end in reversed(ends[-16:]) if end <= footer)
 
 
-def _summary(data: bytes, start: int, *, shifted: bool) -> Summary | None:
-    """Return a summary with its footer, taken apart; None if it is none."""
+def _parse_summary(data: bytes, start: int, *, shifted: bool) -> McapSummary | None:
+    """Return a summary, parsed together with its footer; None if it is invalid."""
     crc = _FOOTER.unpack_from(data, len(data) - _FOOTER.size)[2]
     if crc and zlib.crc32(data[:-4]) != crc:
         return None
-    summary = Summary(start, start + len(data) - HEAD.size - _FOOTER.size, bool(crc), shifted)
+    summary = McapSummary(start, start + len(data) - RECORD_HEADER.size - _FOOTER.size, bool(crc), shifted)
     try:
-        for opcode, first, last in records_in(data):
-            record = parse(opcode, data[first:last])
-            if opcode == Opcode.SCHEMA:
-                summary.schemas[record.id] = record
-            elif opcode == Opcode.CHANNEL:
-                summary.channels[record.id] = record
+        for opcode, first, last in iterate_records(data):
+            record = parse_record(opcode, data[first:last])
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                summary.channels.add(record)
             elif opcode == Opcode.CHUNK_INDEX:
                 summary.chunks.append(
-                    ListedChunk(
+                    IndexedChunk(
                         record.chunk_start_offset,
                         record.chunk_length,
                         record.uncompressed_size,
@@ -135,6 +143,6 @@ def _summary(data: bytes, start: int, *, shifted: bool) -> Summary | None:
                 summary.metadata.append(record)
             elif opcode == Opcode.STATISTICS:
                 summary.statistics = record
-    except BrokenError:
+    except CorruptRecordError:
         return None
     return summary

@@ -53,12 +53,12 @@ def add(subparsers: Subparsers) -> None:
 def run_check(options: argparse.Namespace) -> int:
     """Say what a bag holds, and whether it is whole."""
     from magnetosuture_thread.bags.reader import Bag
-    from magnetosuture_thread.bags.report import report
+    from magnetosuture_thread.bags.report import inspect_bag
 
     console = make_console()
     with progress(console, "bag check") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
-        found = report(bag, options.frame, lambda share: advance(0.5 + 0.5 * share)).to_json()
+        found = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share)).to_json()
     console.print(_table(found))
     for line in _lines(found):
         sayer(console)(line)
@@ -68,9 +68,9 @@ def run_check(options: argparse.Namespace) -> int:
 
 def run_repair(options: argparse.Namespace) -> int:
     """Write what is intact in a bag into a new one."""
-    from magnetosuture_thread.bags.damage import counted
+    from magnetosuture_thread.bags.damage_report import pluralize
     from magnetosuture_thread.bags.reader import Bag
-    from magnetosuture_thread.bags.repair import repair
+    from magnetosuture_thread.bags.repair import write_repaired_bag
     from magnetosuture_thread.jobs.output import whole_folder
 
     console = make_console()
@@ -79,14 +79,16 @@ def run_repair(options: argparse.Namespace) -> int:
     with progress(console, "bag repair") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
         with whole_folder(options.output) as folder:
-            count = repair(bag, folder, options.output.name, refused, lambda share: advance(0.5 + 0.5 * share))
+            count = write_repaired_bag(
+                bag, folder, options.output.name, refused, lambda share: advance(0.5 + 0.5 * share)
+            )
     if bag.damage is not None:
         say(str(bag.damage))
     elif not refused:
         say(bag.unchecked or "is not damaged: the new bag holds the same")
     for reason, lost in refused.items():
-        say(f"{reason}: {counted(lost, 'message')} lost")
-    for place in bag.damage.places if bag.damage is not None else ():
+        say(f"{reason}: {pluralize(lost, 'message')} lost")
+    for place in bag.damage.regions if bag.damage is not None else ():
         say(f"  {place}{_times(place.first, place.last, bag.start)}")
     say(f"{count} messages in {options.output}")
     return DONE

@@ -1,15 +1,15 @@
-"""Obstacles: shapes with a signed distance, and what of them is near."""
+"""Obstacles: shapes, their signed distance, and contacts of points with them."""
 
 from __future__ import annotations
 
 from magnetosuture_thread.geometry.obstacles.closest import closest_on_triangles
+from magnetosuture_thread.geometry.obstacles.contacts import WALL, WorkspaceData, find_contacts, wall_contact
 from magnetosuture_thread.geometry.obstacles.disc import Disc
 from magnetosuture_thread.geometry.obstacles.mesh import Mesh
-from magnetosuture_thread.geometry.obstacles.near import WALL, SurroundingsData, find_near, wall_contact
-from magnetosuture_thread.geometry.obstacles.pack import Obstacle
+from magnetosuture_thread.geometry.obstacles.packing import Obstacle
 from magnetosuture_thread.geometry.obstacles.polygon import Polygon
-from magnetosuture_thread.geometry.obstacles.surroundings import Contacts, Surroundings
 from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
+from magnetosuture_thread.geometry.obstacles.workspace import Contacts, Workspace
 
 __all__ = [
     "WALL",
@@ -18,11 +18,11 @@ __all__ = [
     "Mesh",
     "Obstacle",
     "Polygon",
-    "Surroundings",
-    "SurroundingsData",
     "Triangulation",
+    "Workspace",
+    "WorkspaceData",
     "closest_on_triangles",
-    "find_near",
+    "find_contacts",
     "triangulate",
     "wall_contact",
 ]

@@ -1,7 +1,7 @@
-"""Features of an obstacle's boundary, as flat tables for the compiled search.
+"""Boundary features of obstacles, as flat tables for the compiled search.
 
-A row of numbers holds all that the search asks about one edge of a polygon, or about one face of a mesh
-with its edges and vertices, so that it reads memory in order. The offsets of a row are the constants here.
+A row holds all numbers of one edge of a polygon, or of one face of a mesh with its edges and vertices, so that the
+search reads memory in order. The constants are the offsets in a row.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Grids: which boxes are near a cell, in compressed rows."""
+"""Uniform grids that list the features near each cell, in compressed rows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Grid:
         return int(self.counts.prod())
 
 
-def plan(low: Points, high: Points, reach: float, budget: int) -> Grid:
+def plan_grid(low: Points, high: Points, reach: float, budget: int) -> Grid:
     """Return a grid around boxes, of cells half as large as a box, at least a part of the reach.
 
     Cells are enlarged until there are at most `budget` of them: this bounds the memory.
@@ -66,7 +66,7 @@ def plan(low: Points, high: Points, reach: float, budget: int) -> Grid:
     return Grid(padded, size, cells, growth)
 
 
-def fill(grid: Grid, low: Points, high: Points, corners: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
+def fill_grid(grid: Grid, low: Points, high: Points, corners: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
     """Return the features near each cell: starts, shape (cells + 1,), and feature numbers, ascending.
 
     A feature is listed when its box, grown, meets the cell's box, and it is itself as near as that to
@@ -88,15 +88,15 @@ def fill(grid: Grid, low: Points, high: Points, corners: NDArray[np.float64]) ->
     radius = grid.growth + 0.5 * grid.size * math.sqrt(dimension) * (1.0 + 1e-9)
     arguments = (first, last, grid.counts, grid.low, grid.size, radius, np.ascontiguousarray(corners))
     starts = np.zeros(grid.cells + 1, dtype=np.int64)
-    _visit(*arguments, starts, np.empty(0, dtype=np.int64))
+    _visit_cells(*arguments, starts, np.empty(0, dtype=np.int64))
     starts = np.concatenate([[0], np.cumsum(starts[:-1])])
     entries = np.empty(int(starts[-1]), dtype=np.int64)
-    _visit(*arguments, starts.copy(), entries)
+    _visit_cells(*arguments, starts.copy(), entries)
     return starts, entries
 
 
 @compiled
-def _visit(
+def _visit_cells(
     first: NDArray[np.int64],
     last: NDArray[np.int64],
     counts: NDArray[np.int64],

@@ -1,4 +1,4 @@
-"""Obstacles from the flat lists of numbers that ROS parameters are."""
+"""Obstacles from flat lists of numbers, as in ROS parameters."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,14 +12,18 @@ from numpy.typing import NDArray
 from shapely.validation import explain_validity
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles.smoothing import rounded
 
-LARGEST_COORDINATE = 10.0
+MAX_COORDINATE = 10.0
 """A coordinate beyond this is taken for one in another unit [m]."""
-SMALLEST_EXTENT = 1e-6
+MIN_EXTENT = 1e-6
 """A shape smaller than this in every direction is taken for one in another unit [m]."""
 
-Ring = tuple[tuple[float, float], ...]
+Vertex = tuple[float, float]
+Ring = tuple[Vertex, ...]
+
+# Of an edge between two sharp corners each arc may use just under half, so that a piece of the edge
+# remains: vertices nearly on top of each other would be an edge without a direction.
+_EDGE_SHARE = 0.49
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,8 @@ class Polygon:
         outline = _checked_ring("polygon.outline", self.outline, self.source)
         holes = tuple(_checked_ring(f"polygon.holes[{i}]", hole, self.source) for i, hole in enumerate(self.holes))
         _check_holes(outline, holes, self.source)
-        object.__setattr__(self, "outline", _directed(outline, counter_clockwise=True))
-        object.__setattr__(self, "holes", tuple(_directed(hole, counter_clockwise=False) for hole in holes))
+        object.__setattr__(self, "outline", _oriented(outline, counter_clockwise=True))
+        object.__setattr__(self, "holes", tuple(_oriented(hole, counter_clockwise=False) for hole in holes))
 
     @property
     def rings(self) -> list[NDArray[np.float64]]:
@@ -90,7 +94,7 @@ class Polygon:
         problem: ConfigurationError | None = None
         for halvings in range(12):
             smaller = radius * 0.5**halvings
-            rings = [tuple(rounded(ring, smaller, angle, step)) for ring in (self.outline, *self.holes)]
+            rings = [tuple(_round_corners(ring, smaller, angle, step)) for ring in (self.outline, *self.holes)]
             try:
                 return Polygon(rings[0], tuple(rings[1:]), self.source)
             except ConfigurationError as error:
@@ -117,14 +121,14 @@ def check_metres(name: str, points: NDArray[np.float64], source: str) -> None:
             f"{name}[{wrong[0]}]", tuple(points[wrong[0]].tolist()), "finite coordinates", source=source
         )
     largest = float(np.abs(points).max(initial=0.0))
-    if largest > LARGEST_COORDINATE:
+    if largest > MAX_COORDINATE:
         raise ConfigurationError(
-            name, largest, f"coordinates of at most {LARGEST_COORDINATE:g} m: is it in metres?", source=source
+            name, largest, f"coordinates of at most {MAX_COORDINATE:g} m: is it in metres?", source=source
         )
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-    if extent < SMALLEST_EXTENT:
+    if extent < MIN_EXTENT:
         raise ConfigurationError(
-            name, extent, f"an extent of at least {SMALLEST_EXTENT:g} m: is it in metres?", source=source
+            name, extent, f"an extent of at least {MIN_EXTENT:g} m: is it in metres?", source=source
         )
 
 
@@ -171,7 +175,9 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
         if not solid.contains_properly(shape):
             where = solid.exterior.intersection(shape.exterior)
             value = (
-                "a hole around the outline" if where.is_empty else f"a hole that meets the outline at {_place(where)}"
+                "a hole around the outline"
+                if where.is_empty
+                else f"a hole that meets the outline at {_position_text(where)}"
             )
             raise ConfigurationError(name, value, "a hole inside the outline, apart from it", source=source)
         for j, other in enumerate(shapes[:i]):
@@ -179,13 +185,13 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
                 where = shape.intersection(other)
                 raise ConfigurationError(
                     name,
-                    f"a hole that meets holes[{j}] at {_place(where)}",
+                    f"a hole that meets holes[{j}] at {_position_text(where)}",
                     "holes apart from each other",
                     source=source,
                 )
 
 
-def _place(shape: shapely.Geometry) -> str:
+def _position_text(shape: shapely.Geometry) -> str:
     """Return a point of a shape as text [m]."""
     point = shape.representative_point()
     return f"({point.x:.6g}, {point.y:.6g})"
@@ -197,6 +203,61 @@ def _signed_area(ring: Ring) -> float:
     return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
-def _directed(ring: Ring, counter_clockwise: bool) -> Ring:
+def _oriented(ring: Ring, counter_clockwise: bool) -> Ring:
     """Return a ring in the wanted direction, with the same first vertex."""
     return ring if (_signed_area(ring) > 0.0) == counter_clockwise else (ring[0], *ring[:0:-1])
+
+
+def _turn(before: Vertex, corner: Vertex, after: Vertex) -> float:
+    """Return by how much the way turns at a corner, in (-pi, pi], positive to the left [rad]."""
+    ax, ay = corner[0] - before[0], corner[1] - before[1]
+    bx, by = after[0] - corner[0], after[1] - corner[1]
+    return math.atan2(ax * by - ay * bx, ax * bx + ay * by)
+
+
+def _round_corners(ring: Sequence[Vertex], radius: float, angle: float, step: float) -> Iterator[Vertex]:
+    """Yield the vertices of a ring whose corners sharper than an angle are arcs.
+
+        t = r tan(turn / 2)
+
+    Args:
+        ring: vertices in order, not closed [m].
+        radius: r of the arcs, where the edges are long enough for t [m].
+        angle: greatest turn that is left alone [rad].
+        step: greatest turn between two chords [rad].
+
+    Yields:
+        The vertices; those that are not sharp are the very same values.
+    """
+    n = len(ring)
+    turns = [_turn(ring[i - 1], ring[i], ring[(i + 1) % n]) for i in range(n)]
+    sharp = [abs(value) > angle for value in turns]
+    lengths = [math.dist(ring[i], ring[(i + 1) % n]) for i in range(n)]
+    for i, corner in enumerate(ring):
+        if not sharp[i]:
+            yield corner
+            continue
+        before = lengths[i - 1] * (_EDGE_SHARE if sharp[i - 1] else 2.0 * _EDGE_SHARE)
+        after = lengths[i] * (_EDGE_SHARE if sharp[(i + 1) % n] else 2.0 * _EDGE_SHARE)
+        tangent = min(radius * math.tan(0.5 * abs(turns[i])), before, after)
+        yield from _arc(ring[i - 1], corner, ring[(i + 1) % n], turns[i], tangent, step)
+
+
+def _arc(before: Vertex, corner: Vertex, after: Vertex, turned: float, tangent: float, step: float) -> Iterator[Vertex]:
+    """Yield points on the arc that leaves both edges at the tangent length from their corner."""
+    length = math.dist(before, corner)
+    ux, uy = (corner[0] - before[0]) / length, (corner[1] - before[1]) / length
+    radius = tangent / math.tan(0.5 * abs(turned))
+    side = math.copysign(1.0, turned)
+    x, y = corner[0] - tangent * ux, corner[1] - tangent * uy
+    pieces = max(math.ceil(abs(turned) / step - 1e-9), 1)
+    for k in range(pieces):
+        along = radius * math.sin(abs(turned) * k / pieces)
+        across = side * radius * (1.0 - math.cos(abs(turned) * k / pieces))
+        yield x + along * ux - across * uy, y + along * uy + across * ux
+    # The last point from its own edge: rounding in the arc must not bend that edge.
+    length = math.dist(corner, after)
+    yield (
+        corner[0] + tangent * (after[0] - corner[0]) / length,
+        corner[1] + tangent * (after[1] - corner[1]) / length,
+    )

@@ -1,4 +1,4 @@
-"""The compiled search for the boundary features near a point."""
+"""Search for the boundary features near a point, compiled."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from magnetosuture_thread.geometry.obstacles.closest import (
 )
 from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_MARKS, FACE_WIDTH
 
-TOUCHING = 1e-12
-"""Closer to a vertex or an edge than this, the direction away from it is lost in rounding [m]."""
-_SAME = 1e-7  # two rows of one obstacle that differ by less are one point of its boundary
+MIN_DISTANCE = 1e-12
+"""At a smaller distance from a vertex or an edge, the direction away from it is lost in rounding [m]."""
+_SAME_POINT = 1e-7  # two rows of one obstacle that differ by less are one point of its boundary
 
 
 class Nearest(NamedTuple):
@@ -44,7 +44,7 @@ class Nearest(NamedTuple):
 
 
 @compiled
-def put(
+def add_row(
     start: int,
     count: int,
     length: float,
@@ -63,10 +63,10 @@ def put(
     dimension = outward.shape[1]
     for row in range(start, count):
         if (
-            abs(distance[row] - length) <= _SAME * length + TOUCHING
-            and abs(outward[row, 0] - x) <= _SAME
-            and abs(outward[row, 1] - y) <= _SAME
-            and (dimension == 2 or abs(outward[row, 2] - z) <= _SAME)
+            abs(distance[row] - length) <= _SAME_POINT * length + MIN_DISTANCE
+            and abs(outward[row, 0] - x) <= _SAME_POINT
+            and abs(outward[row, 1] - y) <= _SAME_POINT
+            and (dimension == 2 or abs(outward[row, 2] - z) <= _SAME_POINT)
         ):
             return count
     if count >= len(distance):
@@ -131,10 +131,10 @@ def search_edges(
                 and rx * numbers[k + 9] + ry * numbers[k + 10] >= 0.0
             ):
                 length = math.sqrt(square)
-                if length > TOUCHING:
-                    count = put(start, count, length, rx / length, ry / length, 0.0, distance, outward)
+                if length > MIN_DISTANCE:
+                    count = add_row(start, count, length, rx / length, ry / length, 0.0, distance, outward)
                 else:
-                    count = put(start, count, length, numbers[k + 9], numbers[k + 10], 0.0, distance, outward)
+                    count = add_row(start, count, length, numbers[k + 9], numbers[k + 10], 0.0, distance, outward)
         elif along >= numbers[k + 6]:
             rx, ry = x - numbers[k + 2], y - numbers[k + 3]
             square = rx * rx + ry * ry
@@ -146,12 +146,12 @@ def search_edges(
             if square < best:
                 best, corner, bx, by, nx, ny = square, False, rx, ry, dy, -dx
             if side >= 0.0 and square <= limit:
-                count = put(start, count, side, dy, -dx, 0.0, distance, outward)
+                count = add_row(start, count, side, dy, -dx, 0.0, distance, outward)
     if best == np.inf:
         return Nearest(count, best, best, 0.0, 0.0, 0.0)
     length = math.sqrt(best)
     sign = 1.0 if bx * nx + by * ny >= 0.0 else -1.0
-    if corner and length > TOUCHING:
+    if corner and length > MIN_DISTANCE:
         nx, ny = sign * bx / length, sign * by / length
     return Nearest(count, best, sign * length, nx, ny, 0.0)
 
@@ -246,15 +246,15 @@ def search_faces(
             if spoke < index[mark + 6 + region - VERTEX_A]:
                 continue
         length = math.sqrt(square)
-        if region == FACE or length <= TOUCHING:
-            count = put(start, count, length, numbers[at], numbers[at + 1], numbers[at + 2], distance, outward)
+        if region == FACE or length <= MIN_DISTANCE:
+            count = add_row(start, count, length, numbers[at], numbers[at + 1], numbers[at + 2], distance, outward)
         else:
-            count = put(start, count, length, rx / length, ry / length, rz / length, distance, outward)
+            count = add_row(start, count, length, rx / length, ry / length, rz / length, distance, outward)
     if best == np.inf:
         return Nearest(count, best, best, 0.0, 0.0, 0.0)
     length = math.sqrt(best)
     nx, ny, nz = numbers[normal], numbers[normal + 1], numbers[normal + 2]
     sign = 1.0 if bx * nx + by * ny + bz * nz >= 0.0 else -1.0
-    if not blunt and length > TOUCHING:
+    if not blunt and length > MIN_DISTANCE:
         nx, ny, nz = sign * bx / length, sign * by / length, sign * bz / length
     return Nearest(count, best, sign * length, nx, ny, nz)

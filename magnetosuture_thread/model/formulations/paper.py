@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.barrier import Barrier, BarrierRows
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import WALL, Surroundings, SurroundingsData
+from magnetosuture_thread.geometry.obstacles import WALL, Workspace
+from magnetosuture_thread.geometry.obstacles.contacts import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import (
     Connectivity,
@@ -93,7 +94,7 @@ class PaperFormulation:
 
     Args:
         thread: the thread; of its mechanics only the rest shape counts.
-        surroundings: obstacles and wall [m]; their reach is that of the margins.
+        workspace: obstacles and wall [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
         options: what the paper sets or leaves open.
@@ -105,19 +106,19 @@ class PaperFormulation:
     def __init__(
         self,
         thread: Thread,
-        surroundings: Surroundings,
+        workspace: Workspace,
         solver: Solver,
         tolerance: float,
         options: PaperOptions | None = None,
         barriers: Sequence[Barrier] = (),
     ) -> None:
-        nodes, dimension = thread.segments + 1, surroundings.dimension
+        nodes, dimension = thread.segments + 1, workspace.dimension
         self.dimension = dimension
-        self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
+        self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
         self._options = options or PaperOptions()
         self.added = AddedBarriers(barriers, thread.segment_length)
-        reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
-        self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
+        reach, wall_radius = ROW_REACH * thread.segment_length, workspace.wall_radius
+        self._near = Workspace(workspace.shapes, reach, dimension, wall_radius)
         self._room_radius = (wall_radius - 0.5 * thread.diameter) / thread.segment_length
         self._rest = rest_distances(thread.rest_angles)
         self._rows = 3 * thread.segments - 2
@@ -199,15 +200,15 @@ class PaperFormulation:
             Connectivity(unit).rows(positions),
             EnhancedConnectivity(unit).rows(positions),
             Stiffness(unit * self._rest).rows(positions),
-            ObstacleAvoidance(self._surroundings, radius).rows(positions),
-            WallAvoidance(self._surroundings.wall_radius, radius, self._surroundings.reach).rows(positions),
+            ObstacleAvoidance(self._workspace, radius).rows(positions),
+            WallAvoidance(self._workspace.wall_radius, radius, self._workspace.reach).rows(positions),
         ]
 
 
 @compiled
 def _assemble(
     buffers: StepBuffers,
-    surroundings: SurroundingsData,
+    workspace: WorkspaceData,
     start: Points,
     velocities: Points,
     known: NDArray[np.bool_],
@@ -241,7 +242,7 @@ def _assemble(
         buffers.lower[r] = -(gain if r < stiff else stiffness_gain) * buffers.value[r]
         buffers.upper[r] = np.inf
         buffers.compliance[r] = connectivity_compliance if r < stiff else stiffness_compliance
-    contacts, depth = contact_rows(buffers, rows, surroundings, start, start, known, 1.0 / gain, unit, radius)
+    contacts, depth = contact_rows(buffers, rows, workspace, start, start, known, 1.0 / gain, unit, radius)
     for r in range(rows, rows + contacts):
         clearance = buffers.value[r]
         if clearance > 0.0 and buffers.obstacle[r - rows] != WALL:

@@ -33,7 +33,7 @@ import numpy as np
 
 from magnetosuture_thread.barrier import Barrier, BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, SolverError
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity, ObstacleAvoidance, WallAvoidance
@@ -67,7 +67,7 @@ class RodFormulation:
 
     Args:
         thread: the thread.
-        surroundings: obstacles and wall [m]; their reach is that of the margins.
+        workspace: obstacles and wall [m]; their reach is that of the margins.
         solver: solves the program.
         tolerance: the largest residual with which a solution is accepted.
         barriers: what a user adds to the built-in ones.
@@ -81,16 +81,16 @@ class RodFormulation:
     def __init__(
         self,
         thread: Thread,
-        surroundings: Surroundings,
+        workspace: Workspace,
         solver: Solver,
         tolerance: float,
         barriers: Sequence[Barrier] = (),
     ) -> None:
-        nodes, dimension = thread.segments + 1, surroundings.dimension
+        nodes, dimension = thread.segments + 1, workspace.dimension
         self.dimension = dimension
-        self._thread, self._surroundings, self._solver, self._tolerance = thread, surroundings, solver, tolerance
-        reach, wall_radius = ROW_REACH * thread.segment_length, surroundings.wall_radius
-        self._near = Surroundings(surroundings.shapes, reach, dimension, wall_radius)
+        self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
+        reach, wall_radius = ROW_REACH * thread.segment_length, workspace.wall_radius
+        self._near = Workspace(workspace.shapes, reach, dimension, wall_radius)
         medium, clamped = thread.medium, thread.attachment is Attachment.CLAMPED
         if len(medium.gravity) not in (0, dimension):
             raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
@@ -202,8 +202,8 @@ class RodFormulation:
         return [
             Connectivity(self._thread.segment_length).rows(positions),
             Compression(self.rest_lengths(positions, heading)).rows(positions),
-            ObstacleAvoidance(self._surroundings, radius).rows(positions),
-            WallAvoidance(self._surroundings.wall_radius, radius, self._surroundings.reach).rows(positions),
+            ObstacleAvoidance(self._workspace, radius).rows(positions),
+            WallAvoidance(self._workspace.wall_radius, radius, self._workspace.reach).rows(positions),
         ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import SurroundingsData
+from magnetosuture_thread.geometry.obstacles.contacts import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
@@ -49,7 +49,7 @@ def assemble(
     solves: int,
     rod: RodProperties,
     buffers: StepBuffers,
-    surroundings: SurroundingsData,
+    workspace: WorkspaceData,
     about: Points,
     start: Points,
     before: Points,
@@ -68,7 +68,7 @@ def assemble(
     segments = len(about) - 1
     mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
     stretch = _segment_rows(buffers, about, start, known, interval)
-    contacts, depth = contact_rows(buffers, segments, surroundings, about, start, known, interval, rod.unit, rod.radius)
+    contacts, depth = contact_rows(buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius)
     off = max(stretch / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
     if contacts >= 0 and (solves == 0 or off > 1.0):
         _objective(rod, buffers, about, start, before, last, heading, interval, last_interval)
@@ -256,7 +256,7 @@ def solve_step(
     axes: tuple[int, ...],
     rod: RodProperties,
     buffers: StepBuffers,
-    surroundings: SurroundingsData,
+    workspace: WorkspaceData,
     solver_buffers: banded.SolverBuffers,
     motion: MotionBuffers,
     positions: Points,
@@ -277,7 +277,7 @@ def solve_step(
         axes: 0 to d - 1.
         rod: the thread.
         buffers: has the program in the end, and its multipliers.
-        surroundings: obstacles and wall [m].
+        workspace: obstacles and wall [m].
         solver_buffers: of the structured solver; one without iterations leaves every solve to the caller.
         motion: where the step has got to; written.
         positions: see `init_step`, as are the following.
@@ -305,7 +305,7 @@ def solve_step(
             solves,
             rod,
             buffers,
-            surroundings,
+            workspace,
             motion.about,
             motion.start,
             motion.before,
@@ -320,7 +320,7 @@ def solve_step(
             return NO_ROOM, contacts, solves, off, status, worst
         if off <= 1.0 or solves == max_solves:
             if off > 1.0:  # whatever else holds, nothing passes the wall
-                moved_inside(motion.about, motion.known, (surroundings.wall_radius - rod.radius) / rod.unit)
+                moved_inside(motion.about, motion.known, (workspace.wall_radius - rod.radius) / rod.unit)
             return ENDED, contacts, solves, off, status, worst
         if solver_buffers.iterations == 0:
             return UNSOLVED, contacts, solves, off, status, worst

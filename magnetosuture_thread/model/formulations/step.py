@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import SurroundingsData, find_near
+from magnetosuture_thread.geometry.obstacles import WorkspaceData
+from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
 from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
@@ -134,7 +135,7 @@ class StepBuffers(NamedTuple):
         multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
         chords: length of each segment, shape (n,).
         work: shape (2, n + 1, d).
-        node: contacts: as `find_near` writes them, shape (c,).
+        node: contacts: as `find_contacts` writes them, shape (c,).
         obstacle: shape (c,).
         distance: shape (c,).
         outward: shape (c, d).
@@ -228,7 +229,7 @@ def warmed(solver: Solver, buffers: StepBuffers, known: NDArray[np.bool_], rows:
 def contact_rows(
     buffers: StepBuffers,
     row: int,
-    surroundings: SurroundingsData,
+    workspace: WorkspaceData,
     about: Points,
     start: Points,
     known: NDArray[np.bool_],
@@ -243,7 +244,7 @@ def contact_rows(
     Args:
         buffers: written, from a row on.
         row: the first of these rows.
-        surroundings: obstacles and wall [m].
+        workspace: obstacles and wall [m].
         about: y, shape (n + 1, d) [D].
         start: x, shape (n + 1, d) [D].
         known: nodes that have no rows, as nothing can push them, shape (n + 1,).
@@ -255,8 +256,8 @@ def contact_rows(
         The number of rows, -1 if there is no room for them, and the greatest depth of a node [m].
     """
     nodes, dimension = about.shape
-    found = find_near(
-        about * unit, surroundings, buffers.node, buffers.obstacle, buffers.distance, buffers.outward, buffers.nearest
+    found = find_contacts(
+        about * unit, workspace, buffers.node, buffers.obstacle, buffers.distance, buffers.outward, buffers.nearest
     )
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredInstant, SteeredThread
@@ -178,7 +178,7 @@ def replay_steering(
         InvalidInputError: the thread cannot begin there, or a velocity cannot be used.
         SolverError: a step had no solution.
     """
-    around = Surroundings(needle.scene.obstacles, _FAR)
+    around = Workspace(needle.scene.obstacles, _FAR)
     instants = list(_steps(SteeredThread(settings, centreline, needle), steering, progress))
     radius, obstacles = 0.5 * settings.thread().diameter, len(around.shapes)
     barriers = np.array(
@@ -197,7 +197,7 @@ def _steps(thread: SteeredThread, steering: Steering, progress: Callable[[float]
         progress((k + 1) / count)
 
 
-def _distances(around: Surroundings, points: Points, obstacles: int) -> NDArray[np.float64]:
+def _distances(around: Workspace, points: Points, obstacles: int) -> NDArray[np.float64]:
     """Return the signed distance of each point from each obstacle, shape (m, obstacles) [m]."""
     near = around.near(points)
     distances = np.full((len(points), obstacles), _FAR)

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.arc import needle_axis
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.coverage import Box, Light, blurred, box_around, covered, lay, line_covered
 from magnetosuture_thread.rig.camera.scene import Lighting, Scene

@@ -16,7 +16,7 @@ from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
 from magnetosuture_thread.rig.mechanics.field import CoilField
 from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody
-from magnetosuture_thread.rig.mechanics.newton import advance, make_memory
+from magnetosuture_thread.rig.mechanics.newton import advance, make_buffers
 from magnetosuture_thread.rig.mechanics.rod import Rod
 from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
 
@@ -105,7 +105,7 @@ class RigDynamics:
             0.5 * needle.diameter + surface.skin,
             (glue, 0.5 * thread.rest_curvature * length**2),
         )
-        self._memory = make_memory(thread.segments, _contacts(self._shapes))
+        self._memory = make_buffers(thread.segments, _contacts(self._shapes))
         self._poles, self._flux = np.zeros((2, 3)), np.zeros((2, 2))  # tail and tip, and the field there [T]
         self._move, self._held = 0.0, np.zeros(0)
         self.time, self.residual, self.converged = 0.0, 0.0, True
@@ -163,7 +163,7 @@ class RigDynamics:
         if surface.skin != self._skin:
             raise ConfigurationError("surface.skin", surface.skin, f"{self._skin:g} m, as before")
         shapes = surface.packed()
-        self._memory = make_memory(self.properties.segments, _contacts(shapes))
+        self._memory = make_buffers(self.properties.segments, _contacts(shapes))
         self._shapes = shapes
         # The last two states may be farther apart than a step that touches something can follow.
         self._before, self._last_dt = self._q.copy(), 0.0

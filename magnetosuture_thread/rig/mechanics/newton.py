@@ -32,7 +32,7 @@ LEAST_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
 FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere else
 
 
-class Memory(NamedTuple):
+class NewtonBuffers(NamedTuple):
     """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows."""
 
     trial: NDArray[np.float64]
@@ -46,10 +46,10 @@ class Memory(NamedTuple):
     rows: NDArray[np.float64]
 
 
-def make_memory(segments: int, contacts: int) -> Memory:
+def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
     """Return memory for a thread of n segments and for so many contacts of one point or segment."""
     size = 2 * segments + 3
-    return Memory(
+    return NewtonBuffers(
         trial=np.zeros(size),
         step=np.zeros(size),
         gradient=np.zeros(size),
@@ -69,7 +69,7 @@ def assemble(
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
-    memory: Memory,
+    memory: NewtonBuffers,
     driven: bool,
     convex: bool,
 ) -> float:
@@ -114,7 +114,7 @@ def _minimise(
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
-    memory: Memory,
+    memory: NewtonBuffers,
     driven: bool,
     tolerance: float,
     search: bool,
@@ -177,7 +177,7 @@ def advance(
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
-    memory: Memory,
+    memory: NewtonBuffers,
     driven: bool,
     tolerance: float,
 ) -> tuple[int, float, float]:

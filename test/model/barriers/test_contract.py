@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.barrier import NO_OBSTACLE, Barrier
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle, Polygon, Workspace
 from magnetosuture_thread.model.barriers import (
     Compression,
     Connectivity,
@@ -29,14 +29,14 @@ def barriers(dimension: int) -> list[Barrier]:
             np.array([(-1.0, -1.5, 0.0), (0.3, -1.4, 0.1), (0.1, -0.6, -0.2), (-0.2, -0.9, 1.1)]),
             np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]),
         )
-    surroundings = Surroundings([near, far, shape], 50.0, dimension)
+    workspace = Workspace([near, far, shape], 50.0, dimension)
     return [
         Connectivity(1.0),
         EnhancedConnectivity(1.0),
         Compression(1.0),
         Compression(np.linspace(0.8, 1.0, 8)),
-        ObstacleAvoidance(surroundings, 0.05),
-        SquaredObstacleAvoidance(surroundings, 0.05),
+        ObstacleAvoidance(workspace, 0.05),
+        SquaredObstacleAvoidance(workspace, 0.05),
         Stiffness(np.linspace(1.5, 2.0, 7)),
         WallAvoidance(2.5, 0.05, 50.0),
     ]
@@ -103,7 +103,7 @@ def around_a_disc(*distances: float) -> np.ndarray:
 
 
 def test_the_edge_of_an_obstacle_is_where_its_margin_begins():
-    barrier = ObstacleAvoidance(Surroundings([Disc((0.0, 0.0), 1.0)], 5.0), 0.25)
+    barrier = ObstacleAvoidance(Workspace([Disc((0.0, 0.0), 1.0)], 5.0), 0.25)
     rows = barrier.rows(around_a_disc(1.5, 1.25, 1.0, 0.2))
     np.testing.assert_allclose(rows.value, [0.25, 0.0, -0.25, -1.05], atol=1e-15)
     # Outwards on both sides of the surface: a node inside is pushed out, not trapped.
@@ -111,18 +111,18 @@ def test_the_edge_of_an_obstacle_is_where_its_margin_begins():
 
 
 def test_the_papers_obstacle_function_has_the_same_edge_and_pushes_out_as_well():
-    barrier = SquaredObstacleAvoidance(Surroundings([Disc((0.0, 0.0), 1.0)], 5.0), 0.25)
+    barrier = SquaredObstacleAvoidance(Workspace([Disc((0.0, 0.0), 1.0)], 5.0), 0.25)
     rows = barrier.rows(around_a_disc(1.5, 1.25, 1.0, 0.2))
     np.testing.assert_allclose(rows.value, 0.5 * np.array([0.5**2, 0.25**2, 0.0, -(0.8**2)]) - 0.5 * 0.25**2)
     assert (rows.gradient[[0, 1, 3], 0, 1] > 0.0).all()
     assert (
         np.sign(rows.value)
-        == np.sign(ObstacleAvoidance(barrier.surroundings, 0.25).rows(around_a_disc(1.5, 1.25, 1.0, 0.2)).value)
+        == np.sign(ObstacleAvoidance(barrier.workspace, 0.25).rows(around_a_disc(1.5, 1.25, 1.0, 0.2)).value)
     )[[0, 2, 3]].all()
 
 
 def test_the_needle_has_a_margin_too_and_far_pairs_have_none():
-    near = Surroundings([Disc((0.0, 0.0), 1.0), Disc((9.0, 0.0), 1.0)], 2.0)
+    near = Workspace([Disc((0.0, 0.0), 1.0), Disc((9.0, 0.0), 1.0)], 2.0)
     rows = ObstacleAvoidance(near, 0.0).rows(around_a_disc(1.5, 2.5, 3.5))
     np.testing.assert_array_equal(rows.nodes, [[0], [1]])
     np.testing.assert_array_equal(rows.obstacle, [0, 0])
@@ -155,7 +155,7 @@ def test_a_wall_row_forbids_nothing_that_the_circle_allows():
 
 
 def test_no_obstacle_gives_no_rows():
-    rows = ObstacleAvoidance(Surroundings([], 1.0, 3), 0.1).rows(random_thread(3))
+    rows = ObstacleAvoidance(Workspace([], 1.0, 3), 0.1).rows(random_thread(3))
     assert rows.value.shape == (0,)
     assert rows.gradient.shape == (0, 1, 3)
 

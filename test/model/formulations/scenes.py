@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magnetosuture_thread.geometry.obstacles import Obstacle, Surroundings
+from magnetosuture_thread.geometry.obstacles import Obstacle, Workspace
 from magnetosuture_thread.model.factory import make_formulation, make_solver
 from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
 from magnetosuture_thread.model.medium import Medium
@@ -51,8 +51,8 @@ def formulated(
     wall: float = math.inf,
 ) -> Formulation:
     """Return a formulation of a thread among obstacles, in a dish of a radius; margins reach 5 cm."""
-    surroundings = Surroundings(obstacles, 0.05, dimension, wall)
-    return make_formulation(name, thread, surroundings, make_solver(solver, TOLERANCE), TOLERANCE, paper)
+    workspace = Workspace(obstacles, 0.05, dimension, wall)
+    return make_formulation(name, thread, workspace, make_solver(solver, TOLERANCE), TOLERANCE, paper)
 
 
 def east(dimension: int = 2) -> np.ndarray:

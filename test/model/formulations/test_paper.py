@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.model.barriers import Connectivity, EnhancedConnectivity, Stiffness
 from magnetosuture_thread.model.formulations import PaperFormulation, PaperOptions, ThreadState
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Vector, WideRows
@@ -49,7 +49,7 @@ def test_the_program_is_the_printed_one():
     """P = I, q = -kappa v, rows grad h' u >= -alpha h with the weights' inverses as compliances."""
     thread, solver = polyamide(), Listening()
     options = PaperOptions(gain=30.0, stiffness_gain=7.0, stiffness_weight=0.5)
-    formulation = PaperFormulation(thread, Surroundings((), 0.01), solver, TOLERANCE, options)
+    formulation = PaperFormulation(thread, Workspace((), 0.01), solver, TOLERANCE, options)
     random = np.random.default_rng(2)
     unit = thread.segment_length
     state = ThreadState(straight(thread) + 1e-4 * random.normal(size=(26, 2)), 1e-3 * random.normal(size=(26, 2)))
@@ -180,6 +180,6 @@ class Lying(Listening):
 
 def test_a_solution_is_refused_by_its_residual():
     thread = polyamide()
-    formulation = PaperFormulation(thread, Surroundings((), 0.01), Lying(), TOLERANCE)
+    formulation = PaperFormulation(thread, Workspace((), 0.01), Lying(), TOLERANCE)
     with pytest.raises(SolverError):
         formulation.step(ThreadState.at_rest(straight(thread)), lead(np.zeros(2)), DT)

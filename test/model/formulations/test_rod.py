@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Surroundings
+from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
 from magnetosuture_thread.model.formulations import (
     Formulation,
     PrescribedMotion,
@@ -376,7 +376,7 @@ class LyingSolver:
 
 def test_a_solution_is_refused_by_its_residual_whatever_the_solver_says():
     thread = polyamide()
-    formulation = RodFormulation(thread, Surroundings((), 0.01), LyingSolver(), 1e-5)
+    formulation = RodFormulation(thread, Workspace((), 0.01), LyingSolver(), 1e-5)
     with pytest.raises(SolverError, match=r"liar ended with status 'solved' and residual 2\.0e-05"):
         formulation.step(ThreadState.at_rest(straight(thread)), lead(np.zeros(2)), DT)
 
@@ -399,7 +399,7 @@ class Hidden:
 def among_discs(solver: Solver) -> RodFormulation:
     """Return a formulation of a clamped thread with two discs beside it."""
     discs = tuple(Disc((-0.009 + 0.006 * k, 0.0025), 0.0015) for k in range(2))
-    return RodFormulation(polyamide(Attachment.CLAMPED), Surroundings(discs, 0.05), solver, TOLERANCE)
+    return RodFormulation(polyamide(Attachment.CLAMPED), Workspace(discs, 0.05), solver, TOLERANCE)
 
 
 def assert_same(one: StepResult, other: StepResult) -> None:

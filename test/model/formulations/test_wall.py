@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import Surroundings
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.model.formulations import StepResult
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
@@ -116,7 +116,7 @@ def test_polyamide_along_the_rim_is_where_the_rig_has_it(attachment: Attachment)
     errors: dict[float, list[float]] = {RADIUS: [], math.inf: []}
     predictors = {}
     for wall in errors:
-        predictors[wall] = ThreadPredictor(thread, Surroundings((), 5e-3, 2, wall), residual_tolerance=TOLERANCE)
+        predictors[wall] = ThreadPredictor(thread, Workspace((), 5e-3, 2, wall), residual_tolerance=TOLERANCE)
     furthest = 0.0
     for frame in range(int(6.0 * rate)):
         tail, heading = rim_way(frame / rate, speed, 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.arc import needle_axis, needle_chord
+from magnetosuture_thread.geometry.needle_arc import needle_axis, needle_chord
 
 LENGTH = 0.007
 

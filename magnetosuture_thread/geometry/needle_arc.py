@@ -1,4 +1,4 @@
-"""Circular arcs in the plane: what a needle, straight or curved, lies along."""
+"""Geometry of the needle: a circular arc in the plane."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.polyline import Points
 
-MOST_TURN = 1.02 * np.pi  # of a needle, tail to tip [rad]; a little more than what suture needles have
+MAX_NEEDLE_TURN = 1.02 * np.pi  # of a needle, tail to tip [rad]; a little more than what suture needles have
 
 
 def needle_axis(
@@ -58,7 +58,7 @@ def needle_chord(length: float, curvature: float) -> tuple[float, NDArray[np.flo
 
 @dataclass(frozen=True)
 class NeedlePoints:
-    """Points that stand for a needle's body, seen from its tail with its heading along x.
+    """Sample points on a needle's body, in the frame of its tail with its heading along x.
 
     Driven along its chord and turned about the chord's middle, the needle moves a point by
 
@@ -77,7 +77,7 @@ class NeedlePoints:
     chord: NDArray[np.float64]
 
     def turned(self, heading: Points) -> tuple[Points, Points, NDArray[np.float64]]:
-        """Return the three for a needle with a heading, a unit vector of shape (2,)."""
+        """Return points, turning and chord for a needle with a heading, a unit vector of shape (2,)."""
         c, s = float(heading[0]), float(heading[1])
         turn = np.array([[c, s], [-s, c]])  # of rows
         return self.points @ turn, self.turning @ turn, self.chord @ turn
@@ -99,8 +99,8 @@ def needle_points(length: float, curvature: float, spacing: float) -> NeedlePoin
     return NeedlePoints(points, np.column_stack([-apart[:, 1], apart[:, 0]]), along)
 
 
-def require_needle(group: str, length: float, curvature: float) -> None:
-    """Refuse a needle that is bent beyond a half circle: its chord would not be along it any more.
+def check_needle(group: str, length: float, curvature: float) -> None:
+    """Check that a needle is bent no more than a half circle, as its chord would not be along it any more.
 
     Args:
         group: section of the settings, for the error.
@@ -110,6 +110,6 @@ def require_needle(group: str, length: float, curvature: float) -> None:
     Raises:
         ConfigurationError: the arc turns by more.
     """
-    if abs(curvature) * length > MOST_TURN:
-        expectation = f"at most {MOST_TURN / length:.0f} 1/m, a half circle for a needle of {length:g} m"
+    if abs(curvature) * length > MAX_NEEDLE_TURN:
+        expectation = f"at most {MAX_NEEDLE_TURN / length:.0f} 1/m, a half circle for a needle of {length:g} m"
         raise ConfigurationError(f"{group}.needle_curvature", curvature, expectation)

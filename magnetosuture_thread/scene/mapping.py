@@ -1,4 +1,4 @@
-"""Shapes, dishes and scenes from their descriptions in a scene file, and back."""
+"""Conversion between scenes and the content of scene files."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
-from magnetosuture_thread.scene.fields import Fields
-from magnetosuture_thread.scene.refusal import refusal
-from magnetosuture_thread.scene.scene import KINDS, MAX_NAME_CHARS, Dish, Scene, SceneShape, is_name
+from magnetosuture_thread.scene.errors import scene_error
+from magnetosuture_thread.scene.fields import ShapeFields
+from magnetosuture_thread.scene.scene import KINDS, MAX_NAME_CHARS, MAX_SHAPES, Dish, Scene, SceneShape, is_name
 from magnetosuture_thread.scene.shapes import ROUNDABLE, SHAPES
 from magnetosuture_thread.scene.text import is_number
 
@@ -29,43 +29,43 @@ def shape_from_mapping(name: str, description: Any, source: str = "") -> SceneSh
         ConfigurationError: a field is missing, unknown or out of its bounds, or the shape bounds no area.
     """
     if not isinstance(name, str) or not is_name(name):
-        raise refusal("shapes", name, f"names of 1 to {MAX_NAME_CHARS} printable characters", source)
+        raise scene_error("shapes", name, f"names of 1 to {MAX_NAME_CHARS} printable characters", source)
     if not isinstance(description, Mapping):
-        raise refusal(name, description, f"a shape, one of {', '.join(SHAPES)}", source)
+        raise scene_error(name, description, f"a shape, one of {', '.join(SHAPES)}", source)
     types = [key for key in description if key in SHAPES]
     unknown = [key for key in description if key not in (*SHAPES, "kind", "corner_radius")]
     if unknown or len(types) != 1:
         value = unknown[0] if unknown else types or "no shape"
-        raise refusal(name, value, f"kind, corner_radius and one of {', '.join(SHAPES)}", source)
+        raise scene_error(name, value, f"kind, corner_radius and one of {', '.join(SHAPES)}", source)
     type_name = types[0]
     radius = description.get("corner_radius", 0.0)
     if not is_number(radius) or not 0.0 <= radius <= MAX_CORNER_RADIUS:
-        raise refusal(f"{name}.corner_radius", radius, f"a number from 0 to {MAX_CORNER_RADIUS:g} m", source)
+        raise scene_error(f"{name}.corner_radius", radius, f"a number from 0 to {MAX_CORNER_RADIUS:g} m", source)
     if radius > 0.0 and type_name not in ROUNDABLE:
-        raise refusal(f"{name}.corner_radius", radius, f"0 m: a {type_name} has no corners", source)
-    fields = Fields(name, type_name, description[type_name], source)
+        raise scene_error(f"{name}.corner_radius", radius, f"0 m: a {type_name} has no corners", source)
+    fields = ShapeFields(name, type_name, description[type_name], source)
     kind = description.get("kind", "tissue")
     if kind not in KINDS:
-        raise refusal(f"{name}.kind", kind, f"one of {', '.join(KINDS)}", source)
+        raise scene_error(f"{name}.kind", kind, f"one of {', '.join(KINDS)}", source)
     try:
         geometry = SHAPES[type_name](fields, float(radius))
-        fields.end()
+        fields.require_all_used()
         if isinstance(geometry, Polygon):
             triangulate(geometry)
-        definition = {field: value for field, value in _plain(description).items() if field != "kind"}
+        definition = {field: value for field, value in _to_builtin(description).items() if field != "kind"}
         return SceneShape(name, kind, geometry, definition)
     except ConfigurationError as error:
         if error.source or error.name.startswith(f"{name}."):
             raise
-        raise refusal(f"{name}.{error.name}", error.value, error.expectation, source) from None
+        raise scene_error(f"{name}.{error.name}", error.value, error.expectation, source) from None
 
 
-def _plain(value: Any) -> Any:
+def _to_builtin(value: Any) -> Any:
     """Return a copy of a description in types that YAML and JSON can write, whatever numbers and lists it has."""
     if isinstance(value, Mapping):
-        return {str(name): _plain(entry) for name, entry in value.items()}
+        return {str(name): _to_builtin(entry) for name, entry in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(entry) for entry in value]
+        return [_to_builtin(entry) for entry in value]
     if isinstance(value, float):
         return float(value)
     return value
@@ -78,20 +78,20 @@ def dish_from_mapping(values: Any, source: str = "") -> Dish:
         ConfigurationError: a field is missing, unknown or out of its bounds.
     """
     if not isinstance(values, Mapping) or "diameter" not in values:
-        raise refusal("dish", values, "diameter and depth [m]", source)
+        raise scene_error("dish", values, "diameter and depth [m]", source)
     for field in values:
         if field not in ("diameter", "depth"):
-            raise refusal(f"dish.{field}", values[field], "one of diameter, depth", source)
+            raise scene_error(f"dish.{field}", values[field], "one of diameter, depth", source)
     for field, value in values.items():
         if not is_number(value):
-            raise refusal(f"dish.{field}", value, "a number [m]", source)
+            raise scene_error(f"dish.{field}", value, "a number [m]", source)
     try:
         return Dish(**{field: float(value) for field, value in values.items()})
     except ConfigurationError as error:
         raise ConfigurationError(error.name, error.value, error.expectation, source) from None
 
 
-def scene_of_parts(dish: Dish, shapes: tuple[SceneShape, ...], source: str = "") -> Scene:
+def make_scene(dish: Dish, shapes: tuple[SceneShape, ...], source: str = "") -> Scene:
     """Return a scene; an error names the file.
 
     Raises:
@@ -103,10 +103,10 @@ def scene_of_parts(dish: Dish, shapes: tuple[SceneShape, ...], source: str = "")
         raise ConfigurationError(error.name, error.value, error.expectation, source) from None
 
 
-def description_of(shape: SceneShape) -> dict[str, Any]:
+def shape_to_mapping(shape: SceneShape) -> dict[str, Any]:
     """Return a shape as a scene file describes it; one without a definition as disc or polygon."""
     if shape.definition:
-        return {**_plain(shape.definition), "kind": shape.kind}
+        return {**_to_builtin(shape.definition), "kind": shape.kind}
     geometry = shape.geometry
     if isinstance(geometry, Disc):
         return {"disc": {"center": list(geometry.centre), "radius": geometry.radius}, "kind": shape.kind}
@@ -114,3 +114,37 @@ def description_of(shape: SceneShape) -> dict[str, Any]:
     if geometry.holes:
         fields["holes"] = [[list(point) for point in hole] for hole in geometry.holes]
     return {"polygon": fields, "kind": shape.kind}
+
+
+def scene_from_mapping(content: Any, source: str = "") -> Scene:
+    """Return a scene from what a scene file holds.
+
+    Args:
+        content: the file's content.
+        source: its name, for errors.
+
+    Raises:
+        ConfigurationError: anything in it is missing, unknown or out of bounds.
+    """
+    if not isinstance(content, Mapping) or "dish" not in content:
+        raise scene_error("scene", content, "dish, and shapes by name", source)
+    for name, value in content.items():
+        if name not in ("dish", "shapes"):
+            raise scene_error(str(name), value, "dish and shapes, nothing else", source)
+    dish, shapes = dish_from_mapping(content["dish"], source), content.get("shapes")
+    if shapes is None:
+        shapes = {}
+    if not isinstance(shapes, Mapping):
+        raise scene_error("shapes", shapes, "shapes by name", source)
+    if len(shapes) > MAX_SHAPES:
+        raise scene_error("shapes", f"{len(shapes)} shapes", f"at most {MAX_SHAPES}", source)
+    made = tuple(shape_from_mapping(name, description, source) for name, description in shapes.items())
+    return make_scene(dish, made, source)
+
+
+def scene_to_mapping(scene: Scene) -> dict[str, Any]:
+    """Return what a scene file holds for a scene; a shape without a definition as disc or polygon."""
+    return {
+        "dish": {"diameter": scene.dish.diameter, "depth": scene.dish.depth},
+        "shapes": {shape.name: shape_to_mapping(shape) for shape in scene.shapes},
+    }

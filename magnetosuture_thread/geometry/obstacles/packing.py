@@ -1,4 +1,4 @@
-"""Packing: obstacles and the grids over them, in the flat arrays of the compiled query."""
+"""Packs obstacles and their grids into the flat arrays of the compiled contact query."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles.contacts import BALL, EDGES, FACES, WorkspaceData, nearest_of
 from magnetosuture_thread.geometry.obstacles.disc import Disc
 from magnetosuture_thread.geometry.obstacles.features import Features, edges_of, faces_of
-from magnetosuture_thread.geometry.obstacles.grid import Grid, fill, plan
+from magnetosuture_thread.geometry.obstacles.grid import Grid, fill_grid, plan_grid
 from magnetosuture_thread.geometry.obstacles.mesh import Mesh
-from magnetosuture_thread.geometry.obstacles.near import BALL, EDGES, FACES, SurroundingsData, nearest_of
 from magnetosuture_thread.geometry.obstacles.polygon import Polygon
-from magnetosuture_thread.geometry.obstacles.search import TOUCHING
+from magnetosuture_thread.geometry.obstacles.search import MIN_DISTANCE
 
 Obstacle = Disc | Polygon | Mesh
-"""Any shape that `Surroundings` takes."""
+"""Any shape that `Workspace` takes."""
 
-_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
-_LEAST_CELLS = 200
-_CELLS_OVER_ALL = 20_000  # of the grid that tells which obstacles are near
+_MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
+_MIN_CELLS = 200
+_MAX_OVERVIEW_CELLS = 20_000  # of the grid that tells which obstacles are near
 
 
-class _Tape:
-    """Arrays laid one after another, each known by where it begins."""
+class _FlatArray:
+    """Concatenates arrays and keeps the offset of each."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.generic]] = []
@@ -47,23 +47,25 @@ class _Tape:
         return np.concatenate([np.empty(0, kind), *self._parts]).astype(kind)
 
 
-def pack(shapes: Sequence[Obstacle], reach: float, dimension: int, wall_radius: float = math.inf) -> SurroundingsData:
+def pack_obstacles(
+    shapes: Sequence[Obstacle], reach: float, dimension: int, wall_radius: float = math.inf
+) -> WorkspaceData:
     """Return all obstacles with their grids in flat arrays.
 
-    Each obstacle has a grid of its own over its surroundings, so that its cells fit its features; a grid over
+    Each obstacle has a grid of its own over its workspace, so that its cells fit its features; a grid over
     all obstacles tells which of these a point is in, so that the far ones cost nothing.
 
     Args:
         shapes: the obstacles, all of this dimension.
-        reach: greatest distance of a contact; at least TOUCHING is taken [m].
+        reach: greatest distance of a contact; at least MIN_DISTANCE is taken [m].
         dimension: 2 or 3.
         wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
     """
     # A point on the boundary is found at reach 0 too, whichever way its distance is rounded.
-    reach = max(reach, TOUCHING)
+    reach = max(reach, MIN_DISTANCE)
     frames, tables = np.zeros((len(shapes) + 1, 6)), np.zeros((len(shapes) + 1, 8), dtype=np.int64)
     spokes = np.zeros(len(shapes) + 1, dtype=np.int64)
-    index, numbers = _Tape(), _Tape()
+    index, numbers = _FlatArray(), _FlatArray()
     low, high = np.empty((len(shapes), dimension)), np.empty((len(shapes), dimension))
     features: dict[int, Features] = {}
     for o, shape in enumerate(shapes):
@@ -77,24 +79,24 @@ def pack(shapes: Sequence[Obstacle], reach: float, dimension: int, wall_radius: 
     total = sum(len(found.corners) for found in features.values())
     for o, found in features.items():
         least, most = found.corners.min(axis=1), found.corners.max(axis=1)
-        grid = plan(least, most, reach, max(_CELLS * len(least) // total, _LEAST_CELLS))
+        grid = plan_grid(least, most, reach, max(_MAX_CELLS * len(least) // total, _MIN_CELLS))
         frames[o + 1] = _frame(grid)
         kind = EDGES if isinstance(shapes[o], Polygon) else FACES
-        cells = _add_cells(index, *fill(grid, least, most, found.corners))
+        cells = _add_cells(index, *fill_grid(grid, least, most, found.corners))
         tables[o + 1] = [kind, *grid.counts, cells, len(least), numbers.add(found.numbers), index.add(found.marks)]
         spokes[o + 1] = numbers.add(found.spokes)
         low[o], high[o] = least.min(axis=0) - grid.growth, most.max(axis=0) + grid.growth
     if shapes:
-        over = plan(low, high, 0.0, _CELLS_OVER_ALL)
+        over = plan_grid(low, high, 0.0, _MAX_OVERVIEW_CELLS)
         # The boxes are grown already: only rounding is left to allow for.
         over = dataclasses.replace(over, growth=1e-6 * over.size)
         frames[0] = _frame(over)
         tables[0, :5] = [
             -1,
             *over.counts,
-            _add_cells(index, *fill(over, low, high, np.empty((len(low), 0, dimension)))),
+            _add_cells(index, *fill_grid(over, low, high, np.empty((len(low), 0, dimension)))),
         ]
-    data = SurroundingsData(
+    data = WorkspaceData(
         reach,
         float(wall_radius),
         frames,
@@ -112,7 +114,7 @@ def _frame(grid: Grid) -> list[float]:
     return [*grid.low.tolist(), 1.0 / grid.size, grid.growth, 0.0]
 
 
-def _add_cells(index: _Tape, starts: NDArray[np.int64], entries: NDArray[np.int64]) -> int:
+def _add_cells(index: _FlatArray, starts: NDArray[np.int64], entries: NDArray[np.int64]) -> int:
     """Append entries and cells, none of them inside yet; return where the cells begin."""
     begin = index.add(entries)
     return index.add(np.stack([starts + begin, np.zeros_like(starts)], axis=1))
@@ -121,7 +123,7 @@ def _add_cells(index: _Tape, starts: NDArray[np.int64], entries: NDArray[np.int6
 @compiled
 def _mark_inside(
     obstacle: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     index: NDArray[np.int32],
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],

@@ -1,4 +1,4 @@
-"""Errors of scenes: one short line, however long or deep what was given is."""
+"""Errors of scenes, in one short line however large the value is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_VALUE_CHARS = 80
 MAX_NAME_CHARS = 120
 
 
-class _Shortened:
+class _ShortRepr:
     """A value as an error shows it: the beginning of its representation."""
 
     def __init__(self, text: str) -> None:
@@ -21,7 +21,7 @@ class _Shortened:
         return self._text
 
 
-def _representation() -> reprlib.Repr:
+def _short_repr() -> reprlib.Repr:
     made = reprlib.Repr()
     made.maxdict = made.maxlist = made.maxtuple = 3
     made.maxlevel = 3
@@ -29,10 +29,10 @@ def _representation() -> reprlib.Repr:
     return made
 
 
-_SHORT = _representation()
+_SHORT_REPR = _short_repr()
 
 
-def refusal(name: str, value: Any, expectation: str, source: str = "") -> ConfigurationError:
+def scene_error(name: str, value: Any, expectation: str, source: str = "") -> ConfigurationError:
     """Return the error for a part of a scene.
 
     Args:
@@ -41,10 +41,10 @@ def refusal(name: str, value: Any, expectation: str, source: str = "") -> Config
         expectation: what would have been accepted, with its unit.
         source: the file.
     """
-    text = _SHORT.repr(value)
+    text = _SHORT_REPR.repr(value)
     if len(text) > 2 * MAX_VALUE_CHARS:
         text = f"{text[: 2 * MAX_VALUE_CHARS]}…"
-    short = _Shortened(text) if isinstance(value, (str, list, tuple, dict)) or len(text) > MAX_VALUE_CHARS else value
+    short = _ShortRepr(text) if isinstance(value, (str, list, tuple, dict)) or len(text) > MAX_VALUE_CHARS else value
     # A name comes from a file too: control characters and line ends are shown as escapes.
     name = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in name[: MAX_NAME_CHARS + 1])
     return ConfigurationError(

@@ -1,4 +1,4 @@
-"""The compiled query: contacts of points with all obstacles around."""
+"""Contacts of points with all obstacles and the wall, compiled."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.search import Nearest, put, search_edges, search_faces
+from magnetosuture_thread.geometry.obstacles.search import Nearest, add_row, search_edges, search_faces
 from magnetosuture_thread.geometry.polyline import Points
 
 BALL, EDGES, FACES = range(3)
 """Kinds of obstacles."""
 WALL = -1
-"""Stands for the dish wall where contacts are numbered by obstacle."""
+"""Index of the dish wall in place of an obstacle's."""
 
 
-class SurroundingsData(NamedTuple):
+class WorkspaceData(NamedTuple):
     """All obstacles, packed into few arrays: each costs time when compiled code is entered. Not to be written to.
 
     Row 0 of `frames` and `tables` is the grid over all obstacles; row o + 1 belongs to obstacle o.
@@ -46,7 +46,7 @@ class SurroundingsData(NamedTuple):
 
 
 @compiled
-def cell_of(x: float, y: float, z: float, row: int, data: SurroundingsData) -> int:
+def cell_of(x: float, y: float, z: float, row: int, data: WorkspaceData) -> int:
     """Return where the cell of a point is in `entries`, or -1 when it is outside of the grid, or not a number."""
     frame, table = data.frames[row], data.tables[row]
     i, j, k = (x - frame[0]) * frame[3], (y - frame[1]) * frame[3], (z - frame[2]) * frame[3]
@@ -64,7 +64,7 @@ def nearest_of(
     obstacle: int,
     first: int,
     last: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
@@ -92,12 +92,12 @@ def nearest_of(
 
 
 @compiled
-def _ball(
+def _ball_contact(
     x: float,
     y: float,
     z: float,
     obstacle: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
@@ -112,7 +112,7 @@ def _ball(
         rx, ry, rz = rx / length, ry / length, rz / length
     else:
         rx = 1.0
-    return put(count, count, length - frame[5], rx, ry, rz, distance, outward)
+    return add_row(count, count, length - frame[5], rx, ry, rz, distance, outward)
 
 
 @compiled
@@ -130,12 +130,12 @@ def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float
 
 
 @compiled
-def _contacts(
+def _shape_contacts(
     x: float,
     y: float,
     z: float,
     obstacle: int,
-    data: SurroundingsData,
+    data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
@@ -155,9 +155,9 @@ def _contacts(
             return count
         features = int(data.tables[obstacle + 1, 5])
         found = nearest_of(x, y, z, -1.0, obstacle, -1, features, data, count, distance, outward)
-        return put(start, start, -math.sqrt(found.square), found.x, found.y, found.z, distance, outward)
+        return add_row(start, start, -math.sqrt(found.square), found.x, found.y, found.z, distance, outward)
     if found.signed < 0.0:
-        return put(start, start, found.signed, found.x, found.y, found.z, distance, outward)
+        return add_row(start, start, found.signed, found.x, found.y, found.z, distance, outward)
     if found.rows < 0 or found.signed > data.reach:
         return found.rows
     least = np.inf
@@ -165,25 +165,25 @@ def _contacts(
         least = min(least, distance[row])
     if least > found.signed * (1.0 + 1e-9) + 1e-12:
         # Between two features that rounding gave to neither.
-        return put(start, found.rows, found.signed, found.x, found.y, found.z, distance, outward)
+        return add_row(start, found.rows, found.signed, found.x, found.y, found.z, distance, outward)
     return found.rows
 
 
 @compiled
-def find_near(
+def find_contacts(
     points: Points,
-    data: SurroundingsData,
+    data: WorkspaceData,
     node: NDArray[np.int64],
     obstacle: NDArray[np.int64],
     distance: NDArray[np.float64],
     outward: NDArray[np.float64],
     nearest: NDArray[np.bool_],
 ) -> int:
-    """Write the contacts of points into the caller's arrays; see `Surroundings.near` for what they are.
+    """Write the contacts of points into the caller's arrays; see `Workspace.near` for what they are.
 
     Args:
         points: shape (m, d) [m].
-        data: `Surroundings.data`.
+        data: `Workspace.data`.
         node: index of the point, shape (c,), c rows of room.
         obstacle: index of the obstacle, `WALL` for the wall, shape (c,).
         distance: signed distance, shape (c,) [m].
@@ -203,7 +203,7 @@ def find_near(
         if inner_square < x * x + y * y < np.inf:
             wall_distance, wall_x, wall_y = wall_contact(x, y, data.wall_radius)
             before = count
-            count = put(count, count, wall_distance, wall_x, wall_y, 0.0, distance, outward)
+            count = add_row(count, count, wall_distance, wall_x, wall_y, 0.0, distance, outward)
             if count < 0:
                 return -1
             node[before], obstacle[before], nearest[before] = i, WALL, True
@@ -214,9 +214,9 @@ def find_near(
             o = int(data.entries[slot])
             start = count
             if data.tables[o + 1, 0] == BALL:
-                count = _ball(x, y, z, o, data, count, distance, outward)
+                count = _ball_contact(x, y, z, o, data, count, distance, outward)
             else:
-                count = _contacts(x, y, z, o, data, count, distance, outward)
+                count = _shape_contacts(x, y, z, o, data, count, distance, outward)
             if count < 0:
                 return -1
             best = start

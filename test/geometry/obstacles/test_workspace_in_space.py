@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Surroundings, closest_on_triangles
+from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Workspace, closest_on_triangles
 from magnetosuture_thread.geometry.obstacles.features import faces_of
 
 CORNERS = 0.01 * np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
@@ -65,7 +65,7 @@ def test_a_cube(reach: float, splits: int):
     # Also on a lattice: above edges, diagonals and vertices of faces.
     lattice = np.stack(np.meshgrid(*[np.linspace(-0.005, 0.015, 9)] * 3), axis=-1).reshape(-1, 3)
     points = np.vstack([random.uniform(-0.02, 0.03, (2000, 3)), lattice])
-    contacts = Surroundings([mesh], reach, 3).near(points)
+    contacts = Workspace([mesh], reach, 3).near(points)
     true = cube_distance(points)
     # A convex solid has one local minimum.
     assert contacts.node.tolist() == np.flatnonzero(true <= max(reach, 1e-12)).tolist()
@@ -86,14 +86,14 @@ def test_a_ball(reach: float):
     mesh, radius = ball(0.01, 3), 0.01
     points = np.random.default_rng(1).uniform(-0.02, 0.02, (3000, 3))
     centre = np.linalg.norm(points, axis=1)
-    contacts = Surroundings([mesh], reach, 3).near(points)
+    contacts = Workspace([mesh], reach, 3).near(points)
     flat = radius * 0.006  # how far the faces are below the sphere at most
     assert set(np.flatnonzero(centre - radius < reach - flat).tolist()) <= set(contacts.node.tolist())
     assert ((centre - radius)[contacts.node] <= reach + flat).all()
     assert len(set(contacts.node.tolist())) == len(contacts)
     np.testing.assert_allclose(contacts.distance, (centre - radius)[contacts.node], atol=flat)
     # The exact ball beside it.
-    exact = Surroundings([Disc((0.0, 0.0, 0.0), radius)], reach, 3).near(points)
+    exact = Workspace([Disc((0.0, 0.0, 0.0), radius)], reach, 3).near(points)
     distance, outward = Disc((0.0, 0.0, 0.0), radius).signed_distance(points[exact.node])
     np.testing.assert_allclose(exact.distance, distance, atol=1e-15)
     np.testing.assert_allclose(exact.outward, outward, atol=1e-12)
@@ -106,8 +106,8 @@ def test_an_inner_corner_is_two_contacts_and_an_inner_edge_none():
     vertices = np.vstack([np.hstack([flat, np.zeros((6, 1))]), np.hstack([flat, np.full((6, 1), 0.02)])])
     sides = [f for i in range(6) for j in [(i + 1) % 6] for f in ([i, j, j + 6], [i, j + 6, i + 6])]
     mesh = Mesh(vertices, np.vstack([caps[:, ::-1], caps + 6, sides]))
-    surroundings = Surroundings([mesh], 0.005, 3)
-    contacts = surroundings.near(np.array([[0.013, 0.012, 0.0101], [0.009, 0.009, 0.01], [0.012, 0.02, 0.005]]))
+    workspace = Workspace([mesh], 0.005, 3)
+    contacts = workspace.near(np.array([[0.013, 0.012, 0.0101], [0.009, 0.009, 0.01], [0.012, 0.02, 0.005]]))
     assert contacts.node.tolist() == [0, 0, 1, 2]
     assert sorted(np.round(contacts.distance[:2], 12).tolist()) == [0.002, 0.003]
     assert contacts.nearest.tolist().count(True) == 3
@@ -121,9 +121,9 @@ def test_a_hollow_is_outside():
         np.vstack([3.0 * (CUBE.vertices - 0.005), CUBE.vertices - 0.005]),
         np.vstack([CUBE.faces, CUBE.faces[:, ::-1] + 8]),
     )
-    surroundings = Surroundings([shell], 0.001, 3)
+    workspace = Workspace([shell], 0.001, 3)
     points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0045], [0.0, 0.001, 0.009], [0.0, 0.0, 0.0155], [1.0, 1.0, 1.0]])
-    contacts = surroundings.near(points)
+    contacts = workspace.near(points)
     assert contacts.node.tolist() == [1, 2, 3]
     np.testing.assert_allclose(contacts.distance, [0.0005, -0.004, 0.0005])
 
@@ -145,7 +145,7 @@ def test_a_body_of_bumps_and_dents_by_definition(reach: float):
         round_.vertices * (1.0 + 0.3 * np.sin(5.0 * np.arctan2(y, x)) * np.cos(300.0 * z))[:, None], round_.faces
     )
     points = np.random.default_rng(2).uniform(-0.016, 0.016, (400, 3))
-    contacts = Surroundings([mesh], reach, 3).near(points)
+    contacts = Workspace([mesh], reach, 3).near(points)
     feet = closest_on_triangles(points, mesh.vertices, mesh.faces)
     distance = np.linalg.norm(points[:, None] - feet, axis=2)
     inside = winding(mesh, points) > 0.5

@@ -1,4 +1,4 @@
-"""Surroundings: all obstacles around a thread, ready to be asked for what is near."""
+"""Workspace: the dish wall and all obstacles, and the contacts of points with them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
 from magnetosuture_thread.geometry.obstacles.disc import Disc
 from magnetosuture_thread.geometry.obstacles.mesh import Mesh
-from magnetosuture_thread.geometry.obstacles.near import find_near
-from magnetosuture_thread.geometry.obstacles.pack import Obstacle, pack
+from magnetosuture_thread.geometry.obstacles.packing import Obstacle, pack_obstacles
 from magnetosuture_thread.geometry.obstacles.polygon import Polygon
 from magnetosuture_thread.geometry.polyline import Points
 
-_ROOM = 256  # contacts that `near` has room for at first
+_INITIAL_ROWS = 256  # contacts that `near` has room for at first
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Contacts:
         return len(self.node)
 
 
-class Surroundings:
+class Workspace:
     """Obstacles that do not move and the round wall of the dish about the origin, and what of them is near.
 
     Args:
@@ -57,7 +57,7 @@ class Surroundings:
         reach: greatest distance at which a boundary is near [m].
         dimension: 2 or 3.
         wall_radius: inner radius of the wall [m].
-        data: the same for compiled code, see `find_near`.
+        data: the same for compiled code, see `find_contacts`.
 
     Raises:
         ConfigurationError: when a shape is not of this dimension, or a number is not in its bounds.
@@ -67,19 +67,19 @@ class Surroundings:
         self, shapes: Sequence[Obstacle], reach: float, dimension: int = 2, wall_radius: float = math.inf
     ) -> None:
         if dimension not in (2, 3):
-            raise ConfigurationError("surroundings.dimension", dimension, "2 or 3")
+            raise ConfigurationError("workspace.dimension", dimension, "2 or 3")
         if not (math.isfinite(reach) and reach >= 0.0):
-            raise ConfigurationError("surroundings.reach", reach, "a number of at least 0 m")
+            raise ConfigurationError("workspace.reach", reach, "a number of at least 0 m")
         if not wall_radius > 0.0:
-            raise ConfigurationError("surroundings.wall_radius", wall_radius, "a number above 0 m, or inf")
+            raise ConfigurationError("workspace.wall_radius", wall_radius, "a number above 0 m, or inf")
         self.shapes = tuple(shapes)
         self.reach = float(reach)
         self.dimension = dimension
         self.wall_radius = float(wall_radius)
         for i, shape in enumerate(self.shapes):
-            _check(f"surroundings.shapes[{i}]", shape, dimension)
-        self.data = pack(self.shapes, self.reach, dimension, self.wall_radius)
-        self._room = _ROOM
+            _check(f"workspace.shapes[{i}]", shape, dimension)
+        self.data = pack_obstacles(self.shapes, self.reach, dimension, self.wall_radius)
+        self._max_rows = _INITIAL_ROWS
 
     def near(self, points: Points) -> Contacts:
         """Return the contacts of points: every local minimum of the distance to an obstacle's boundary.
@@ -105,13 +105,13 @@ class Surroundings:
         if points.ndim != 2 or points.shape[1] != self.dimension:
             raise ValueError(f"points of shape {points.shape}, expected (m, {self.dimension})")
         while True:
-            node, obstacle = np.empty(self._room, np.int64), np.empty(self._room, np.int64)
-            distance, outward = np.empty(self._room), np.empty((self._room, self.dimension))
-            nearest = np.empty(self._room, np.bool_)
-            count = find_near(points, self.data, node, obstacle, distance, outward, nearest)
+            node, obstacle = np.empty(self._max_rows, np.int64), np.empty(self._max_rows, np.int64)
+            distance, outward = np.empty(self._max_rows), np.empty((self._max_rows, self.dimension))
+            nearest = np.empty(self._max_rows, np.bool_)
+            count = find_contacts(points, self.data, node, obstacle, distance, outward, nearest)
             if count >= 0:
                 break
-            self._room *= 2
+            self._max_rows *= 2
         found = [array[:count].copy() for array in (node, obstacle, distance, outward, nearest)]
         for array in found:
             array.setflags(write=False)

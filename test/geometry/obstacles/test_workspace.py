@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Surroundings, find_near
+from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Workspace, find_contacts
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 # An L: its only reflex corner is (0.01, 0.01).
@@ -62,7 +62,7 @@ def test_contacts_of_random_stars(seed: int, vertices: int, hole: bool, reach: f
     polygon = star(seed, vertices, hole)
     points = np.random.default_rng(seed + 1).uniform([-0.06, -0.09], [0.08, 0.05], (120, 2))
     points = np.vstack([points, np.random.default_rng(seed + 2).uniform([0.0, -0.03], [0.02, -0.01], (30, 2))])
-    contacts = Surroundings([polygon], reach).near(points)
+    contacts = Workspace([polygon], reach).near(points)
     true = signed(polygon, points)
     assert set(contacts.node.tolist()) == set(np.flatnonzero(true <= reach).tolist())
     nearest = contacts.nearest
@@ -85,7 +85,7 @@ def test_contacts_of_random_stars(seed: int, vertices: int, hole: bool, reach: f
 def test_outward_is_the_gradient(seed: int, hole: bool):
     polygon = star(seed, 12, hole)
     points = np.random.default_rng(seed).uniform([-0.06, -0.09], [0.08, 0.05], (60, 2))
-    contacts = Surroundings([polygon], 0.2).near(points)
+    contacts = Workspace([polygon], 0.2).near(points)
     outward = contacts.outward[contacts.nearest]
     step = 1e-7
     slopes = [(signed(polygon, points + e) - signed(polygon, points - e)) / (2.0 * step) for e in step * np.eye(2)]
@@ -99,7 +99,7 @@ def test_a_wall_of_many_edges_is_one_contact():
     turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
     x = np.linspace(0.0, 0.05, 101)
     outline = np.vstack([np.stack([x, 0.0 * x], 1), np.stack([x[::-1], 0.0 * x + 0.002], 1)]) @ turn.T + 0.03
-    wall = Surroundings([Polygon(tuple(map(tuple, outline.tolist())))], 0.01)
+    wall = Workspace([Polygon(tuple(map(tuple, outline.tolist())))], 0.01)
     along = np.concatenate([x[1:-1], np.random.default_rng(0).uniform(0.001, 0.049, 500)])
     for above in (0.0, 1e-9, 0.003, 0.009):
         points = np.stack([along, 0.002 + above + 0.0 * along], 1) @ turn.T + 0.03
@@ -112,7 +112,7 @@ def test_a_wall_of_many_edges_is_one_contact():
 
 
 def test_a_concave_corner_is_two_contacts():
-    contacts = Surroundings([CORNER], 0.005).near(np.array([[0.013, 0.012], [0.012, 0.02], [0.01, 0.01]]))
+    contacts = Workspace([CORNER], 0.005).near(np.array([[0.013, 0.012], [0.012, 0.02], [0.01, 0.01]]))
     assert contacts.node.tolist()[:3] == [0, 0, 1]
     assert sorted(np.round(contacts.distance[:2], 12).tolist()) == [0.002, 0.003]
     assert contacts.nearest[:2].sum() == 1
@@ -124,7 +124,7 @@ def test_a_concave_corner_is_two_contacts():
 
 @pytest.mark.parametrize("reach", [0.0, 1e-4, 0.004, 1.0])
 def test_a_hole_is_outside_and_the_deep_inside_is_never_free(reach: float):
-    ring = Surroundings([RING], reach)
+    ring = Workspace([RING], reach)
     contacts = ring.near(np.array([[0.0, 0.001], [0.015, 0.001], [0.0099, 0.0], [0.03, 0.0], [1.5, 0.0]]))
     assert (contacts.distance[contacts.node == 1]).tolist() == pytest.approx([-0.005])
     assert len(contacts.distance[contacts.node == 0]) == (4 if reach == 1.0 else 0)
@@ -134,7 +134,7 @@ def test_a_hole_is_outside_and_the_deep_inside_is_never_free(reach: float):
 
 def test_on_the_boundary_the_direction_is_the_normal():
     points = np.array([[0.005, 0.0], [0.01, 0.01], [0.01, 0.005]])
-    contacts = Surroundings([SQUARE], 0.0).near(points)
+    contacts = Workspace([SQUARE], 0.0).near(points)
     assert contacts.node.tolist() == [0, 1, 2]
     assert contacts.distance.tolist() == [0.0, 0.0, 0.0]
     np.testing.assert_allclose(contacts.outward, [[0.0, -1.0], [np.sqrt(0.5), np.sqrt(0.5)], [1.0, 0.0]])
@@ -146,8 +146,8 @@ def test_a_needle_and_a_notch_keep_their_signs():
     needle = Polygon(((0.0, -tip), (0.05, 0.0), (0.0, tip)))
     notched = Polygon(((0.0, -0.01), (0.02, -0.01), (0.02, -tip), (depth, 0.0), (0.02, tip), (0.02, 0.01), (0.0, 0.01)))
     points = np.array([[0.051, 0.0], [0.051, 0.001], [0.025, 1e-4], [0.025, -1e-4]])
-    assert Surroundings([needle], 0.01).near(points).distance.min() > 0.0
-    inside = Surroundings([notched], 0.02).near(np.array([[0.008, 0.0], [0.0099, 0.001], [0.015, -0.001]]))
+    assert Workspace([needle], 0.01).near(points).distance.min() > 0.0
+    inside = Workspace([notched], 0.02).near(np.array([[0.008, 0.0], [0.0099, 0.001], [0.015, -0.001]]))
     np.testing.assert_allclose(inside.distance, [-0.002, -np.hypot(1e-4, 1e-3), -0.001], rtol=1e-6)
 
 
@@ -158,7 +158,7 @@ def test_discs_polygons_and_order():
         Polygon(((0.02, 0.0), (0.03, 0.0), (0.03, 0.01), (0.02, 0.01))),
     ]
     points = np.array([[0.0125, 0.005], [np.nan, 0.005], [0.015, 0.005], [0.5, 0.5], [0.018, 0.005]])
-    contacts = Surroundings(shapes, 0.003).near(points)
+    contacts = Workspace(shapes, 0.003).near(points)
     assert contacts.node.tolist() == [0, 0, 2, 4, 4]
     assert contacts.obstacle.tolist() == [0, 1, 1, 1, 2]
     np.testing.assert_allclose(contacts.distance, [0.0025, 0.0005, -0.002, 0.001, 0.002])
@@ -172,39 +172,39 @@ def test_far_obstacles_of_any_scale_change_nothing():
     near = star(3, 30, True)
     far = [Polygon(tuple((x + 0.5 + 0.1 * i, y - 9.0) for x, y in SQUARE.outline)) for i in range(40)]
     points = np.random.default_rng(4).uniform([-0.06, -0.09], [0.08, 0.05], (300, 2))
-    alone, among = Surroundings([near], 0.004).near(points), Surroundings([near, *far], 0.004).near(points)
+    alone, among = Workspace([near], 0.004).near(points), Workspace([near, *far], 0.004).near(points)
     assert alone.node.tolist() == among.node.tolist()
     np.testing.assert_array_equal(alone.distance, among.distance)
 
 
 def test_too_small_arrays_are_told():
-    ring = Surroundings([RING], 1.0)
+    ring = Workspace([RING], 1.0)
     points = np.zeros((200, 2))
     room = (np.empty(9, np.int64), np.empty(9, np.int64), np.empty(9), np.empty((9, 2)), np.empty(9, np.bool_))
-    assert find_near(points, ring.data, *room) == -1
-    assert find_near(points[:2], ring.data, *room) == 8
+    assert find_contacts(points, ring.data, *room) == -1
+    assert find_contacts(points[:2], ring.data, *room) == 8
     assert len(ring.near(points)) == 800
 
 
 def test_the_wall_is_a_contact_of_its_own_before_the_obstacles():
     points = np.array([[0.0, 0.0], [0.045, 0.0], [0.0, -0.06], [np.nan, 0.0], [np.inf, 0.0]])
-    contacts = Surroundings([Disc((0.044, 0.0), 1e-3)], 0.01, wall_radius=0.05).near(points)
+    contacts = Workspace([Disc((0.044, 0.0), 1e-3)], 0.01, wall_radius=0.05).near(points)
     np.testing.assert_array_equal(contacts.node, [1, 1, 2])
     np.testing.assert_array_equal(contacts.obstacle, [WALL, 0, WALL])
     np.testing.assert_allclose(contacts.distance, [0.005, 0.0, -0.01], atol=1e-15)
     np.testing.assert_allclose(contacts.outward[[0, 2]], [[-1.0, 0.0], [0.0, 1.0]], atol=1e-15)
     assert contacts.nearest.all()
-    centre = Surroundings([], 0.1, 3, 0.05).near(np.array([[0.0, 0.0, 0.7]]))
+    centre = Workspace([], 0.1, 3, 0.05).near(np.array([[0.0, 0.0, 0.7]]))
     assert centre.distance.tolist() == [0.05]
     room = (np.empty(1, np.int64), np.empty(1, np.int64), np.empty(1), np.empty((1, 2)), np.empty(1, np.bool_))
-    data = Surroundings([], 0.01, wall_radius=0.05).data
-    assert find_near(points[1:2], data, *room) == 1
-    assert find_near(points[1:3], data, *room) == -1
+    data = Workspace([], 0.01, wall_radius=0.05).data
+    assert find_contacts(points[1:2], data, *room) == 1
+    assert find_contacts(points[1:3], data, *room) == -1
 
 
 def test_nothing_is_near_nothing():
-    assert len(Surroundings([], 0.01).near(np.zeros((3, 2)))) == 0
-    assert len(Surroundings([SQUARE], 0.01).near(np.zeros((0, 2)))) == 0
+    assert len(Workspace([], 0.01).near(np.zeros((3, 2)))) == 0
+    assert len(Workspace([SQUARE], 0.01).near(np.zeros((0, 2)))) == 0
 
 
 @pytest.mark.parametrize(
@@ -222,15 +222,15 @@ def test_nothing_is_near_nothing():
 )  # fmt: skip
 def test_shapes_must_fit(shapes, reach: float, dimension: int, reason: str):
     with pytest.raises(ConfigurationError, match=reason):
-        Surroundings(shapes, reach, dimension)
+        Workspace(shapes, reach, dimension)
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, np.nan])
 def test_a_wall_must_have_a_radius(radius: float):
     with pytest.raises(ConfigurationError, match="wall_radius"):
-        Surroundings([], 0.1, 2, radius)
+        Workspace([], 0.1, 2, radius)
 
 
 def test_points_must_fit():
     with pytest.raises(ValueError, match="expected"):
-        Surroundings([SQUARE], 0.1).near(np.zeros((1, 3)))
+        Workspace([SQUARE], 0.1).near(np.zeros((1, 3)))

@@ -1,0 +1,228 @@
+"""Strict parsing and encoding of mcap records, and of chunks with their checksums.
+
+The package `mcap` accepts short reads and trailing bytes. Here a record must be as long as its header says, which is
+how a corrupt header is noticed.
+
+Source: the MCAP specification, https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from io import BytesIO
+from typing import Any, BinaryIO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
+RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of the content
+MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
+MIN_PRIVATE_OPCODE = 0x80
+MAX_CHUNK_BYTES = 1 << 30  # of a chunk in memory, compressed or not
+
+_READERS: dict[int, Callable[[ReadDataStream], Any]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.MESSAGE_INDEX: MessageIndex.read,
+    Opcode.CHUNK_INDEX: ChunkIndex.read,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
+    Opcode.STATISTICS: Statistics.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.METADATA_INDEX: MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: SummaryOffset.read,
+    Opcode.DATA_END: DataEnd.read,
+}
+# First and last time, uncompressed size, its checksum, length of the compression's name.
+_CHUNK_HEADER = struct.Struct("<QQQII")
+_LENGTH = struct.Struct("<Q")
+_READ_BYTES = 1 << 20  # decompressed at a time where the size is not known in advance
+# Opcode, length of less than a terabyte, times, size and checksum, a known compression.
+_CHUNK_PATTERN = re.compile(rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}", re.DOTALL)
+_WINDOW_BYTES = 1 << 22
+_OVERLAP_BYTES = 64  # longer than a match of the pattern
+_lz4 = import_module("lz4.frame")  # which has no types
+
+
+class CorruptRecordError(Exception):
+    """Bytes that are no valid record; the text says what is wrong."""
+
+
+def is_opcode(opcode: int) -> bool:
+    """Return whether the format defines an opcode, or leaves it to private use."""
+    return Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= MIN_PRIVATE_OPCODE
+
+
+def parse_record(opcode: int, body: bytes) -> Any:
+    """Return a record of the package `mcap`, or None where its content is not needed.
+
+    Raises:
+        CorruptRecordError: the bytes are no such record.
+    """
+    reader = _READERS.get(opcode)
+    if reader is None:
+        return None
+    stream = ReadDataStream(BytesIO(body))
+    name = Opcode(opcode).name.lower().replace("_", " ")
+    try:
+        record = reader(stream)
+    except (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError):
+        raise CorruptRecordError(f"a corrupt {name}") from None
+    if stream.count != len(body):
+        raise CorruptRecordError(f"a {name} of a wrong length")
+    return record
+
+
+def iterate_records(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, start and end of the body of each record of a chunk.
+
+    Raises:
+        CorruptRecordError: the records do not fill the chunk exactly.
+    """
+    position, size = 0, len(content)
+    while position < size:
+        if position + RECORD_HEADER.size > size:
+            raise CorruptRecordError("a chunk with a corrupt record")
+        opcode, length = RECORD_HEADER.unpack_from(content, position)
+        start = position + RECORD_HEADER.size
+        position = start + length
+        if position > size or (opcode == Opcode.MESSAGE and length < MESSAGE_HEADER.size):
+            raise CorruptRecordError("a chunk with a corrupt record")
+        yield opcode, start, position
+
+
+def encode_records(*records: McapRecord) -> bytes:
+    """Return records as they are in a file."""
+    builder: Any = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()
+    return data
+
+
+class ChunkContent(NamedTuple):
+    """A chunk, decompressed.
+
+    Attributes:
+        data: its records.
+        crc: their checksum, computed.
+        has_checksum: whether the chunk has a checksum; if so, it equals `crc`.
+        compression: `zstd`, `lz4` or empty.
+    """
+
+    data: bytes
+    crc: int
+    has_checksum: bool
+    compression: str
+
+
+def decompress_chunk(body: bytes) -> ChunkContent:
+    """Return the content of a chunk and verify its checksum.
+
+    Args:
+        body: of the chunk's record.
+
+    Raises:
+        CorruptRecordError: it is no chunk, cannot be decompressed, or its checksum is wrong.
+    """
+    if len(body) < _CHUNK_HEADER.size:
+        raise CorruptRecordError("a corrupt chunk")
+    _, _, size, crc, name_length = _CHUNK_HEADER.unpack_from(body)
+    start = _CHUNK_HEADER.size + name_length + _LENGTH.size
+    if start > len(body) or start + _LENGTH.unpack_from(body, start - _LENGTH.size)[0] != len(body):
+        raise CorruptRecordError("a corrupt chunk")
+    compression = body[_CHUNK_HEADER.size : _CHUNK_HEADER.size + name_length]
+    if size > MAX_CHUNK_BYTES:
+        raise CorruptRecordError(f"a chunk that claims {size} bytes")
+    data = _decompress(compression, body[start:], size)
+    if len(data) != size:
+        raise CorruptRecordError("a chunk of a wrong size")
+    found = zlib.crc32(data)
+    if crc and found != crc:
+        raise CorruptRecordError("a chunk with a wrong checksum")
+    return ChunkContent(data, found, bool(crc), compression.decode())
+
+
+def _decompress(compression: bytes, compressed: bytes, size: int) -> bytes:
+    """Return the data, but at most a byte more than the size that the chunk claims."""
+    if not compression:
+        return compressed
+    try:
+        if compression == b"lz4":
+            data: bytes = _lz4.LZ4FrameDecompressor().decompress(compressed, max_length=size + 1)
+            return data
+        if compression == b"zstd":
+            if zstandard.frame_content_size(compressed) == size:
+                return zstandard.ZstdDecompressor().decompress(compressed)
+            parts, count = [], 0
+            with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
+                while count <= size and (part := stream.read(_READ_BYTES)):
+                    parts.append(part)
+                    count += len(part)
+            return b"".join(parts)
+    except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError):
+        raise CorruptRecordError("a chunk that cannot be decompressed") from None
+    raise CorruptRecordError("a chunk of an unknown compression")
+
+
+def find_chunk(stream: BinaryIO, position: int, limit: int, before: int) -> int | None:
+    """Return where the next chunk with a correct checksum begins; None if there is none.
+
+    A chunk without a checksum does not count: it cannot be told from message data that looks like one.
+
+    Args:
+        stream: the file.
+        position: where the search begins.
+        limit: where the data ends.
+        before: the chunk must begin before this position.
+    """
+    while position < before:
+        stream.seek(position)
+        window = stream.read(min(_WINDOW_BYTES, limit - position))
+        at = 0
+        while (match := _CHUNK_PATTERN.search(window, at)) is not None and position + match.start() < before:
+            if is_intact_chunk(stream, position + match.start(), limit):
+                return position + match.start()
+            at = match.start() + 1
+        if match is not None or len(window) < _WINDOW_BYTES:
+            return None
+        position += len(window) - _OVERLAP_BYTES
+    return None
+
+
+def is_intact_chunk(stream: BinaryIO, position: int, limit: int) -> bool:
+    """Return whether a chunk with a correct checksum begins at a position."""
+    stream.seek(position)
+    _, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
+    if length > MAX_CHUNK_BYTES or position + RECORD_HEADER.size + length > limit:
+        return False
+    try:
+        content = decompress_chunk(stream.read(length))
+        for _ in iterate_records(content.data):
+            pass
+    except CorruptRecordError:
+        return False
+    return content.has_checksum
