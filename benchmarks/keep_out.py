@@ -23,7 +23,7 @@ import numpy as np
 import shapely
 from rich.console import Console
 
-from magnetosuture_thread.cli.terminal import sayer
+from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.coils.bridge import CoilBridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
@@ -395,7 +395,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     }
     if math.isinf(total.deepest):
         figures["deepest"] = None  # the needle was never near; JSON has no infinity
-    sayer(console)(
+    make_log(console)(
         f"{total.seconds:.0f} s in {total.episodes} episodes, {total.steps} steps, {total.stalls} stalls: "
         f"{total.violations} violations beyond {1e6 * TOLERANCE:g} um, deepest {1e6 * total.deepest:.4f} um"
     )

@@ -48,7 +48,7 @@ OPERATOR_COMMAND = Channel("operator/servo_cv", "geometry_msgs/msg/TwistStamped"
 FILTER_STATE = Channel("needle/filter_state", "magnetosuture_msgs/msg/FilterState")
 NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
 NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
-SEEN_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
+MEASURED_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
 PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
 MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
 THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
@@ -69,8 +69,8 @@ LOAD_SCENE, ADD_SHAPE, REPLACE_SHAPE, REMOVE_SHAPE = "scene/load", "scene/add", 
 PAUSE_REPLAY, PAUSE_RIG = "replay/pause", "rig/pause"
 
 # What only a simulation knows; never an input of the graph.
-TRUTH_NEEDLE = Channel("ground_truth/needle", "geometry_msgs/msg/PoseStamped")
-TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path")
+GROUND_TRUTH_NEEDLE = Channel("ground_truth/needle", "geometry_msgs/msg/PoseStamped")
+GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path")
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 

@@ -12,9 +12,9 @@ import pytest
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.setups import read_setup
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -43,13 +43,13 @@ def view() -> DishView:
 @pytest.fixture(scope="session")
 def camera() -> DishCamera:
     """A camera over an empty dish."""
-    return DishCamera(Scene(), VIEW, seed=5)
+    return DishCamera(CameraScene(), VIEW, seed=5)
 
 
 @pytest.fixture(scope="session")
 def camera_with_post() -> DishCamera:
     """A camera over a dish with a post."""
-    return DishCamera(Scene(obstacles=[POST]), VIEW, seed=6)
+    return DishCamera(CameraScene(obstacles=[POST]), VIEW, seed=6)
 
 
 @pytest.fixture
@@ -72,5 +72,5 @@ def straight_pull() -> ReferenceTrajectory:
 def short_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceTrajectory) -> Path:
     """Return a bag of one second."""
     path = tmp_path_factory.mktemp("short") / "pull"
-    record(straight_pull, read_setup("petri_35mm_polyamide"), path, duration=1.0)
+    render_bag(straight_pull, read_setup("petri_35mm_polyamide"), path, duration=1.0)
     return path

@@ -28,7 +28,7 @@ def test_help_names_every_command_and_the_exit_codes():
     assert shown.returncode == 0
     for words in (
         "replay",
-        "record",
+        "render",
         "simulate",
         "reproduce",
         "track",
@@ -62,8 +62,8 @@ def test_help_waits_for_no_package_of_a_command():
     ("name", "option"),
     [
         ("replay", "--output"),
-        ("record", "--output"),
-        ("simulate", "--pace"),
+        ("render", "--output"),
+        ("simulate", "--rate"),
         ("reproduce", "thread-behavior"),
         ("reproduce hernia", "--animation"),
         ("reproduce thread-behavior", "--output"),
@@ -91,11 +91,11 @@ def test_every_command_has_help(name: str, option: str, capsys: pytest.CaptureFi
         ["replay", "bag"],
         ["replay", "bag", "--output", "out", "--rate", "fast"],
         ["replay", "bag", "--output", "out", "--rate", "nan"],
-        ["record", "r.npz", "--output", "out"],
-        ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--seed", "-1"],
-        ["record", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--quality", "0"],
+        ["render", "r.npz", "--output", "out"],
+        ["render", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--seed", "-1"],
+        ["render", "r.npz", "--output", "out", "--setup", "petri_35mm_polyamide", "--quality", "0"],
         ["simulate", "petri_35mm_polyamide"],
-        ["simulate", "petri_35mm_polyamide", "--output", "out", "--pace", "0"],
+        ["simulate", "petri_35mm_polyamide", "--output", "out", "--rate", "0"],
         ["simulate", "petri_35mm_polyamide", "--output", "out", "--duration", "-1"],
         ["reproduce"],
         ["reproduce", "hernia", "--output", "out"],
@@ -124,9 +124,9 @@ def test_wrong_use_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]
     [
         (["replay", "nowhere"], 1, "error: nowhere: does not exist"),
         (["replay", "x" * 300], 1, "error: " + "x" * 300 + ": cannot be read"),
-        (["record", "no.npz", "--setup", "petri_35mm_polyamide"], 1, "error: no.npz: does not exist"),
-        (["record", "no.npz", "--setup", "petri_35cm"], 2, "error: set-up: got 'petri_35cm'"),
-        (["record", "no.npz", "--setup", "x" * 300], 2, "error: set-up: got 'xxx"),
+        (["render", "no.npz", "--setup", "petri_35mm_polyamide"], 1, "error: no.npz: does not exist"),
+        (["render", "no.npz", "--setup", "petri_35cm"], 2, "error: set-up: got 'petri_35cm'"),
+        (["render", "no.npz", "--setup", "x" * 300], 2, "error: set-up: got 'xxx"),
     ],
 )
 def test_a_failed_job_is_one_line(tmp_path: Path, monkeypatch, capsys, arguments: list[str], code: int, words: str):

@@ -15,7 +15,7 @@ from rich.console import Console
 from benchmarks.bridge.measurements import measure_bridge
 from benchmarks.bridge.report import bridge_table
 from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import progress, sayer
+from magnetosuture_thread.cli.terminal import make_log, progress
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +33,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Time the bridge; return the figures."""
     with progress(console, "bridge") as advance:
-        report = measure_bridge(options.trials, options.kills, options.hostile, say=sayer(console), progress=advance)
+        report = measure_bridge(options.trials, options.kills, options.hostile, log=make_log(console), progress=advance)
     console.print(bridge_table(report))
     return report.to_json(), True

@@ -31,12 +31,12 @@ BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
 MOVING = 0.3  # s for which the coils must be driven before something is killed
 ATTEMPTS = 7  # to arm
 HEARD = 10.0  # s for a process to start and to be heard
-PATIENCE = 30.0  # s for anything to happen
+TIMEOUT = 30.0  # s for anything to happen
 LOOP = 12.0  # s over which the loop's period is looked at; the bridge keeps the last 2000 intervals
 FULL = 32767
 SUPPLY, RESISTANCE, INDUCTANCE = 24.0, 1.0, 0.005  # V, ohm, H of the simulated boards and coils
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 class BridgeBench:
@@ -82,7 +82,7 @@ class BridgeBench:
         self.start("commander", burst=BURST, pause=PAUSE)
         log = self._logs / "commander.log"
         delays: list[float] = []
-        deadline = time.monotonic() + PATIENCE + 4.0 * trials * (BURST + PAUSE)
+        deadline = time.monotonic() + TIMEOUT + 4.0 * trials * (BURST + PAUSE)
         while len(delays) < trials:
             time.sleep(0.2)
             self._watch.look()
@@ -120,7 +120,7 @@ class BridgeBench:
         time.sleep(2.0 * SILENCE_TIMEOUT)
         self._watch.forget()
         self.start("fuzzer", count=count)
-        self._wait(lambda: self._nodes.ended("fuzzer"), "the fuzzer to end", PATIENCE + count / 200.0)
+        self._wait(lambda: self._nodes.ended("fuzzer"), "the fuzzer to end", TIMEOUT + count / 200.0)
         self._nodes.kill("fuzzer")  # whose work is done
         self._watch.look()
         greatest = self._watch.largest / FULL * SUPPLY / RESISTANCE
@@ -170,7 +170,7 @@ class BridgeBench:
     def _driven_for_a_while(self) -> bool:
         return self._driven() and time.monotonic() - self._watch.turns[-1][0] > MOVING
 
-    def _wait(self, condition: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
+    def _wait(self, condition: Callable[[], bool], what: str, patience: float = TIMEOUT) -> None:
         deadline = time.monotonic() + patience
         while not condition():
             time.sleep(0.01)
@@ -187,7 +187,7 @@ def measure_bridge(
     kills: int,
     hostile: int,
     busy: bool = True,
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Callable[[float], None] = lambda s: None,
 ) -> BridgeReport:
     """Measure a coil bridge that drives simulated RoboClaw boards, on a machine all of whose cores are busy.
@@ -197,7 +197,7 @@ def measure_bridge(
         kills: of each process.
         hostile: messages.
         busy: whether to keep all cores busy meanwhile.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
         progress: called with the share of a stage done, 0 to 1.
     """
     # Only here, where it is needed: without ROS the other commands still work.
@@ -232,17 +232,17 @@ def measure_bridge(
                 bench = BridgeBench(stage, nodes, CoilClient, folder / "logs", bound)
                 bench.start("coil_bridge")
                 bench.start("tracker")
-                say(f"{trials} times a commander that falls silent")
+                log(f"{trials} times a commander that falls silent")
                 delays = [bench.stop_trials(trials, progress)]
-                say(delays[-1].words)
+                log(delays[-1].words)
                 with CoilClient() as client:
                     loop, scheduling = client.loop_timing()
                 bench.start("commander")
                 for victim in ("commander", "tracker", "coil_bridge"):
-                    say(f"{kills} times kill -9 of the {victim}")
+                    log(f"{kills} times kill -9 of the {victim}")
                     delays.append(bench.kills(victim, kills, progress))
-                    say(delays[-1].words)
-                say(f"{hostile} hostile messages")
+                    log(delays[-1].words)
+                log(f"{hostile} hostile messages")
                 nodes.kill("commander")
                 nodes.kill("tracker")
                 greatest = bench.fuzz(hostile)

@@ -14,7 +14,7 @@ from rich.console import Console
 from benchmarks.page.measurements import measure_page
 from benchmarks.page.report import page_lines, page_table
 from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import progress, sayer
+from magnetosuture_thread.cli.terminal import make_log, progress
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -25,8 +25,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Time the page; return the figures."""
     with progress(console, "page") as advance:
-        report = measure_page(options.presses, say=sayer(console), progress=advance)
+        report = measure_page(options.presses, log=make_log(console), progress=advance)
     console.print(page_table(report))
     for line in page_lines(report):
-        sayer(console)(line)
+        make_log(console)(line)
     return report.to_json(), True

@@ -31,14 +31,14 @@ SCENARIO = "petri_35mm_polyamide"
 SEGMENTS, FRAME_RATE = 81, 30.0  # in place of the scenario's own
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH, HEIGHT = 1366, 768  # of the page [px]
-PATIENCE = 240.0  # s for the graph to be there; the first start on a machine compiles
+TIMEOUT = 240.0  # s for the graph to be there; the first start on a machine compiles
 HELD, LET_GO = 0.25, 0.35  # s that a key is held, and not held, on average
 KEYS = (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"))  # by axis; the second where the tip is beyond 0
 GRACE = 20.0  # s for the command to end
 LISTEN = "() => { window.bench_keys = []; addEventListener('keydown', (event) => { if (!event.repeat)"
 LISTEN += " window.bench_keys.push(performance.timeOrigin + event.timeStamp); }, true); }"
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Times = dict[str, list[float]]
 
 
@@ -64,14 +64,14 @@ class Server:
         Raises:
             GraphError: the command ended, or says no such thing.
         """
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while time.monotonic() < deadline:
             if found := re.search(pattern, "\n".join(self._lines)):
                 return found[1]
             if self._process.poll() is not None:
                 raise GraphError(f"the console ended: {self._lines[-1] if self._lines else 'it said nothing'}")
             time.sleep(0.05)
-        raise GraphError(f"after {PATIENCE:g} s the console is not ready: {self._lines[-1:]}")
+        raise GraphError(f"after {TIMEOUT:g} s the console is not ready: {self._lines[-1:]}")
 
     def end(self) -> None:
         """Press Ctrl-C."""
@@ -91,13 +91,13 @@ class Server:
 
 
 def measure_page(
-    presses: int, say: Say = lambda text: None, progress: Callable[[float], None] = lambda share: None
+    presses: int, log: Log = lambda text: None, progress: Callable[[float], None] = lambda share: None
 ) -> PageReport:
     """Press keys in a browser without a window, on the page of the whole graph around the simulated rig.
 
     Args:
         presses: of a key.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -105,7 +105,7 @@ def measure_page(
         GraphError: the graph does not start, or moves nothing.
     """
     browser = _browser()
-    say(f"starting {SCENARIO} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
+    log(f"starting {SCENARIO} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
     with TemporaryDirectory() as folder, _serving(Path(folder)) as server:
         domain = int(server.says(r"ROS domain (\d+)"))
         url = server.says(r"open (http\S+)")
@@ -164,7 +164,7 @@ def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
 
 
 def _click(page: Page, what: str) -> None:
-    page.locator(f"{what}:enabled").click(timeout=1e3 * PATIENCE)
+    page.locator(f"{what}:enabled").click(timeout=1e3 * TIMEOUT)
 
 
 def _stats(page: Page) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from benchmarks.solver.measurements import measure_solver
 from benchmarks.solver.table import solver_lines, solver_table
-from magnetosuture_thread.cli.terminal import progress, sayer
+from magnetosuture_thread.cli.terminal import make_log, progress
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -29,5 +29,5 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         report = measure_solver(with_baselines=options.peers, progress=advance)
     console.print(solver_table(report))
     for line in solver_lines(report):
-        sayer(console)(line)
+        make_log(console)(line)
     return report.to_json(), True

@@ -10,7 +10,7 @@ from rich.table import Table
 from benchmarks.solver.measurements import SolverReport, SolverRow
 
 SAME_RESIDUAL = 1e-7  # solvers that reach it are compared with the banded one, which reaches 1e-8
-SHORTEST = 81  # segments; below it, what a call costs by itself hides what a segment costs
+MIN_SEGMENTS = 81  # segments; below it, what a call costs by itself hides what a segment costs
 STEP, SOLVE = "rod step, banded", "rod solve, banded"
 
 
@@ -73,7 +73,7 @@ def _speed(rows: Iterable[SolverRow]) -> list[str]:
 def _linearity(rows: Iterable[SolverRow]) -> list[str]:
     """Give the time per segment, which is the same at all sizes if the method is linear."""
     lines = []
-    kept = [row for row in rows if row.system in (STEP, SOLVE) and row.n >= SHORTEST]
+    kept = [row for row in rows if row.system in (STEP, SOLVE) and row.n >= MIN_SEGMENTS]
     for (system, d, obstacles), group in groupby(sorted(kept, key=_scene), key=lambda row: _scene(row)[:3]):
         sizes = list(group)
         each = ", ".join(f"{1e6 * row.median_s / row.n:.2f} at {row.n}" for row in sizes)

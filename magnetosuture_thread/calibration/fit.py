@@ -17,14 +17,14 @@ Array = NDArray[np.float64]
 
 STEP, ROUGH_STEP = 0.01, 0.5  # of the change that counts, in difference quotients; the second for `paper`
 NO_GAIN, NO_STEP, FLAT = 1e-4, 1e-3, 1e-10  # of cost, numbers and gradient, where a fit ends
-MOST_STEPS = 15
+MAX_STEPS = 15
 MOST_TRIED, NEAR_X, NEAR_ERROR = 60, 0.05, 0.005  # of the simplex; changes that count, and % of length, where it ends
 OUTLIER = 3.0  # scatters; beyond, a residual counts by its size only, not by its square
-LEAST_SCALE = 1e-3  # of the thread's length, below which nothing is an outlier
+MIN_SCALE = 1e-3  # of the thread's length, below which nothing is an outlier
 
 
 @dataclass(frozen=True)
-class Solution:
+class FitSolution:
     """Where a fit ended.
 
     Attributes:
@@ -122,7 +122,7 @@ class Objective:
         length = self.base.thread_length
         return [[self._distance(v, p, length) for v, p in zip(vertices, passages, strict=True)] for vertices in found]
 
-    def fit(self, start: Array | None = None, scale: float = np.inf) -> Solution:
+    def fit(self, start: Array | None = None, scale: float = np.inf) -> FitSolution:
         """Return the best numbers near a start.
 
             min over x  sum rho(r(x)^2 / scale^2),    rho(z) = 2 (sqrt(1 + z) - 1)
@@ -163,7 +163,7 @@ class Objective:
             gtol=FLAT,
             loss="linear" if np.isinf(scale) else "soft_l1",
             f_scale=1.0 if np.isinf(scale) else scale,
-            max_nfev=MOST_STEPS,
+            max_nfev=MAX_STEPS,
         )
         x = np.clip(first + units * found.x, self.low, self.high)
         return self._solution(x, float(found.cost), scale)
@@ -193,12 +193,12 @@ class Objective:
         pairs = zip(self._replays.of([settings], self.which)[0], passages, strict=True)
         return float(np.mean([mean_error(v, p.targets, settings.thread_length) for v, p in pairs]))
 
-    def _solution(self, x: Array, cost: float, scale: float) -> Solution:
-        return Solution(self.settings(x), self.parameters, x, self.residuals(x), self.jacobian(x), scale, cost)
+    def _solution(self, x: Array, cost: float, scale: float) -> FitSolution:
+        return FitSolution(self.settings(x), self.parameters, x, self.residuals(x), self.jacobian(x), scale, cost)
 
 
 def scale_of(residuals: Sequence[Array]) -> float:
     """Return the scale of the robust loss: three times the scatter of the residuals, by their median size."""
     sizes = np.abs(np.concatenate([part[part != 0.0] for part in residuals]))
     middle = float(np.median(sizes)) if len(sizes) else 0.0
-    return max(OUTLIER * 1.4826 * middle, LEAST_SCALE)
+    return max(OUTLIER * 1.4826 * middle, MIN_SCALE)

@@ -29,14 +29,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magnetosuture_thread.calibration.fit import Solution
+from magnetosuture_thread.calibration.fit import FitSolution
 from magnetosuture_thread.calibration.parameters import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.calibration.passage import Passage
 from magnetosuture_thread.calibration.uncertainty import uncertainty_of
 
 COLLINEAR = 0.95
 FLOOR = 2e-3  # of the length
-SHORTEST_BEND = 0.07  # of the length; silk of 150 mm has 0.03, polyamide of 19 mm 0.2 to 0.6
+MIN_BEND = 0.07  # of the length; silk of 150 mm has 0.03, polyamide of 19 mm 0.2 to 0.6
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Identifiability:
         return not self.reason
 
 
-def assess_identifiability(solution: Solution, passages: Sequence[Passage]) -> list[Identifiability]:
+def assess_identifiability(solution: FitSolution, passages: Sequence[Passage]) -> list[Identifiability]:
     """Return what the data say of each of a solution's numbers.
 
     Args:
@@ -95,7 +95,7 @@ def assess_identifiability(solution: Solution, passages: Sequence[Passage]) -> l
     return [verdicts[index] for index in range(len(parameters))]
 
 
-def _reason(solution: Solution, index: int, effect: float, half: float) -> str:
+def _reason(solution: FitSolution, index: int, effect: float, half: float) -> str:
     parameter, settings = solution.parameters[index], solution.settings
     if effect < FLOOR:
         change = (
@@ -109,14 +109,14 @@ def _reason(solution: Solution, index: int, effect: float, half: float) -> str:
     return ""
 
 
-def _too_short(solution: Solution, index: int, passages: Sequence[Passage]) -> str:
+def _too_short(solution: FitSolution, index: int, passages: Sequence[Passage]) -> str:
     """Return in words that the stiffness acts on too small a part of the thread; empty if it does not."""
     parameter, length = solution.parameters[index], solution.settings.thread_length
     speed = min(passage.speed for passage in passages)
     if parameter is not STIFFNESS_OVER_DRAG or speed <= 0.0:
         return ""
     bend = float(np.cbrt(parameter.from_fit(float(solution.x[index])) / speed))
-    if bend >= SHORTEST_BEND * length:
+    if bend >= MIN_BEND * length:
         return ""
     part = f"{1e3 * bend:.1f} mm, {bend / length:.1%} of the thread"
     return f"bending acts within {part} only; elsewhere it goes where it is pulled, however stiff"

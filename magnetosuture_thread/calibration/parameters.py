@@ -29,7 +29,7 @@ LOGARITHM = 700.0  # whose exponential is a number yet
 STIFFNESS = 1e3  # B is looked for within this factor of the material's
 STIFFEST = 0.99e12  # Pa; just within what a set-up may say
 OFFSET_COUNTS, OFFSET_MOST = 0.01, 0.1  # of the thread's length
-KEPT_MOST = 0.999  # kappa
+MAX_KAPPA = 0.999  # kappa
 LEAST_WEIGHT, GREATEST_WEIGHT = 1e-6, 1e7  # W_stiff; beyond, every step needs another solver
 
 Settings = ThreadModelSettings
@@ -186,7 +186,7 @@ DAMPING = Parameter(
     "lost",
     _plain("paper_damping"),
     _replaced("paper_damping"),
-    lambda settings: (0.0, KEPT_MOST),
+    lambda settings: (0.0, MAX_KAPPA),
     lambda settings: DOUBLED,
     lambda settings: WIDEST,
 )

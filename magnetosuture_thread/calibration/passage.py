@@ -17,9 +17,9 @@ from magnetosuture_thread.scene import Scene
 
 AGAINST = ("seen", "truth")
 SETTLING = 1.0  # s after the start that are not compared: the noise of the first centreline straightens out in it
-MOST_FRAMES = 600  # compared, evenly over the run; every pose is replayed
-SHORTEST = 3.0  # s
-LEAST_FRAMES = 20  # compared
+MAX_FRAMES = 600  # compared, evenly over the run; every pose is replayed
+MIN_DURATION = 3.0  # s
+MIN_FRAMES = 20  # compared
 GAP = 500_000_000  # ns without a needle, after which the thread's way is not known
 BACK = 1_000_000_000  # ns; stamps that go back by more begin another run
 SMOOTHED, STEPS = 1.0, 0.5  # s; over which the thread is averaged to tell whether it moves, and the needle how fast
@@ -126,13 +126,15 @@ def passage_of(
     run = _gathered(name, sights, settings, against)
     ends = [*run.legs[1:], len(run.stamps)]
     duration = sum(run.stamps[end - 1] - run.stamps[leg] for leg, end in zip(run.legs, ends, strict=True)) * 1e-9
-    if duration < SHORTEST:
-        raise BagError(name, f"is too short: {duration:.1f} s with needle and thread, expected at least {SHORTEST:g} s")
+    if duration < MIN_DURATION:
+        raise BagError(
+            name, f"is too short: {duration:.1f} s with needle and thread, expected at least {MIN_DURATION:g} s"
+        )
     compared = [entry for entry in run.curves if _settled(run, entry[0])]
-    if len(compared) < LEAST_FRAMES:
+    if len(compared) < MIN_FRAMES:
         words = f"in {len(compared)} frames, the first second left out, is half of the thread or more {_word(against)}"
-        raise BagError(name, f"is of no use: {words}, expected at least {LEAST_FRAMES}")
-    chosen = np.unique(np.linspace(0, len(compared) - 1, min(MOST_FRAMES, len(compared))).round().astype(int))
+        raise BagError(name, f"is of no use: {words}, expected at least {MIN_FRAMES}")
+    chosen = np.unique(np.linspace(0, len(compared) - 1, min(MAX_FRAMES, len(compared))).round().astype(int))
     kept = [compared[index] for index in chosen]
     passage = Passage(
         name,

@@ -17,7 +17,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from magnetosuture_thread.calibration.replays import across
-from magnetosuture_thread.calibration.result import FIXED, BagFit, Calibration, Estimate
+from magnetosuture_thread.calibration.result import FIXED, BagFit, CalibrationResult, Estimate
 from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, tidy
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points
@@ -25,12 +25,12 @@ from magnetosuture_thread.geometry.polyline import Points
 INSTANTS = 6
 AFTER = "#d1495b"
 BEFORE = "#b4bcc4"
-LEAST_SHOWN = 1e-3  # % of length
+MIN_SHOWN = 1e-3  # % of length
 OBSTACLE = "#e9d8d3"
 CLOSE = 0.06  # of the length, within which a second instant gets no label
 
 
-def draw_calibration(path: Path, calibration: Calibration, fits: Sequence[BagFit]) -> None:
+def draw_calibration(path: Path, calibration: CalibrationResult, fits: Sequence[BagFit]) -> None:
     """Write the picture (.png).
 
     Args:
@@ -53,7 +53,7 @@ def draw_calibration(path: Path, calibration: Calibration, fits: Sequence[BagFit
     figure.savefig(path, format="png", metadata={"Software": None})
 
 
-def _summary(calibration: Calibration) -> str:
+def _summary(calibration: CalibrationResult) -> str:
     before = np.mean([score.before for score in calibration.scores])
     count, bags = len(calibration.scores), "bag" if len(calibration.scores) == 1 else "bags"
     words = (
@@ -68,7 +68,7 @@ def _summary(calibration: Calibration) -> str:
     return words
 
 
-def _draw_scene(axes: Axes, calibration: Calibration, fit: BagFit) -> None:
+def _draw_scene(axes: Axes, calibration: CalibrationResult, fit: BagFit) -> None:
     """Draw the thread as it was, as the set-up has it and as calibrated, at instants evenly over the bag."""
     passage = fit.passage
     whole = np.flatnonzero(passage.known.mean(axis=1) >= np.quantile(passage.known.mean(axis=1), 0.5))
@@ -106,14 +106,14 @@ def _draw_scene(axes: Axes, calibration: Calibration, fit: BagFit) -> None:
     tidy(axes)
 
 
-def _draw_time(axes: Axes, calibration: Calibration, fits: Sequence[BagFit]) -> None:
+def _draw_time(axes: Axes, calibration: CalibrationResult, fits: Sequence[BagFit]) -> None:
     """Draw the prediction error over time, one bag after the other."""
     length, begin = calibration.settings.thread_length, 0.0
     lowest, highest = np.inf, 0.0
     for index, fit in enumerate(fits):
         times = begin + fit.passage.times
         for vertices, colour, label in ((fit.before, BEFORE, "before"), (fit.after, AFTER, "after")):
-            error = np.maximum(fit.error(vertices, length), LEAST_SHOWN)
+            error = np.maximum(fit.error(vertices, length), MIN_SHOWN)
             axes.plot(times, error, color=colour, linewidth=1.3, label=label if index == 0 else None)
             lowest, highest = min(lowest, float(error.min())), max(highest, float(error.max()))
         begin += fit.passage.duration
@@ -131,7 +131,7 @@ def _draw_time(axes: Axes, calibration: Calibration, fits: Sequence[BagFit]) -> 
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8.5, frameon=False, ncols=2)
 
 
-def _draw_along(axes: Axes, calibration: Calibration, fits: Sequence[BagFit]) -> None:
+def _draw_along(axes: Axes, calibration: CalibrationResult, fits: Sequence[BagFit]) -> None:
     """Draw the distance across the thread from needle to end, mean over all bags and frames."""
     length = calibration.settings.thread_length
     lowest, highest = np.inf, 0.0
@@ -140,7 +140,7 @@ def _draw_along(axes: Axes, calibration: Calibration, fits: Sequence[BagFit]) ->
         for fit in fits:
             size = np.abs(across(getattr(fit, kind), fit.passage, length))
             total, count = total + size.sum(axis=0), count + fit.passage.known.sum(axis=0)
-        mean = np.maximum(100.0 * total / np.maximum(count, 1), LEAST_SHOWN)
+        mean = np.maximum(100.0 * total / np.maximum(count, 1), MIN_SHOWN)
         mean = np.where(count > 0, mean, np.nan)
         at = 1e3 * length * np.arange(1, len(mean) + 1) / len(mean)
         axes.plot(at, mean, color=colour, linewidth=1.3, marker="o", markersize=2.0)
@@ -160,7 +160,7 @@ def _percent_axis(axes: Axes, lowest: float, highest: float) -> None:
     tidy(axes)
 
 
-def _draw_parameters(figure: Figure, calibration: Calibration, box: tuple[float, float, float, float]) -> None:
+def _draw_parameters(figure: Figure, calibration: CalibrationResult, box: tuple[float, float, float, float]) -> None:
     """Draw a scale for each parameter: fitted value with its interval, and what the set-up says."""
     left, low, width, height = box
     figure.text(

@@ -23,7 +23,7 @@ Run = Callable[[Sequence[Task]], list[Points]]
 Array = NDArray[np.float64]
 
 
-def replay(passage: Passage, settings: ThreadModelSettings) -> Points:
+def replay_with_parameters(passage: Passage, settings: ThreadModelSettings) -> Points:
     """Return the predicted nodes at the compared frames, shape (K, n + 1, 2) [m].
 
     The very session that the node runs, over all poses, anew in each leg. Where a step fails the thread stays as it
@@ -188,6 +188,6 @@ class Replays:
 def attempt(passage: Passage, settings: ThreadModelSettings) -> Points:
     """Return `replay`, or nothing but not a number where such settings can predict nothing."""
     try:
-        return replay(passage, settings)
+        return replay_with_parameters(passage, settings)
     except InvalidInputError:
         return np.full((len(passage.frames), settings.segments + 1, 2), np.nan)

@@ -54,7 +54,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class AttachmentVerdict:
+class AttachmentDecision:
     """Which attachment fits better.
 
     Attributes:
@@ -135,7 +135,7 @@ class BagFit:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CalibrationResult:
     """What a calibration found.
 
     Attributes:
@@ -154,7 +154,7 @@ class Calibration:
     start: ThreadModelSettings
     against: str
     estimates: tuple[Estimate, ...]
-    attachment: AttachmentVerdict | None
+    attachment: AttachmentDecision | None
     scores: tuple[BagErrors, ...]
     simulated: tuple[str, ...]
     replays: int

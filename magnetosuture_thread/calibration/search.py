@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from magnetosuture_thread.calibration.fit import Array, Objective, Solution, scale_of
+from magnetosuture_thread.calibration.fit import Array, FitSolution, Objective, scale_of
 from magnetosuture_thread.calibration.identifiability import Identifiability, assess_identifiability
 from magnetosuture_thread.calibration.parameters import (
     OF_FORMULATION,
@@ -23,9 +23,9 @@ from magnetosuture_thread.calibration.result import (
     IDENTIFIED,
     STAND_IN,
     UNFINISHED,
-    AttachmentVerdict,
+    AttachmentDecision,
     BagFit,
-    Calibration,
+    CalibrationResult,
     Estimate,
     scores_of,
 )
@@ -37,11 +37,11 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 
-TOLD = 0.05  # % of length by which an attachment must fit better, besides the noise
+MIN_IMPROVEMENT = 0.05  # % of length by which an attachment must fit better, besides the noise
 GIVEN_WAY = 0.1  # % of length; a default that predicts worse by more gives way to what was fitted
 NARROWER = 0.5  # of the robust loss's scale, where the fit is repeated with the smaller one
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -53,8 +53,8 @@ def calibrate(
     run: Run | None = None,
     best: Best | None = None,
     progress: Progress = lambda share: None,
-    say: Say = lambda line: None,
-) -> tuple[Calibration, list[BagFit]]:
+    log: Log = lambda line: None,
+) -> tuple[CalibrationResult, list[BagFit]]:
     """Fit what the passages can tell of a thread.
 
     1. Stiffnesses from a hundredth to a hundred times the material's are tried with each attachment, and the best
@@ -71,7 +71,7 @@ def calibrate(
         run: gives the predictions of tasks; here, one after the other, if None.
         best: is told the best so far at every moment.
         progress: is told the share done.
-        say: is told a line at the end of each stage.
+        log: is told a line at the end of each stage.
 
     Returns:
         What was found, and each bag before and after.
@@ -83,7 +83,7 @@ def calibrate(
     if settings.medium != "liquid":
         raise ConfigurationError("thread_model.medium", settings.medium, "liquid: what is fitted is bending over drag")
     replays = Replays(passages, run, best)
-    stages = Stages(replays.best, progress, say)
+    stages = Stages(replays.best, progress, log)
     for scene in dict.fromkeys(passage.scene for passage in passages):
         ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
     replays.tell(stages.told)
@@ -92,7 +92,7 @@ def calibrate(
 
 def unfinished(
     passages: Sequence[Passage], settings: ThreadModelSettings, best: Best
-) -> tuple[Calibration, list[BagFit]]:
+) -> tuple[CalibrationResult, list[BagFit]]:
     """Return the best that an interrupted search had come to, without intervals.
 
     Args:
@@ -107,11 +107,13 @@ def unfinished(
     )
     attachment = None
     if found.attachment != settings.attachment:
-        attachment = AttachmentVerdict(found.attachment, settings.attachment, {}, looked=False)
+        attachment = AttachmentDecision(found.attachment, settings.attachment, {}, looked=False)
     fits = [BagFit(*parts) for parts in zip(passages, best.first, best.vertices, strict=True)]
     scores, simulated = scores_of(fits, settings.thread_length), tuple(passage.simulated for passage in passages)
     against = passages[0].against
-    done = Calibration(found, settings, against, estimates, attachment, scores, simulated, best.replays, finished=False)
+    done = CalibrationResult(
+        found, settings, against, estimates, attachment, scores, simulated, best.replays, finished=False
+    )
     return done, fits
 
 
@@ -123,7 +125,7 @@ class _Search:
     both: bool
     stages: Stages
 
-    def go(self) -> tuple[Calibration, list[BagFit]]:
+    def go(self) -> tuple[CalibrationResult, list[BagFit]]:
         passages, count = self.replays.passages, len(self.replays.passages)
         self.replays.error(self.start)
         candidates = starts(self.replays, self.start, self.parameters, self.both, self.stages)
@@ -143,7 +145,7 @@ class _Search:
             self.stages.end("predicted each bag by the others")
         before, after = self.replays.of([self.start, settings])
         fits = [BagFit(*parts) for parts in zip(passages, before, after, strict=True)]
-        calibration = Calibration(
+        calibration = CalibrationResult(
             settings,
             self.start,
             passages[0].against,
@@ -159,7 +161,7 @@ class _Search:
         self.stages.done()
         return calibration, fits
 
-    def _fitted(self, objective: Objective, scale: float | None = None) -> Solution:
+    def _fitted(self, objective: Objective, scale: float | None = None) -> FitSolution:
         """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
         if scale is not None:
             return objective.fit(scale=scale)
@@ -168,25 +170,25 @@ class _Search:
         narrower = scale_of(solution.residuals)
         return objective.fit(solution.x, narrower) if narrower < NARROWER * scale else solution
 
-    def _attached(self, solutions: Sequence[Solution]) -> tuple[Solution, AttachmentVerdict | None]:
+    def _attached(self, solutions: Sequence[FitSolution]) -> tuple[FitSolution, AttachmentDecision | None]:
         """Return the solution whose attachment fits better, or the set-up's where that cannot be told."""
         if not self.both:
             return solutions[0], None
         errors = {s.settings.attachment: self.replays.error(s.settings) for s in solutions}
         best = min(solutions, key=lambda s: float(np.mean(self._blocks(s))))
         if len(solutions) == 1:
-            return best, AttachmentVerdict(best.settings.attachment, self.start.attachment, errors)
+            return best, AttachmentDecision(best.settings.attachment, self.start.attachment, errors)
         other = next(s for s in solutions if s is not best)
         difference = self._blocks(other) - self._blocks(best)
         middle, count = float(difference.mean()), len(difference)
         half = float(student.ppf(0.975, count - 1) * difference.std(ddof=1) / np.sqrt(count))
         reason = ""
-        if middle < max(TOLD, half):
+        if middle < max(MIN_IMPROVEMENT, half):
             reason = f"{other.settings.attachment} is worse by {middle:.2g} ± {half:.2g} % of the length only"
             best = next(s for s in solutions if s.settings.attachment == self.start.attachment)
-        return best, AttachmentVerdict(best.settings.attachment, self.start.attachment, errors, reason)
+        return best, AttachmentDecision(best.settings.attachment, self.start.attachment, errors, reason)
 
-    def _blocks(self, solution: Solution) -> Array:
+    def _blocks(self, solution: FitSolution) -> Array:
         """Return the mean distance across the thread in each block of time of each passage [% of length]."""
         result = []
         for residual, passage in zip(solution.residuals, self.replays.passages, strict=True):
@@ -198,7 +200,7 @@ class _Search:
         return np.array(result)
 
     def _identified(
-        self, solution: Solution, verdicts: Sequence[Identifiability]
+        self, solution: FitSolution, verdicts: Sequence[Identifiability]
     ) -> tuple[ThreadModelSettings, list[str]]:
         """Return the fit of what can be identified, and what became of each number."""
         statuses = [self._status(solution, index, verdict) for index, verdict in enumerate(verdicts)]
@@ -217,7 +219,7 @@ class _Search:
                 return settings, statuses
             statuses[spare.pop(0)] = STAND_IN
 
-    def _status(self, solution: Solution, index: int, verdict: Identifiability) -> str:
+    def _status(self, solution: FitSolution, index: int, verdict: Identifiability) -> str:
         """Return what becomes of a number at first: the set-up's is kept unless the data contradict it."""
         if verdict.identified:
             return IDENTIFIED
@@ -238,7 +240,7 @@ class _Search:
         return self.replays.of([settings], [index])[0][0]
 
     def _estimate(
-        self, solution: Solution, index: int, verdict: Identifiability, status: str, settings: ThreadModelSettings
+        self, solution: FitSolution, index: int, verdict: Identifiability, status: str, settings: ThreadModelSettings
     ) -> Estimate:
         parameter = self.parameters[index]
         value = parameter.read(settings)

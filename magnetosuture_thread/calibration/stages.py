@@ -16,11 +16,11 @@ class Stages:
     Args:
         best: the best so far.
         progress: is told the share done, which never falls.
-        say: is told a line at the end of each stage.
+        log: is told a line at the end of each stage.
     """
 
-    def __init__(self, best: Best, progress: Callable[[float], None], say: Callable[[str], None]) -> None:
-        self._best, self._progress, self._say = best, progress, say
+    def __init__(self, best: Best, progress: Callable[[float], None], log: Callable[[str], None]) -> None:
+        self._best, self._progress, self._say = best, progress, log
         self._begin = self._width = 0.0
         self._done, self._expected = 0, 1
 

@@ -22,7 +22,7 @@ from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import Attachment
 
 STARTS = tuple(10.0 ** (power / 1.5) for power in range(-3, 4))  # of the material's stiffness
-MOST_STARTS = 2  # of them, of each attachment, are fitted: the best local minima
+MAX_STARTS = 2  # of them, of each attachment, are fitted: the best local minima
 DAMPINGS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)  # kappa
 WEIGHTS = (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)  # W_stiff
 POOR, MUCH = 3.0, 1.0  # times the better error, and % of length more, where an attachment is given up after the starts
@@ -51,7 +51,7 @@ def starts(
     if STIFFNESS_OVER_DRAG not in parameters:
         return bases
     count = len(replays.passages)
-    stages.begin("starts", count * len(bases) * (len(STARTS) + MOST_STARTS * 8))
+    stages.begin("starts", count * len(bases) * (len(STARTS) + MAX_STARTS * 8))
     tried = [started for base in bases for started in _started(base)]
     replays.of(tried)  # at once, so that all cores have work
     errors = np.array([replays.error(settings) for settings in tried]).reshape(len(bases), -1)
@@ -59,7 +59,7 @@ def starts(
     for index in _not_much_worse(errors.min(axis=1).tolist(), POOR, MUCH):
         objectives = [
             Objective(replays, tried[index * len(STARTS) + place], [STIFFNESS_OVER_DRAG], whole=True)
-            for place in local_minima(errors[index].tolist())[:MOST_STARTS]
+            for place in local_minima(errors[index].tolist())[:MAX_STARTS]
         ]
         found.append(min((objective.fit() for objective in objectives), key=lambda fit: fit.cost).settings)
     stages.end(f"tried {len(tried)} starts")

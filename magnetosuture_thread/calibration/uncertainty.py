@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from magnetosuture_thread.calibration.fit import Solution
+from magnetosuture_thread.calibration.fit import FitSolution
 from magnetosuture_thread.calibration.passage import Passage
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 BLOCKS = 10  # of each passage
 CLUSTERS = 3  # passages, from which on each is a block too
 CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time
-SMALLEST = 1e-12  # effect of a number, as a share of the length, below which it has none
+MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Uncertainty:
     correlation: Array
 
 
-def uncertainty_of(solution: Solution, passages: Sequence[Passage], columns: Sequence[int]) -> Uncertainty:
+def uncertainty_of(solution: FitSolution, passages: Sequence[Passage], columns: Sequence[int]) -> Uncertainty:
     """Return how well some of a solution's numbers are determined, the others taken as they are.
 
     Args:
@@ -63,7 +63,7 @@ def uncertainty_of(solution: Solution, passages: Sequence[Passage], columns: Seq
     jacobian = [j[..., list(columns)] for j in solution.jacobian]
     flat = np.concatenate([j[passage.known] for j, passage in zip(jacobian, passages, strict=True)])
     weights = np.concatenate([w[p.known] for w, p in zip(solution.weights, passages, strict=True)])
-    size = np.maximum(np.sqrt((weights[:, None] * flat**2).sum(axis=0)), SMALLEST)
+    size = np.maximum(np.sqrt((weights[:, None] * flat**2).sum(axis=0)), MIN_EFFECT)
     scaled = flat / size
     gram = scaled.T @ (weights[:, None] * scaled)
     inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
@@ -74,7 +74,7 @@ def uncertainty_of(solution: Solution, passages: Sequence[Passage], columns: Seq
     half = _half(inverse, blocks) / size
     if len(passages) >= CLUSTERS:
         half = np.maximum(half, _half(inverse, whole) / size)
-    return Uncertainty(half + CHAIN / np.maximum(effect, SMALLEST), effect, correlation)
+    return Uncertainty(half + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation)
 
 
 def _half(inverse: Array, scores: Array) -> Array:
@@ -88,7 +88,7 @@ def _half(inverse: Array, scores: Array) -> Array:
 
 
 def _scores(
-    solution: Solution, jacobian: Sequence[Array], passages: Sequence[Passage], size: Array
+    solution: FitSolution, jacobian: Sequence[Array], passages: Sequence[Passage], size: Array
 ) -> tuple[Array, Array]:
     """Return J' W r of each block of time, and of each passage."""
     blocks, whole = [], []
@@ -106,6 +106,6 @@ def _own_effect(flat: Array, weights: Array, index: int) -> float:
     own, others = flat[:, index], np.delete(flat, index, axis=1)
     if others.shape[1]:
         root = np.sqrt(weights)[:, None]
-        scale = np.maximum(np.linalg.norm(root * others, axis=0), SMALLEST)
+        scale = np.maximum(np.linalg.norm(root * others, axis=0), MIN_EFFECT)
         own = own - (others / scale) @ np.linalg.lstsq(root * others / scale, root[:, 0] * own, rcond=None)[0]
     return float(np.abs(own).mean())

@@ -7,7 +7,7 @@ import textwrap
 from typing import Any
 
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
-from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, Calibration, Estimate
+from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, CalibrationResult, Estimate
 from magnetosuture_thread.model.settings import ThreadModelSettings
 
 WIDTH = 118
@@ -21,7 +21,7 @@ STIFFNESS = (
 )
 
 
-def to_yaml(calibration: Calibration) -> str:
+def to_yaml(calibration: CalibrationResult) -> str:
     """Return the text of the file, the same for the same calibration."""
     lines = [*_header(calibration), "/**/thread_model:", "  ros__parameters:"]
     settings = calibration.settings
@@ -41,7 +41,7 @@ def to_yaml(calibration: Calibration) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _header(calibration: Calibration) -> list[str]:
+def _header(calibration: CalibrationResult) -> list[str]:
     words = [
         "A thread calibrated by `magnetosuture calibrate`, for the node thread_model: put the lines into the set-up's"
     ]
@@ -74,7 +74,7 @@ def _comment(text: str, indent: str = "") -> list[str]:
     return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
 
 
-def _attachment(calibration: Calibration) -> list[str]:
+def _attachment(calibration: CalibrationResult) -> list[str]:
     verdict, value = calibration.attachment, calibration.settings.attachment
     if verdict is None:
         return [f"    {ATTACHMENT}: {value} # as in the set-up"]

@@ -10,7 +10,7 @@ from magnetosuture_thread.bags.remap import parse_remap
 from magnetosuture_thread.errors import ConfigurationError
 
 
-def number(low: float, high: float) -> Callable[[str], float]:
+def number_argument(low: float, high: float) -> Callable[[str], float]:
     """Return an argument type: a number within bounds."""
 
     def within(text: str) -> float:

@@ -13,7 +13,7 @@ from magnetosuture_thread.cli.commands import (
     coils,
     console,
     evaluate,
-    record,
+    render,
     replay,
     reproduce,
     scene,
@@ -30,7 +30,7 @@ Research software, no medical device. Lengths are in metres and times in seconds
 # In the order of --help.
 COMMANDS = (
     replay.add,
-    record.add,
+    render.add,
     simulate.add,
     console.add,
     reproduce.add,

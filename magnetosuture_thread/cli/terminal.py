@@ -17,7 +17,7 @@ def make_console() -> Console:
     return Console(highlight=False)
 
 
-def sayer(console: Console) -> Callable[[str], None]:
+def make_log(console: Console) -> Callable[[str], None]:
     """Return what prints a line as it is, however long; what cannot be printed, as an escape sequence."""
     return lambda text: console.print(printable(text), soft_wrap=True, markup=False)
 

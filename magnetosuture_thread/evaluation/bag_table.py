@@ -16,7 +16,7 @@ from rich.text import Text
 from magnetosuture_thread.barrier import BUILT_IN
 from magnetosuture_thread.evaluation.metrics import Percentiles
 from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures
-from magnetosuture_thread.evaluation.report.headlines import AGAINST, micrometres, milliseconds, number
+from magnetosuture_thread.evaluation.report.headlines import AGAINST, format_number, micrometres, milliseconds
 
 Row: TypeAlias = "dict[str, str | int | float | None]"
 
@@ -142,14 +142,14 @@ def bags_table(rows: Sequence[Row]) -> Table:
         table.add_row(
             Text(f"{row['bag']} {SIMULATED}" if row["simulated"] else str(row["bag"])),
             f"{row['predicted']}/{row['frames']}",
-            *(_shown(error, number) for error in errors),
+            *(_shown(error, format_number) for error in errors),
             _shown(row["least_obstacle_m"], micrometres),
             _shown(row["step_median_s"], milliseconds),
         )
     summed = totals(rows)
     table.add_section()
     for name in ("mean", "worst"):
-        means = [_shown(summed[name][f"error_{target}_mean_percent"], number) for target in AGAINST]
+        means = [_shown(summed[name][f"error_{target}_mean_percent"], format_number) for target in AGAINST]
         table.add_row(name, "", means[0], "", means[1])
     return table
 

@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.frames import FrameResult
-from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, nanoseconds, planar_pose
+from magnetosuture_thread.evaluation.graph_outputs import GraphCollector
 from magnetosuture_thread.evaluation.metrics import Percentiles
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     CURRENTS,
+    GROUND_TRUTH_NEEDLE,
     NEEDLE_POSE,
     PREDICTED_THREAD,
     TIP_SETPOINT,
     TRACKER_STATE,
-    TRUTH_NEEDLE,
 )
+from magnetosuture_thread.messages.reading import nanoseconds, planar_pose
 
 TRACKED = 1  # as in the message TrackerState
 WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the truth, or ...
@@ -108,13 +109,13 @@ class LoopCollector:
         self._saturated: list[bool] = []
         self.instants: list[FrameResult] = []
 
-    def take(self, topic: str, time: int, message: Any) -> None:
+    def add(self, topic: str, time: int, message: Any) -> None:
         """Take one message that arrived at a time [ns]."""
-        self._threads.take(topic, message)
+        self._threads.add(topic, message)
         if not hasattr(message, "header"):
             return
         stamp = nanoseconds(message.header.stamp)
-        if topic == TRUTH_NEEDLE.recorded:
+        if topic == GROUND_TRUTH_NEEDLE.recorded:
             self._truth[stamp] = np.array(planar_pose(message.pose))
         elif topic == NEEDLE_POSE.recorded:
             self._poses[stamp] = np.array(planar_pose(message.pose.pose))

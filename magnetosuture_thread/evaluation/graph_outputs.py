@@ -16,14 +16,14 @@ from magnetosuture_thread.interface import (
     CAMERA,
     CURRENTS,
     DIAGNOSTICS,
+    GROUND_TRUTH_THREAD,
     MARGINS,
+    MEASURED_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
     PREDICTED_THREAD,
-    SEEN_THREAD,
-    TRUTH_THREAD,
 )
-from magnetosuture_thread.messages.reading import margins_of
+from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose
 
 CURRENT_VALID = 0.05  # s; a recorded current counts as in force for this long
 
@@ -49,14 +49,14 @@ class GraphCollector:
         self.driven: set[int] = set()
         self.health: dict[str, str] = {}
 
-    def take(self, topic: str, message: Any) -> None:
+    def add(self, topic: str, message: Any) -> None:
         """Take one message; topics that say nothing about a frame are ignored."""
         taker = {
             NEEDLE_POSE.recorded: self._take_pose,
-            SEEN_THREAD.recorded: self._take_seen,
+            MEASURED_THREAD.recorded: self._take_seen,
             PREDICTED_THREAD.recorded: self._take_prediction,
             MARGINS.recorded: self._take_margins,
-            TRUTH_THREAD.recorded: self._take_truth,
+            GROUND_TRUTH_THREAD.recorded: self._take_truth,
         }.get(topic)
         if topic == DIAGNOSTICS.recorded:
             self.health.update({status.name.split(":")[0]: status.message for status in message.status})
@@ -108,17 +108,6 @@ class GraphCollector:
         if message.valid:
             frame.margins = margins_of(message)
             frame.in_contact = bool(frame.margins.in_contact)
-
-
-def nanoseconds(stamp: Any) -> int:
-    """Return the time of a message builtin_interfaces/Time [ns]."""
-    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
-
-
-def planar_pose(pose: Any) -> tuple[float, float, float]:
-    """Return x, y [m] and the angle [rad] of a message geometry_msgs/Pose in the plane."""
-    turned = pose.orientation
-    return pose.position.x, pose.position.y, 2.0 * float(np.arctan2(turned.z, turned.w))
 
 
 def _path(message: Any) -> Points:
@@ -180,7 +169,7 @@ class CurrentSeries:
     def __init__(self) -> None:
         self._taken: dict[int, tuple[NDArray[np.float64], bool]] = {}
 
-    def take(self, message: Any) -> None:
+    def add(self, message: Any) -> None:
         """Take a message CoilCurrents, of ROS or of the bags' type store."""
         stamp = nanoseconds(message.header.stamp)
         self._taken[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)

@@ -23,7 +23,7 @@ from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 
 TOLERANCE = 1e-6  # of the residuals
-NEAR = 3e-3  # m; within this of an obstacle, depths are looked at
+CONTACT_RANGE = 3e-3  # m; within this of an obstacle, depths are looked at
 
 
 Progress = Callable[[float], None]
@@ -150,7 +150,7 @@ def score(
         thread, paper = reference_thread(reference, path, segments)
         predictor = ThreadPredictor(
             thread,
-            Workspace(reference.discs, NEAR),
+            Workspace(reference.discs, CONTACT_RANGE),
             formulation=formulation,
             solver=solver,
             paper=paper,

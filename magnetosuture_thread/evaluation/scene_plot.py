@@ -31,7 +31,7 @@ RESOLUTION = 150  # dots per inch
 STEPS = (0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)  # m; of the scale bar
 
 
-def draw_scene(path: Path, scene: Scene, name: str) -> None:
+def plot_scene(path: Path, scene: Scene, name: str) -> None:
     """Draw a scene into a file, PNG or SVG by its ending.
 
     Args:

@@ -14,22 +14,22 @@ from magnetosuture_thread.calibration.passage import Passage, passage_of
 from magnetosuture_thread.calibration.picture import draw_calibration
 from magnetosuture_thread.calibration.pool import pool
 from magnetosuture_thread.calibration.replays import Best
-from magnetosuture_thread.calibration.result import BagFit, Calibration
+from magnetosuture_thread.calibration.result import BagFit, CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate as fit
 from magnetosuture_thread.calibration.search import unfinished
 from magnetosuture_thread.calibration.yaml_text import to_yaml
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
-from magnetosuture_thread.jobs.judge import Given, opened
 from magnetosuture_thread.jobs.output import whole_file
+from magnetosuture_thread.jobs.replay_inputs import Given, opened
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import MATERIALS
-from magnetosuture_thread.offline.predictions import sights
+from magnetosuture_thread.offline.predictions import read_observations
 from magnetosuture_thread.setups import Setup, read_setup
 
 READING = 0.15  # share of the time for reading the bags, and tracking their frames
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -60,16 +60,16 @@ class Request:
     frame: str = "dish"
 
 
-def calibrate(
+def calibrate_bags(
     bags: Sequence[Path],
     output: Path,
     request: Request,
     *,
     picture: Path | None = None,
     json_file: Path | None = None,
-    say: Say = lambda line: None,
+    log: Log = lambda line: None,
     progress: Progress = lambda share: None,
-) -> Calibration:
+) -> CalibrationResult:
     """Fit a thread's parameters to bags, and write them as a file that `thread_model` loads.
 
     The file does not depend on the number of workers, nor on the time: the same bags give the same bytes. Ctrl-C ends
@@ -81,7 +81,7 @@ def calibrate(
         request: what to calibrate.
         picture: of fit and residuals, to draw (.png); beside the output if None.
         json_file: to write all figures to, if any.
-        say: is told a line at the end of each stage.
+        log: is told a line at the end of each stage.
         progress: is told the share done.
 
     Raises:
@@ -89,7 +89,7 @@ def calibrate(
         ConfigurationError: the set-up, the material or a parameter cannot be used.
         InvalidInputError: the bags are of different threads.
     """
-    passages, settings = _read(bags, request, say, lambda share: progress(READING * share))
+    passages, settings = _read(bags, request, log, lambda share: progress(READING * share))
     best = Best()
     try:
         with pool(passages, min(request.workers, os.cpu_count() or 1)) as run:
@@ -100,19 +100,19 @@ def calibrate(
                 run=run,
                 best=best,
                 progress=lambda share: progress(READING + (1.0 - READING) * share),
-                say=say,
+                log=log,
             )
     except KeyboardInterrupt:
         if best.settings is None:
             raise
-        say("interrupted; writing the best so far")
+        log("interrupted; writing the best so far")
         calibration, fits = unfinished(passages, settings, best)
     _write(calibration, fits, output, picture or output.with_suffix(".png"), json_file)
     return calibration
 
 
 def _write(
-    calibration: Calibration, fits: Sequence[BagFit], output: Path, picture: Path, json_file: Path | None
+    calibration: CalibrationResult, fits: Sequence[BagFit], output: Path, picture: Path, json_file: Path | None
 ) -> None:
     with whole_file(output) as partial:
         partial.write_text(to_yaml(calibration), encoding="utf-8")
@@ -124,7 +124,7 @@ def _write(
 
 
 def _read(
-    bags: Sequence[Path], request: Request, say: Say, progress: Progress
+    bags: Sequence[Path], request: Request, log: Log, progress: Progress
 ) -> tuple[list[Passage], ThreadModelSettings]:
     """Read all bags, their frames tracked once, and return what the set-up says of the thread."""
     passages: list[Passage] = []
@@ -143,7 +143,7 @@ def _read(
             duration=None,
             remap=dict(request.remap),
             frame=request.frame,
-            say=say,
+            log=log,
         ) as given:
             own = settings_of(given.setup, request)
             chosen(own.formulation, request.parameters)  # what is wrong is said before the bag is read
@@ -153,7 +153,7 @@ def _read(
                 raise InvalidInputError(str(path), f"set-up {name}", f"that of {bags[0]}, {first}; name one by --setup")
             threads.append((path, _named(given) or given.setup))
             settings = own
-            seen = sights(given.recording, given.setup, source=given.source, progress=share)
+            seen = read_observations(given.recording, given.setup, source=given.source, progress=share)
             simulated = given.recording.notes.get("simulated", "")
             try:
                 passages.append(passage_of(str(path), seen, own, request.against, simulated, given.setup.scene))

@@ -14,9 +14,9 @@ from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.jobs.judge import DEFAULT_SETUP, opened
-from magnetosuture_thread.jobs.playing import SHORTEST_LOOP, Playing
-from magnetosuture_thread.jobs.simulate import Say
+from magnetosuture_thread.jobs.playing import MIN_LOOP_DURATION, Playing
+from magnetosuture_thread.jobs.replay_inputs import DEFAULT_SETUP, opened
+from magnetosuture_thread.jobs.simulate import Log
 from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.setups import read_setup
 
@@ -36,7 +36,7 @@ def console(
     address: str | None = None,
     port: int | None = None,
     token: str | None = None,
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
 ) -> None:
     """Serve the operator's page until this process is asked to end, by SIGINT, SIGTERM or SIGHUP.
 
@@ -49,7 +49,7 @@ def console(
         address: that the page is served on; the set-up's if None.
         port: of it; the set-up's if None.
         token: that commands need; the set-up's if None.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
 
     Raises:
         BagError: the bag cannot be used.
@@ -60,16 +60,16 @@ def console(
     given = {name: value for name, value in asked.items() if value is not None}
     with ExitStack() as stack:
         if running:
-            graph, host = _running(stack, scenario, given, recordings, say)
+            graph, host = _running(stack, scenario, given, recordings, log)
         elif bag is not None:
-            graph, host = _replayed(stack, scenario, given, bag, say)
+            graph, host = _replayed(stack, scenario, given, bag, log)
         else:
-            graph, host = _simulated(stack, scenario, given, recordings, say)
-        asyncio.run(_serve(graph, host, say))
+            graph, host = _simulated(stack, scenario, given, recordings, log)
+        asyncio.run(_serve(graph, host, log))
 
 
 def _running(
-    stack: ExitStack, scenario: str, given: dict[str, str | int], recordings: Path, say: Say
+    stack: ExitStack, scenario: str, given: dict[str, str | int], recordings: Path, log: Log
 ) -> tuple[ConsoleGraph, RecordingHost]:
     """Join the graph that runs."""
     # Only here, where it is needed: without ROS the other commands still work.
@@ -79,11 +79,11 @@ def _running(
 
     setup = read_setup(scenario or DEFAULT_SETUP)
     graph = ConsoleGraph(stack.enter_context(joined()), _settings(setup.console, given))
-    return graph, RecordingHost(graph, setup, recordings, say)
+    return graph, RecordingHost(graph, setup, recordings, log)
 
 
 def _simulated(
-    stack: ExitStack, scenario: str, given: dict[str, str | int], recordings: Path, say: Say
+    stack: ExitStack, scenario: str, given: dict[str, str | int], recordings: Path, log: Log
 ) -> tuple[ConsoleGraph, RecordingHost]:
     """Start the whole graph around a simulated rig."""
     from magnetosuture_thread.jobs.console_hosts import SimulatedHost
@@ -96,13 +96,13 @@ def _simulated(
     domain, environment, logs = _alone(stack)
     graph = ConsoleGraph(stack.enter_context(joined(domain=domain)), settings)
     scenarios = dict.fromkeys([*shipped, name])
-    host = SimulatedHost(graph, name, tuple(scenarios), environment, logs, recordings, say)
-    say(f"starting the graph around a simulated rig (ROS domain {domain}, this machine only)")
+    host = SimulatedHost(graph, name, tuple(scenarios), environment, logs, recordings, log)
+    log(f"starting the graph around a simulated rig (ROS domain {domain}, this machine only)")
     return graph, host
 
 
 def _replayed(
-    stack: ExitStack, scenario: str, given: dict[str, str | int], bag: Path, say: Say
+    stack: ExitStack, scenario: str, given: dict[str, str | int], bag: Path, log: Log
 ) -> tuple[ConsoleGraph, RecordingHost]:
     """Play a bag through the nodes."""
     from magnetosuture_thread.jobs.console_replay import ReplayHost
@@ -110,10 +110,10 @@ def _replayed(
     from magnetosuture_thread.nodes.console_host import joined
 
     played = stack.enter_context(
-        opened(bag, setup_name=scenario, source="auto", start=0.0, duration=None, remap={}, frame="dish", say=say)
+        opened(bag, setup_name=scenario, source="auto", start=0.0, duration=None, remap={}, frame="dish", log=log)
     )
-    if played.duration < SHORTEST_LOOP:
-        words = f"gives {played.duration:.2f} s to play over and over; expected {SHORTEST_LOOP:g} s or more"
+    if played.duration < MIN_LOOP_DURATION:
+        words = f"gives {played.duration:.2f} s to play over and over; expected {MIN_LOOP_DURATION:g} s or more"
         raise BagError(bag, words)
     playing = Playing(played)
     settings = _settings(played.setup.console, given)
@@ -122,8 +122,8 @@ def _replayed(
     domain, environment, logs = _alone(stack)
     node = stack.enter_context(joined(domain=domain, simulated_clock=True))
     graph = ConsoleGraph(node, settings)
-    host = ReplayHost(graph, playing, domain, environment, logs, say)
-    say(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
+    host = ReplayHost(graph, playing, domain, environment, logs, log)
+    log(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
     return graph, host
 
 
@@ -141,7 +141,7 @@ def _settings(settings: ConsoleSettings, given: dict[str, str | int]) -> Console
     return from_mapping(ConsoleSettings, {**to_mapping(settings), **given})
 
 
-async def _serve(graph: ConsoleGraph, host: RecordingHost, say: Say) -> None:
+async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
     """Serve the page until somebody asks this process to end, or the graph breaks."""
     loop, asked = asyncio.get_running_loop(), asyncio.Event()
     for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -150,8 +150,8 @@ async def _serve(graph: ConsoleGraph, host: RecordingHost, say: Say) -> None:
     try:
         host.start()
         server = ConsoleServer(graph.settings, graph, host)
-        say(f"open {await server.start()}")
-        say("Ctrl-C ends everything")
+        log(f"open {await server.start()}")
+        log("Ctrl-C ends everything")
         try:
             while not asked.is_set():
                 await host.watch()
@@ -163,4 +163,4 @@ async def _serve(graph: ConsoleGraph, host: RecordingHost, say: Say) -> None:
             await server.stop()
     finally:
         await host.close()
-    say("ended")
+    log("ended")

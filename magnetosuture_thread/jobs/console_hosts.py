@@ -14,7 +14,7 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import GraphError, MagnetosutureError
 from magnetosuture_thread.interface import NODES, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.jobs.console_recording import BagRecording, new_name
-from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE, SLOWER_BRIDGE, START_TIMEOUT, Say
+from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE, SLOWER_BRIDGE, START_TIMEOUT, Log
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console_graph import ConsoleGraph
 from magnetosuture_thread.nodes.console_host import RIG, GraphHost
@@ -35,14 +35,14 @@ class RecordingHost(GraphHost):
         graph: to serve.
         setup: with which.
         recordings: folder that gets a bag for each recording.
-        say: called with a line for a person.
+        log: called with a line for a person.
     """
 
-    def __init__(self, graph: ConsoleGraph, setup: Setup, recordings: Path, say: Say) -> None:
+    def __init__(self, graph: ConsoleGraph, setup: Setup, recordings: Path, log: Log) -> None:
         super().__init__(graph)
         self.setup = setup
         self.busy = ""
-        self.say = say
+        self.log = log
         self._recordings = recordings
         self._recording: BagRecording | None = None
         self._tap: ConsoleTap | None = None
@@ -89,9 +89,9 @@ class RecordingHost(GraphHost):
         except MagnetosutureError as error:
             self._recording = None
             return str(error)
-        self._tap = ConsoleTap(self.graph.node, taken, None, bag.take)
+        self._tap = ConsoleTap(self.graph.node, taken, None, bag.add)
         self._tapping = asyncio.create_task(self._tap.run())
-        self.say(f"recording to {bag.output}")
+        self.log(f"recording to {bag.output}")
         return ""
 
     async def watch(self) -> None:
@@ -120,11 +120,11 @@ class RecordingHost(GraphHost):
         try:
             await recording.end()
         except MagnetosutureError as error:
-            self.say(f"the recording has ended: {error}")
+            self.log(f"the recording has ended: {error}")
             return str(error)
         finally:
             self._recording = None
-        self.say(f"recorded: {recording.output}")
+        self.log(f"recorded: {recording.output}")
         return ""
 
 
@@ -138,7 +138,7 @@ class SimulatedHost(RecordingHost):
         environment: for the nodes.
         logs: folder for what each node prints.
         recordings: folder that gets a bag for each recording.
-        say: called with a line for a person.
+        log: called with a line for a person.
     """
 
     mode = "simulated"
@@ -151,9 +151,9 @@ class SimulatedHost(RecordingHost):
         environment: Mapping[str, str],
         logs: Path,
         recordings: Path,
-        say: Say,
+        log: Log,
     ) -> None:
-        super().__init__(graph, read_setup(setup), recordings, say)
+        super().__init__(graph, read_setup(setup), recordings, log)
         self._setup_name, self._setups = setup, tuple(setups)
         self._environment, self._logs = dict(environment), logs
         self._nodes: NodeProcesses | None = None
@@ -194,7 +194,7 @@ class SimulatedHost(RecordingHost):
         self.setup, self._setup_name, self.paused = selected, setup, False
         self.graph.begin(served_as(selected.console, self.graph.settings))
         self.start()
-        self.say(f"starting {selected.name}, scene {version}")
+        self.log(f"starting {selected.name}, scene {version}")
         return ""
 
     async def watch(self) -> None:
@@ -209,9 +209,9 @@ class SimulatedHost(RecordingHost):
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
             # Only now: while it compiles for the first time, others shall not wait for it.
-            self.say(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
+            self.log(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
             self._block("")
-            self.say(f"{self.setup.name} runs; the coils are not armed")
+            self.log(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > START_TIMEOUT:
             unheard = ", ".join(missing) or "a bridge that is ready"
             raise GraphError(f"after {START_TIMEOUT:g} s nothing is heard of {unheard}")

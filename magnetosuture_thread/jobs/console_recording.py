@@ -47,7 +47,7 @@ class BagRecording:
         threading.Thread(target=self._run, name="recording").start()
         await asyncio.wrap_future(self._begun)
 
-    def take(self, topic: str, arrival: int, data: bytes) -> None:
+    def add(self, topic: str, arrival: int, data: bytes) -> None:
         """Take a message: topic with its leading slash, when it came [ns], CDR bytes."""
         if not self.ended:
             self._waiting.put((topic, arrival, data))

@@ -10,7 +10,7 @@ from typing import Any
 
 from magnetosuture_thread.jobs.console_hosts import RecordingHost
 from magnetosuture_thread.jobs.playing import Playing
-from magnetosuture_thread.jobs.simulate import Say
+from magnetosuture_thread.jobs.simulate import Log
 from magnetosuture_thread.nodes.console_graph import ConsoleGraph
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.nodes.replay import LiveReplay
@@ -28,15 +28,15 @@ class ReplayHost(RecordingHost):
         domain: the graph's ROS domain.
         environment: for the nodes.
         logs: folder for what each node prints.
-        say: called with a line for a person.
+        log: called with a line for a person.
     """
 
     mode = "replay"
 
     def __init__(
-        self, graph: ConsoleGraph, playing: Playing, domain: int, environment: Mapping[str, str], logs: Path, say: Say
+        self, graph: ConsoleGraph, playing: Playing, domain: int, environment: Mapping[str, str], logs: Path, log: Log
     ) -> None:
-        super().__init__(graph, playing.given.setup, Path(), say)
+        super().__init__(graph, playing.given.setup, Path(), log)
         self._playing, self._domain = playing, domain
         self._environment, self._logs = dict(environment), logs
         self._nodes: NodeProcesses | None = None
@@ -85,7 +85,7 @@ class ReplayHost(RecordingHost):
             nodes=len(playing.nodes),
             receive=lambda topic, time, data: None,
             watch=self._check,
-            say=self.say,
+            log=self.log,
         )
         try:
             live.wait_for_graph()

@@ -10,16 +10,16 @@ from pathlib import Path
 from magnetosuture_thread.bags.bag_files import STORAGE_SUFFIXES, find_bag_files
 from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
 from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv, table_json
-from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable
+from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable_path
 from magnetosuture_thread.jobs.frames import numbered
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.workers import WorkerDiedError, run_all
 from magnetosuture_thread.setups import read_setup
 
 DEPTH = 2  # folders below the one that is given, in which bags are looked for
-LONGEST_NAME = 200  # bytes
+MAX_NAME_BYTES = 200  # bytes
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -46,7 +46,7 @@ def evaluate_bags(
     options: Options,
     *,
     workers: int = 1,
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> list[Row]:
     """Evaluate bags, each for itself.
@@ -60,7 +60,7 @@ def evaluate_bags(
         output: folder to make.
         options: how.
         workers: processes.
-        say: called with a line for a person.
+        log: called with a line for a person.
         progress: called with the share done, 0 to 1.
 
     Returns:
@@ -83,21 +83,21 @@ def evaluate_bags(
             row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
             if row["problem"]:
                 task.page.unlink(missing_ok=True)
-                say(f"{task.name}: {row['problem']}")
+                log(f"{task.name}: {row['problem']}")
             rows[index] = row
 
-        run_all(evaluate_one, tasks, workers, done=done, say=say, progress=progress)
+        run_all(evaluate_one, tasks, workers, done=done, log=log, progress=progress)
         ordered = [rows[index] for index in range(len(tasks))]
         (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
         (folder / "table.json").write_text(table_json(ordered), encoding="utf-8")
     return ordered
 
 
-def evaluate_one(task: Task, say: Say, progress: Progress) -> Row:
+def evaluate_one(task: Task, log: Log, progress: Progress) -> Row:
     """Return the row of a bag, with the problem in it if there is one: nothing stops the others."""
     try:
         return evaluate_bag(
-            task.path, task.name, task.options, task.page, lambda text: say(f"{task.name}: {text}"), progress
+            task.path, task.name, task.options, task.page, lambda text: log(f"{task.name}: {text}"), progress
         )
     except MagnetosutureError as error:
         return _failed(task, str(error))
@@ -106,13 +106,13 @@ def evaluate_one(task: Task, say: Say, progress: Progress) -> Row:
 
 
 def _failed(task: Task, problem: str) -> Row:
-    return failed_row(task.name, printable(str(task.path)), printable(" ".join(problem.split())))
+    return failed_row(task.name, printable_path(str(task.path)), printable_path(" ".join(problem.split())))
 
 
 def _name(bag: Path) -> str:
     path = Path(os.path.abspath(bag))
-    name = printable(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
-    return name.encode()[:LONGEST_NAME].decode("utf-8", "ignore")
+    name = printable_path(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
+    return name.encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
 
 
 def find_bags(paths: Sequence[Path]) -> list[Path]:

@@ -20,23 +20,23 @@ from magnetosuture_thread.evaluation.frames import FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures
 from magnetosuture_thread.evaluation.report.page import write_page
-from magnetosuture_thread.evaluation.report.pictures import Photo, Picture, draw_worst_frame
+from magnetosuture_thread.evaluation.report.pictures import Photo, ReportPicture, draw_worst_frame
 from magnetosuture_thread.evaluation.series import WorstFrame
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import DISH_FRAME, PREDICTED_THREAD, SEEN_THREAD, TRUTH_THREAD
+from magnetosuture_thread.interface import DISH_FRAME, GROUND_TRUTH_THREAD, MEASURED_THREAD, PREDICTED_THREAD
 from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions, live_figures
-from magnetosuture_thread.jobs.judge import Given, opened
+from magnetosuture_thread.jobs.replay_inputs import Given, opened
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.offline.observations import NOT_FOUND, ObservationReader, pixels
 from magnetosuture_thread.offline.predictions import predictions
-from magnetosuture_thread.offline.sights import NOT_FOUND, Sights, pixels
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 AGAINST = ("auto", "truth", "seen")
 SOFTWARE = ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless")
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -65,7 +65,7 @@ class Options:
     duration: float | None = None
 
 
-def evaluate_bag(path: Path, name: str, options: Options, page: Path, say: Say, progress: Progress) -> Row:
+def evaluate_bag(path: Path, name: str, options: Options, page: Path, log: Log, progress: Progress) -> Row:
     """Evaluate a bag, write its page and return its row of the table.
 
     Of each frame some numbers are kept, and of a few frames the threads: memory grows by 130 bytes a frame.
@@ -75,7 +75,7 @@ def evaluate_bag(path: Path, name: str, options: Options, page: Path, say: Say, 
         name: of the report.
         options: how.
         page: the file to write.
-        say: called with a line for a person.
+        log: called with a line for a person.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -90,7 +90,7 @@ def evaluate_bag(path: Path, name: str, options: Options, page: Path, say: Say, 
         duration=options.duration,
         remap=dict(options.remap),
         frame=options.frame,
-        say=say,
+        log=log,
     ) as given:
         model = given.setup.model
         if options.formulation:
@@ -112,7 +112,7 @@ def evaluate_bag(path: Path, name: str, options: Options, page: Path, say: Say, 
     return row_of(about, figures)
 
 
-class _Looked(Sights):
+class _Looked(ObservationReader):
     """A bag's sights, each of which the metrics take as it goes by; what else the bag says goes to the model."""
 
     def __init__(self, given: Given, metrics: RunMetrics, progress: Progress) -> None:
@@ -134,16 +134,16 @@ def _targets(given: Given, against: str) -> list[str]:
     """
     counts = given.recording.counts
     there = {
-        "truth": bool(counts.get(TRUTH_THREAD.recorded)),
-        "seen": given.source == "camera" or bool(counts.get(SEEN_THREAD.recorded)),
+        "truth": bool(counts.get(GROUND_TRUTH_THREAD.recorded)),
+        "seen": given.source == "camera" or bool(counts.get(MEASURED_THREAD.recorded)),
     }
     if against != "auto" and not there[against]:
-        topic = TRUTH_THREAD if against == "truth" else SEEN_THREAD
+        topic = GROUND_TRUTH_THREAD if against == "truth" else MEASURED_THREAD
         raise BagError(given.recording.path, f"has no messages on {topic.recorded} ({topic.type_name})")
     return [target for target, is_there in there.items() if is_there and against in ("auto", target)]
 
 
-def _predict(given: Given, model: ThreadModelSettings, metrics: RunMetrics, seen: Sights) -> Counter[str]:
+def _predict(given: Given, model: ThreadModelSettings, metrics: RunMetrics, seen: ObservationReader) -> Counter[str]:
     """Go through a bag once; return what was refused, by why."""
     recorded = RecordedPredictions(given.recording, given.start, given.duration)
     refused = Counter[str]()
@@ -170,7 +170,7 @@ def _kind(problem: Exception) -> str:
     return "the model: a program that was not solved"
 
 
-def _pictures(given: Given, model: ThreadModelSettings, metrics: RunMetrics) -> list[Picture]:
+def _pictures(given: Given, model: ThreadModelSettings, metrics: RunMetrics) -> list[ReportPicture]:
     worst = metrics.worst_frames()
     photos = _photos(given, worst)
     return [
@@ -216,7 +216,7 @@ def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter
     recording, setup = given.recording, given.setup
     return BagDetails(
         name=name,
-        path=printable(str(recording.path)),
+        path=printable_path(str(recording.path)),
         setup=setup.name,
         simulated=recording.notes.get("simulated", ""),
         source=given.source,
@@ -255,7 +255,7 @@ def _versions() -> Iterator[tuple[str, str]]:
             continue
 
 
-def printable(text: str) -> str:
+def printable_path(text: str) -> str:
     """Return a text of one line that can be written as UTF-8 and shown, whatever bytes a file's name is made of."""
     decoded = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in decoded)

@@ -17,8 +17,8 @@ from magnetosuture_thread.interface import CURRENTS, NEEDLE_POSE, PREDICTED_THRE
 from magnetosuture_thread.messages.reading import stamp_of
 
 LATENT = dict(zip((NEEDLE_POSE, PREDICTED_THREAD, CURRENTS), STAGES, strict=True))
-LONGEST = 10.0  # s; a median beyond is of two clocks
-HELD = 600  # recorded predictions that may wait for their frame
+MAX_LATENCY = 10.0  # s; a median beyond is of two clocks
+MAX_WAITING = 600  # recorded predictions that may wait for their frame
 
 
 def live_figures(recording: Recording, start: float, duration: float | None) -> LiveFigures:
@@ -46,7 +46,7 @@ def live_figures(recording: Recording, start: float, duration: float | None) -> 
             latencies[record.topic].append((record.time - stamp) * 1e-9)
     percentiles = {LATENT[channel]: Percentiles.of(latencies[channel.recorded]) for channel in there}
     found = {stage: each for stage, each in percentiles.items() if each is not None}
-    if any(not 0.0 <= each.median <= LONGEST for each in found.values()):
+    if any(not 0.0 <= each.median <= MAX_LATENCY for each in found.values()):
         return LiveFigures(remark="not measured: stamps and times of recording are of two clocks")
     if all(each.maximum == 0.0 for each in found.values()):
         return LiveFigures(remark="not measured: the bag was made offline")
@@ -86,7 +86,7 @@ class RecordedPredictions:
         Args:
             stamp: of the frame [ns], not before those asked for until now.
         """
-        while self._latest < stamp and len(self._held) < HELD:
+        while self._latest < stamp and len(self._held) < MAX_WAITING:
             record = next(self._records, None)
             if record is None:
                 break

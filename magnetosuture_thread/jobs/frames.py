@@ -26,7 +26,7 @@ FRAMES_FOR_RATE = 300  # of a bag, from its beginning
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameFile:
     """One frame.
 
     Attributes:
@@ -110,7 +110,7 @@ class FrameSource:
         else:
             self._files.append(path)
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[FrameFile]:
         """Go through the frames: files in the order given, a folder by name, a bag by time."""
         if self._recording is not None:
             self._recording.refused.clear()
@@ -119,11 +119,11 @@ class FrameSource:
             return
         for name, file in zip(self.names, self._files, strict=True):
             try:
-                yield Frame(name, decode_image(file.read_bytes()))
+                yield FrameFile(name, decode_image(file.read_bytes()))
             except OSError as error:
-                yield Frame(name, None, f"cannot be read: {error.strerror}")
+                yield FrameFile(name, None, f"cannot be read: {error.strerror}")
             except InvalidInputError as error:
-                yield Frame(name, None, str(error))
+                yield FrameFile(name, None, str(error))
 
     def rate(self) -> float:
         """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
@@ -136,7 +136,7 @@ class FrameSource:
         # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
         return min(HIGHEST_RATE, max(LOWEST_RATE, round(1.0 / float(np.median(intervals)), 2)))
 
-    def _recorded(self, record: RecordedMessage) -> Frame:
+    def _recorded(self, record: RecordedMessage) -> FrameFile:
         """Return a recorded frame; it is broken where message or picture are."""
         stamp = record.time * 1e-9
         try:
@@ -147,8 +147,8 @@ class FrameSource:
             else:
                 image = unpack_image(message.data, message.height, message.width, message.step, message.encoding)
         except (BagError, InvalidInputError) as error:
-            return Frame(f"{record.topic} {stamp:.6f}", None, str(error), stamp)
-        return Frame(f"{record.topic} {stamp:.6f}", np.asarray(image), "", stamp)
+            return FrameFile(f"{record.topic} {stamp:.6f}", None, str(error), stamp)
+        return FrameFile(f"{record.topic} {stamp:.6f}", np.asarray(image), "", stamp)
 
 
 def numbered(names: Sequence[str], form: str) -> list[str]:

@@ -14,15 +14,15 @@ from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.interface import (
     CAMERA,
     CAMERA_INFO,
+    MEASURED_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
     NODES,
     PROCESSES,
     SCENE,
-    SEEN_THREAD,
     Channel,
 )
-from magnetosuture_thread.jobs.judge import Given
+from magnetosuture_thread.jobs.replay_inputs import Given
 from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.scene import write_scene
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 # A replayed bag never moves a needle, so its bridge may arm itself.
 NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE)
-SHORTEST_LOOP = 1.5  # s; nodes take a jump back of a second and less for messages that come late
+MIN_LOOP_DURATION = 1.5  # s; nodes take a jump back of a second and less for messages that come late
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Playing:
     def channels(self) -> list[Channel]:
         """Return what is played."""
         camera = self.given.recording.camera
-        source = (camera, CAMERA_INFO) if self.given.source == "camera" else (NEEDLE_POSE, SEEN_THREAD)
+        source = (camera, CAMERA_INFO) if self.given.source == "camera" else (NEEDLE_POSE, MEASURED_THREAD)
         counts = self.given.recording.counts
         there = [
             channel

@@ -19,25 +19,25 @@ from magnetosuture_thread.evaluation.graph_outputs import (
 )
 from magnetosuture_thread.interface import (
     CURRENTS,
+    GROUND_TRUTH_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
     PAUSE_REPLAY,
-    TRUTH_THREAD,
 )
-from magnetosuture_thread.jobs.judge import Given, opened, replay_summary, write_results
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.playing import SHORTEST_LOOP, Playing
-from magnetosuture_thread.offline.predictions import sights
+from magnetosuture_thread.jobs.playing import MIN_LOOP_DURATION, Playing
+from magnetosuture_thread.jobs.replay_inputs import Given, opened, replay_summary, write_results
+from magnetosuture_thread.offline.predictions import read_observations
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.interruption import Interruption
     from magnetosuture_thread.nodes.replay import LiveReplay
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
-def replay(
+def replay_live(
     bag_path: Path,
     output: Path,
     *,
@@ -49,7 +49,7 @@ def replay(
     loop: bool = False,
     remap: Mapping[str, str] | None = None,
     frame: str = "dish",
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> ReplaySummary:
     """Play a bag through the nodes as processes of their own, and judge what they made of it.
@@ -69,7 +69,7 @@ def replay(
         loop: whether it is played over and over until it is interrupted; the first pass is recorded and judged.
         remap: other names for topics of the bag, by the old one.
         frame: the bag's name of the dish frame.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
         progress: called with the share played, 0 to 1.
 
     Raises:
@@ -88,35 +88,36 @@ def replay(
                 duration=duration,
                 remap=remap or {},
                 frame=frame,
-                say=say,
+                log=log,
             )
         )
-        if loop and given.duration < SHORTEST_LOOP:
+        if loop and given.duration < MIN_LOOP_DURATION:
             raise BagError(
-                bag_path, f"gives {given.duration:.2f} s to play over and over; expected {SHORTEST_LOOP:g} s or more"
+                bag_path,
+                f"gives {given.duration:.2f} s to play over and over; expected {MIN_LOOP_DURATION:g} s or more",
             )
-        remark, refused = _look_through(given, say)
+        remark, refused = _look_through(given, log)
         if rate < 1.0:
-            say("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
+            log("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
         if rate > 1.0:
-            say("played faster than recorded: latencies count what waits in the queues")
+            log("played faster than recorded: latencies count what waits in the queues")
         folder = stack.enter_context(whole_folder(output))
-        job = _Replay(given, folder, rate, remark, refused, say, progress)
+        job = _Replay(given, folder, rate, remark, refused, log, progress)
         summary, problem = job.run(loop)
     if problem:
         raise GraphError(f"{problem}; the first pass is in {output}")
     return summary
 
 
-def _look_through(given: Given, say: Say) -> tuple[str, dict[str, int]]:
+def _look_through(given: Given, log: Log) -> tuple[str, dict[str, int]]:
     """Check recorded poses and threads before any node starts; return what is odd, and what cannot be used."""
     if given.source == "camera":
         return "", {}
-    looked = sights(given.recording, given.setup, source="poses", start=given.start, duration=given.duration)
+    looked = read_observations(given.recording, given.setup, source="poses", start=given.start, duration=given.duration)
     for _ in looked:
         pass
     if remark := looked.thread_problem():
-        say(remark)
+        log(remark)
     return remark, dict(looked.refused)
 
 
@@ -129,7 +130,7 @@ class _Replay:
     rate: float
     remark: str
     refused: dict[str, int]
-    say: Say
+    log: Log
     progress: Progress
 
     def run(self, loop: bool) -> tuple[ReplaySummary, str]:
@@ -151,7 +152,7 @@ class _Replay:
         problem = ""
         with reserved_domain() as domain:
             environment = graph_environment(domain)
-            self.say(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
+            self.log(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
             with (
                 environment_of(environment),
                 NodeProcesses(playing.processes, playing.arguments(qos), environment, self.folder / "logs") as nodes,
@@ -171,12 +172,12 @@ class _Replay:
                     nodes=len(playing.nodes),
                     receive=outputs.write,
                     watch=watch,
-                    say=self.say,
+                    log=self.log,
                 )
                 try:
                     with outputs, interruption:
                         self._play(live, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE_REPLAY}")
-                    self.say("judging what came out")
+                    self.log("judging what came out")
                     summary = self._judge(live)
                     if loop:
                         problem = self._play_on(live, interruption)
@@ -189,19 +190,19 @@ class _Replay:
     def _play(self, live: LiveReplay, pause: str) -> None:
         live.wait_for_graph()
         at = f" at {self.rate:g} times the speed" if self.rate != 1.0 else ""
-        self.say(f"playing {self.given.duration:.1f} s{at}")
-        self.say(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
+        self.log(f"playing {self.given.duration:.1f} s{at}")
+        self.log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
         length = max(self.given.duration, 1e-9)
         live.play(Playing(self.given).records(), lambda time: self.progress(min(1.0, time / length)))
 
     def _play_on(self, live: LiveReplay, interruption: Interruption) -> str:
         """Play on for who watches; return what ended it, if it was not a person."""
-        self.say("the first pass is recorded and judged; playing on until Ctrl-C")
+        self.log("the first pass is recorded and judged; playing on until Ctrl-C")
         try:
             with interruption:
                 live.play_on(Playing(self.given).records)
         except KeyboardInterrupt:
-            self.say("ended")
+            self.log("ended")
         except GraphError as error:
             return str(error)
         return ""
@@ -211,16 +212,18 @@ class _Replay:
         given = self.given
         collector = GraphCollector(given.setup.model.thread_length)
         recorded, replayed = CurrentSeries(), CurrentSeries()
-        truth = [c for c in (TRUTH_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
+        truth = [c for c in (GROUND_TRUTH_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
         for record in given.recording.records(truth, start=given.start, duration=given.duration):
             message = record.decode()
-            collector.take(record.topic, message) if record.topic == TRUTH_THREAD.recorded else recorded.take(message)
+            collector.add(record.topic, message) if record.topic == GROUND_TRUTH_THREAD.recorded else recorded.add(
+                message
+            )
         made = Bag(self.folder / "bag")
         for record in made.records(set(made.topics)):
             message = record.decode()
-            collector.take(record.topic, message)
+            collector.add(record.topic, message)
             if record.topic == CURRENTS.recorded:
-                replayed.take(message)
+                replayed.add(message)
         metrics, losses = collector.metrics(given.recording.start), live.losses
         source = NEEDLE_POSE.name if given.source == "poses" else ""
         frames = losses.played[source] if source else losses.frames_played
@@ -242,5 +245,5 @@ class _Replay:
             dropped=losses.dropped(),
             remark=self.remark,
         )
-        write_results(self.folder, given, metrics, summary, self.say)
+        write_results(self.folder, given, metrics, summary, self.log)
         return summary

@@ -14,17 +14,17 @@ from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
-from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SCENE, SEEN_THREAD, TRACKER_STATE
-from magnetosuture_thread.jobs.judge import Given, begin_with_scene, opened, replay_summary, write_results
+from magnetosuture_thread.interface import MARGINS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, SCENE, TRACKER_STATE
 from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.replay_inputs import Given, begin_with_scene, opened, replay_summary, write_results
 from magnetosuture_thread.messages.cdr import time_of
 from magnetosuture_thread.messages.packing import packed_margins, packed_path, packed_pose, packed_prediction
 from magnetosuture_thread.model.session import WAITING
-from magnetosuture_thread.offline.predictions import Step, predictions, sights
-from magnetosuture_thread.offline.sights import NOT_NEWER, Sights
-from magnetosuture_thread.vision.session import Seen
+from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationReader
+from magnetosuture_thread.offline.predictions import Step, predictions, read_observations
+from magnetosuture_thread.vision.session import FrameMeasurement
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -38,7 +38,7 @@ def replay_offline(
     duration: float | None = None,
     remap: Mapping[str, str] | None = None,
     frame: str = "dish",
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> ReplaySummary:
     """Put a bag through tracker and model without a graph, and judge what they made of it.
@@ -57,7 +57,7 @@ def replay_offline(
         duration: [s]; to the bag's end if None.
         remap: other names for topics of the bag, by the old one.
         frame: the bag's name of the dish frame.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -73,13 +73,13 @@ def replay_offline(
             duration=duration,
             remap=remap or {},
             frame=frame,
-            say=say,
+            log=log,
         ) as given,
         whole_folder(output) as folder,
     ):
         what = "camera frames" if given.source == "camera" else "recorded poses"
-        say(f"predicting by the {what} of {given.duration:.1f} s")
-        seen = sights(
+        log(f"predicting by the {what} of {given.duration:.1f} s")
+        seen = read_observations(
             given.recording,
             given.setup,
             source=given.source,
@@ -104,11 +104,11 @@ def replay_offline(
                 elif step.outcome.problem is not None:
                     refused[_kind(step.outcome.problem)] += 1
             taken = time.perf_counter() - began
-        say(f"{given.duration / taken:.3g} times as fast as it was recorded; judging what came out")
+        log(f"{given.duration / taken:.3g} times as fast as it was recorded; judging what came out")
         summary, remark = _summary(given, seen, metrics, refused, given.duration / taken), seen.thread_problem()
         if remark:
-            say(remark)
-        write_results(folder, given, metrics, summary, say)
+            log(remark)
+        write_results(folder, given, metrics, summary, log)
         return summary
 
 
@@ -119,7 +119,9 @@ def _kind(problem: Exception) -> str:
     return NOT_NEWER if problem.field == "needle pose stamp" else f"a {problem.field} that cannot be used"
 
 
-def _summary(given: Given, seen: Sights, metrics: RunMetrics, refused: Counter[str], speed: float) -> ReplaySummary:
+def _summary(
+    given: Given, seen: ObservationReader, metrics: RunMetrics, refused: Counter[str], speed: float
+) -> ReplaySummary:
     """Return the figures.
 
     Raises:
@@ -155,10 +157,10 @@ class _Output:
         version: of the scene that the bag begins with.
     """
 
-    def __init__(self, bag: BagWriter, seen: Sights, version: str) -> None:
+    def __init__(self, bag: BagWriter, seen: ObservationReader, version: str) -> None:
         self._bag = bag
         states = [TRACKER_STATE] if seen.source == "camera" else []
-        for channel in (NEEDLE_POSE, *states, SEEN_THREAD, PREDICTED_THREAD, MARGINS):
+        for channel in (NEEDLE_POSE, *states, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
             bag.add_topic(channel.recorded, channel.type_name)
         self._version = version
         seen.on_frame, seen.on_record = self._frame, self._record
@@ -175,13 +177,13 @@ class _Output:
         packed = packed_margins(time_of(stamp), step.margins, reason, outcome.scene_version)
         self._bag.write(MARGINS.recorded, max(stamp, 0), packed)
 
-    def _frame(self, stamp: int, seen: Seen) -> None:
+    def _frame(self, stamp: int, seen: FrameMeasurement) -> None:
         track = seen.track
         if seen.tracked:
             pose = packed_pose(time_of(stamp), track.tail, track.heading, track.covariance)
             self._bag.write(NEEDLE_POSE.recorded, max(stamp, 0), pose)
             if len(seen.centreline):
-                self._bag.write(SEEN_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
+                self._bag.write(MEASURED_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
         self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), MESSAGES.tracker_state(stamp, track))
 
     def _record(self, stamp: int, record: RecordedMessage) -> None:

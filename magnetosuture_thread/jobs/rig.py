@@ -18,12 +18,12 @@ from magnetosuture_thread.evaluation.reference_scores import (
     run_case,
     score_each,
 )
-from magnetosuture_thread.rig.mechanics.dynamics import Attachment, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 
 SEGMENTS = 100
 FORMULATION, SOLVER = "rig", "newton"
-DRIVEN = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
+NEEDLE_BODY = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
 """Of a needle whose motion is given, the body does not matter."""
 
 
@@ -52,7 +52,7 @@ def score_rig(
     def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
         thread = rig_thread(reference, path, segments or SEGMENTS)
         surface, heading = Surface(discs=reference.discs), float(reference.headings[0])
-        rig = RigDynamics(DRIVEN, thread, surface, None, reference.tails[0], heading, reference.threads[0])
+        rig = RigDynamics(NEEDLE_BODY, thread, surface, None, reference.tails[0], heading, reference.threads[0])
         speed = np.linalg.norm(np.diff(reference.tails, axis=0), axis=1) / np.diff(reference.times)
         force = thread.drag_across * thread.length * max(float(speed.max()), 1e-6)
 
@@ -80,7 +80,7 @@ def rig_thread(reference: ReferenceTrajectory, path: Path, segments: int) -> Thr
     try:
         given = reference.metadata["material"]
         length, bending, stretching, across, along, diameter = (float(given[name]) for name in names)
-        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}[reference.metadata["boundary"]]
+        attachment = {"pinned": NeedleJoint.PINNED, "clamped": NeedleJoint.CLAMPED}[reference.metadata["boundary"]]
     except NOT_ONE as error:
         raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
     values = (length, bending, stretching, across, along, diameter)

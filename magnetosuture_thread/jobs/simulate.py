@@ -30,7 +30,7 @@ INTERRUPTED = "interrupted"
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 SETTLE = 1.0  # s for all nodes to have found each other
 AFTERWARDS = 0.5  # s that go on once the path is done
-PATIENCE = 3.0  # times the path's own duration, and ...
+TIMEOUT = 3.0  # times the path's own duration, and ...
 SPARE = 20.0  # s of simulated time besides: then a run that never ends is ended
 PATIENT = 15.0  # s for simulated boards to be ready
 FAULT = "fault: "  # what a bridge says of itself that needs a reset
@@ -46,7 +46,7 @@ SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:aut
 # for 75 ms, as happens with two busy cores, would be taken for dead.
 PATIENT_DRIVER = {"roboclaw_answer_timeout": 0.2, "driver_timeout": 0.5}
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -55,9 +55,9 @@ def simulate(
     output: Path,
     *,
     duration: float | None = None,
-    pace: float | None = None,
+    rate: float | None = None,
     boards: bool = False,
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> LoopSummary:
     """Run rig, tracker, model, bridge and path follower as processes of their own, and judge the loop.
@@ -71,10 +71,10 @@ def simulate(
         output: the bag's folder.
         duration: the run ends after this many seconds of the scenario's time, wherever the needle is then;
             when the path is done if None.
-        pace: how much faster than real time, with a simulated clock; in real time if None.
+        rate: how much faster than real time, with a simulated clock; in real time if None.
         boards: whether the bridge drives the rig through simulated RoboClaw boards on pseudo-terminals, by the
             driver for real ones; they keep real time, so not with `pace`.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -92,23 +92,23 @@ def simulate(
             "vision_tracker.image_transport", setup.vision.image_transport, expectation, str(setup.path)
         )
     with whole_folder(output, is_recording=True) as folder:
-        problem = _run(setup, folder, output.name, duration, pace, boards, say, progress)
+        problem = _run(setup, folder, output.name, duration, rate, boards, log, progress)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
     if problem:
         raise GraphError(f"{problem}; what was recorded is in {output}")
-    say("judging the run")
-    return judge(Bag(output), setup).summary(setup.name)
+    log("judging the run")
+    return measure_loop(Bag(output), setup).summary(setup.name)
 
 
-def judge(bag: Bag, setup: Setup) -> LoopCollector:
+def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
     """Return all that a simulated run's bag says, put side by side."""
     collector = LoopCollector(
         setup.model.thread_length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
     )
     camera = {channel.recorded for channel in CAMERA.values()}
     for record in bag.records(set(bag.topics) - camera):
-        collector.take(record.topic, record.time, record.decode())
+        collector.add(record.topic, record.time, record.decode())
     return collector
 
 
@@ -117,9 +117,9 @@ def _run(
     folder: Path,
     name: str,
     duration: float | None,
-    pace: float | None,
+    rate: float | None,
     boards: bool,
-    say: Say,
+    log: Log,
     progress: Progress,
 ) -> str:
     """Run the graph and record it; return what went wrong, so that the bag stays."""
@@ -136,8 +136,8 @@ def _run(
     from magnetosuture_thread.nodes.recorder import Recorder
 
     arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE]
-    if pace is not None:
-        arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:pace:={float(pace)}"]
+    if rate is not None:
+        arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(rate)}"]
     notes = {
         "setup": setup.name,
         SCENARIO_NOTE: setup.path.read_text(encoding="utf-8"),
@@ -154,7 +154,7 @@ def _run(
         arguments += _wired(ports, len(setup.coils.coil_angles)) if boards else SIMULATED_COILS
         for topic in taken:
             bag.add_topic(topic.channel.recorded, topic.channel.type_name)
-        say(f"starting {SCENE_SERVER}, rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
+        log(f"starting {SCENE_SERVER}, rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
         with (
             environment_of(environment),
             NodeProcesses(
@@ -182,7 +182,7 @@ def _run(
                 interruption.check()
                 nodes.check()
 
-            recorder = Recorder(domain, taken, simulated_clock=pace is not None, receive=receive)
+            recorder = Recorder(domain, taken, simulated_clock=rate is not None, receive=receive)
             try:
                 perhaps = (
                     topics.NEEDLE_COMMAND,
@@ -195,11 +195,11 @@ def _run(
                     _wait(recorder, check, {topic.name for topic in perhaps})
                 if boards:
                     _arm(CoilClient)
-                say("running" if pace is None else f"running at {pace:g} times the speed")
+                log("running" if rate is None else f"running at {rate:g} times the speed")
                 running = True
                 nodes.start("path_follower", arguments=BRIDGE_AND_RECORDER)
                 with interruption:
-                    return _follow(recorder, check, setup, duration, pace or 1.0, progress)
+                    return _follow(recorder, check, setup, duration, rate or 1.0, progress)
             except KeyboardInterrupt:
                 if not running:
                     raise
@@ -247,12 +247,12 @@ def _follow(
     check: Callable[[], None],
     setup: Setup,
     duration: float | None,
-    pace: float,
+    rate: float,
     progress: Progress,
 ) -> str:
     """Record until the needle is at the end of its path, or the time is over; return what went wrong."""
     points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
-    longest = PATIENCE * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE + (duration or 0.0)
+    longest = TIMEOUT * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE + (duration or 0.0)
     began = time.monotonic()
     following, started = False, began
     while True:
@@ -263,13 +263,13 @@ def _follow(
         if "path_follower" not in recorder.said and time.monotonic() - started < START_TIMEOUT:
             began = time.monotonic()  # its process is still loading
         said, values = recorder.said.get("path_follower", ("", {}))
-        elapsed = (time.monotonic() - began) * pace
+        elapsed = (time.monotonic() - began) * rate
         done = float(values.get("progress", 0.0))
         progress(done if duration is None else min(1.0, elapsed / duration))
         if duration is not None and elapsed > duration + (0.0 if following else SPARE):
             return ""
         if duration is None and said == "done":
-            recorder.spin(AFTERWARDS / pace)
+            recorder.spin(AFTERWARDS / rate)
             return ""
         held = recorder.said.get("coil_bridge", ("", {}))[0]
         if held.startswith(FAULT):

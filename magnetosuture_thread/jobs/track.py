@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.jobs.frames import Frame, FrameSource, numbered
+from magnetosuture_thread.jobs.frames import FrameFile, FrameSource, numbered
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
@@ -80,7 +80,7 @@ def track(
     *,
     overlay: Path | None = None,
     remap: Mapping[str, str] | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    log: Callable[[str], None] = lambda text: None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[TrackedFrame]:
     """Track the needle in frames: each by itself, or over time where they are a bag's.
@@ -91,7 +91,7 @@ def track(
         scene: in which.
         overlay: folder or video to draw into.
         remap: new name of a bag's topic by its recorded name.
-        say: called with a line for a person on what of a bag is damaged or not checked.
+        log: called with a line for a person on what of a bag is damaged or not checked.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -99,7 +99,7 @@ def track(
     """
     source = FrameSource(paths, remap=remap)
     for doubt in source.doubts:
-        say(f"{paths[0]} {doubt}")
+        log(f"{paths[0]} {doubt}")
     tracker = VisionTracker(settings, scene)
     warm_up()
     results = []
@@ -114,11 +114,11 @@ def track(
                 writer.write(name, _drawn(frame.image, result, settings, scene))
             progress((index + 1) / max(source.count, 1))
     for line in source.refused:
-        say(line)
+        log(line)
     return results
 
 
-def _look(tracker: VisionTracker, frame: Frame, in_sequence: bool) -> TrackedFrame:
+def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> TrackedFrame:
     """Look at one frame, and time it."""
     began = time.thread_time()
     try:

@@ -22,9 +22,9 @@ ONE_THREAD = (
     "OPENCV_FOR_THREADS_NUM",
 )
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
-Work = Callable[[Any, Say, Progress], Any]
+Work = Callable[[Any, Log, Progress], Any]
 
 
 class WorkerDiedError(Exception):
@@ -44,7 +44,7 @@ def run_all(
     workers: int,
     *,
     done: Callable[[int, Any], None],
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> None:
     """Do tasks, each by one call; `done` gets them as they end.
@@ -58,7 +58,7 @@ def run_all(
         tasks: can be pickled, like what work returns.
         workers: processes.
         done: called with a task's index and what work returned, or a `WorkerDiedError`.
-        say: called with a line for a person.
+        log: called with a line for a person.
         progress: called with the share of all tasks done, 0 to 1.
     """
     shares = [0.0] * len(tasks)
@@ -69,7 +69,7 @@ def run_all(
 
     if min(workers, len(tasks)) <= 1:
         for index, task in enumerate(tasks):
-            done(index, work(task, say, partial(set_share, index)))
+            done(index, work(task, log, partial(set_share, index)))
             set_share(index, 1.0)
         return
     with _team(work, min(workers, len(tasks))) as team:
@@ -94,7 +94,7 @@ def run_all(
                     _give(worker, waiting)
                     continue
                 if kind == "say":
-                    say(content)
+                    log(content)
                 elif kind == "progress":
                     set_share(worker.task, content)
                 else:

@@ -23,11 +23,11 @@ from magnetosuture_thread.interface import (
     DISH_FRAME,
     FILTER_STATE,
     IMAGE,
+    MEASURED_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
     SCENE,
     SCENE_MARKERS,
-    SEEN_THREAD,
     TIP_SETPOINT,
     TRACKER_STATE,
 )
@@ -141,7 +141,7 @@ class MessageBuilder:
 
     def path(self, header: Any, poses: Sequence[Any]) -> Any:
         """Return a Path of poses."""
-        return self.make(SEEN_THREAD.type_name, header=header, poses=[self.pose_stamped(header, p) for p in poses])
+        return self.make(MEASURED_THREAD.type_name, header=header, poses=[self.pose_stamped(header, p) for p in poses])
 
     def path_message(self, stamp: Any, points: Points) -> Any:
         """Return a polyline of shape (m, 2) [m] as a Path."""

@@ -11,11 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import DISH_FRAME, MARGINS, NEEDLE_POSE, SEEN_THREAD
+from magnetosuture_thread.interface import DISH_FRAME, MARGINS, MEASURED_THREAD, NEEDLE_POSE
 from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
 from magnetosuture_thread.model.friction import Friction, FrictionState
@@ -128,7 +127,7 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, 2.0 * float(np.arctan2(turn.z, turn.w))
 
 
-def path_points(message: Any, field: str = SEEN_THREAD.name) -> Points:
+def path_points(message: Any, field: str = MEASURED_THREAD.name) -> Points:
     """Return a Path as an array of shape (m, 2) [m].
 
     Raises:
@@ -153,7 +152,7 @@ def plane_velocity(message: Any, field: str) -> NDArray[np.float64]:
     return np.array([linear.x, linear.y])
 
 
-class Record(Protocol):
+class SerializedMessage(Protocol):
     """A recorded message."""
 
     @property
@@ -176,13 +175,13 @@ class Record(Protocol):
         """
 
 
-def stamp_of(record: RecordedMessage) -> int:
+def stamp_of(record: SerializedMessage) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
     stamp = header_stamp(record.data)
     return record.time if stamp is None else stamp
 
 
-def read_pose(record: RecordedMessage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_pose(record: SerializedMessage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return tail and heading of a recorded needle pose, each of shape (2,), as `thread_model` gets them.
 
     Raises:
@@ -199,7 +198,7 @@ def read_pose(record: RecordedMessage) -> tuple[NDArray[np.float64], NDArray[np.
     return np.array([position.x, position.y]), heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
 
 
-def read_path(record: RecordedMessage) -> Points:
+def read_path(record: SerializedMessage) -> Points:
     """Return a recorded path as an array of shape (m, 2) [m].
 
     Raises:

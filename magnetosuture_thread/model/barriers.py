@@ -197,7 +197,7 @@ class ObstacleAvoidance(CompiledBarrier):
             nodes=found.node[chosen][:, None],
             obstacle=found.obstacle[chosen],
             value=value,
-            gradient=found.outward[chosen][:, None, :],
+            gradient=found.normal[chosen][:, None, :],
             clearance=value,
         )
 
@@ -236,7 +236,7 @@ class SquaredObstacleAvoidance(CompiledBarrier):
             nodes=found.node[chosen][:, None],
             obstacle=found.obstacle[chosen],
             value=value,
-            gradient=(slope[:, None] * found.outward[chosen])[:, None, :],
+            gradient=(slope[:, None] * found.normal[chosen])[:, None, :],
             clearance=signed - self.distance,
         )
 

@@ -45,7 +45,7 @@ def of_material(
     return values
 
 
-def told_material(message: Any) -> dict[str, Any]:
+def parse_material(message: Any) -> dict[str, Any]:
     """Return `of_material` for a ThreadMaterial, whoever decoded it."""
     return of_material(
         name=message.name,

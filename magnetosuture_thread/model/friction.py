@@ -119,7 +119,7 @@ class NodeMotion:
         self._last: Points | None = None
         self._velocity: Points | None = None
 
-    def take(self, vertices: Points, interval: float) -> NDArray[np.float64]:
+    def update(self, vertices: Points, interval: float) -> NDArray[np.float64]:
         """Return each node's speed, shape (n + 1,) [m/s].
 
         Args:

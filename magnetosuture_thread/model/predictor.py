@@ -20,7 +20,7 @@ from magnetosuture_thread.model.factory import make_formulation, make_solver, wo
 from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
-from magnetosuture_thread.model.succession import resample_state
+from magnetosuture_thread.model.resampling import resample_state
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.scene import Scene
 

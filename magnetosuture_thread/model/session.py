@@ -127,7 +127,7 @@ class ThreadSession:
         """
         self.prepare(settings, scene)()
 
-    def wants_seen(self, stamp: int) -> bool:
+    def needs_measured_thread(self, stamp: int) -> bool:
         """Return whether a seen thread of this stamp [ns] would be of use; most are not."""
         if self.settings.initial_shape != "measured":
             return False
@@ -143,7 +143,7 @@ class ThreadSession:
         Returns:
             What comes of the poses that waited for it, each worked out when it is asked for.
         """
-        if not self.wants_seen(stamp):
+        if not self.needs_measured_thread(stamp):
             return iter(())
         self._seen = (stamp, centreline)
         # The pose of the same frame may have come first, and others after it.
@@ -176,7 +176,7 @@ class ThreadSession:
         except (InvalidInputError, SolverError) as error:
             return PredictionResult(stamp, problem=error, scene_version=self.scene_version)
         self._last = stamp
-        speeds = self._motion.take(prediction.positions, prediction.interval)
+        speeds = self._motion.update(prediction.positions, prediction.interval)
         law = self.settings.friction_law()
         return PredictionResult(stamp, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
 

@@ -309,5 +309,5 @@ def check_scene(settings: ThreadModelSettings, scene: Scene | None) -> None:
         if isinstance(shape.geometry, Disc):
             if shape.geometry.radius < least:
                 raise ConfigurationError(name, shape.geometry.radius, f"a radius {words}")
-        elif not shape.geometry.has_room_for(least):
+        elif not shape.geometry.can_contain(least):
             raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {words}")

@@ -23,7 +23,7 @@ from magnetosuture_thread.nodes.coil_report import CoilReport
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
-from magnetosuture_thread.nodes.scheduling import take_priority
+from magnetosuture_thread.nodes.scheduling import raise_priority
 from magnetosuture_thread.scene import Scene
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
@@ -152,9 +152,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             self._reactivate = True
             self.trigger_deactivate()
 
-    def take_priority(self) -> None:
+    def raise_priority(self) -> None:
         """Set the real-time priority of the loop; meant for a process of its own."""
-        self._report.report_scheduling(take_priority((self.settings or CoilBridgeSettings()).realtime_priority))
+        self._report.report_scheduling(raise_priority((self.settings or CoilBridgeSettings()).realtime_priority))
 
     def destroy_node(self) -> None:
         """Set the coils to zero and close the driver."""
@@ -177,7 +177,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node as a program."""
-    return run(CoilBridgeNode, arguments, CoilBridgeNode.take_priority)
+    return run(CoilBridgeNode, arguments, CoilBridgeNode.raise_priority)
 
 
 if __name__ == "__main__":

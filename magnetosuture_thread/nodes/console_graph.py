@@ -27,7 +27,7 @@ JPEG_QUALITY = 80
 READERS = {
     "tracker": (topics.TRACKER_STATE, console_messages.tracker, 0.0),
     "needle": (topics.NEEDLE_POSE, console_messages.needle, 0.0),
-    "measured": (topics.SEEN_THREAD, console_messages.seen, MEASURED_PERIOD),
+    "measured": (topics.MEASURED_THREAD, console_messages.seen, MEASURED_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, console_messages.predicted, 0.0),
     "margins": (topics.MARGINS, console_messages.margins, 0.0),
     "scene": (topics.SCENE, console_messages.scene, 0.0),

@@ -33,8 +33,8 @@ _ARRAYS = {
     int: Parameter.Type.INTEGER_ARRAY,
     str: Parameter.Type.STRING_ARRAY,
 }
-LONGEST_LIST = 1000  # entries that a parameter may be set to while the node runs: what it builds of them takes time
-_LONGEST_REASON = 400  # characters
+MAX_LIST_LENGTH = 1000  # entries that a parameter may be set to while the node runs: what it builds of them takes time
+_MAX_REASON_CHARS = 400  # characters
 
 
 def _type(about: ConfigurationField) -> Parameter.Type:
@@ -148,9 +148,11 @@ class Changeable(Generic[C]):
 
     def _check_lengths(self, asked: Mapping[str, Any]) -> None:
         for name, value in asked.items():
-            if isinstance(value, list) and len(value) > LONGEST_LIST:
+            if isinstance(value, list) and len(value) > MAX_LIST_LENGTH:
                 where = f"{self.settings.GROUP}.{name}"
-                raise ConfigurationError(where, f"{len(value)} entries", f"at most {LONGEST_LIST} while the node runs")
+                raise ConfigurationError(
+                    where, f"{len(value)} entries", f"at most {MAX_LIST_LENGTH} while the node runs"
+                )
 
     def _put_in_force(self, parameters: Sequence[Parameter]) -> None:
         if self._agreed is not None:
@@ -161,8 +163,8 @@ class Changeable(Generic[C]):
 def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
     """Return why a change was refused, in one line: of a long list its beginning and what was expected."""
     text = " ".join(str(error).split())
-    if len(text) > _LONGEST_REASON:
-        text = f"{text[: _LONGEST_REASON // 2]} … {text[-_LONGEST_REASON // 2 :]}"
+    if len(text) > _MAX_REASON_CHARS:
+        text = f"{text[: _MAX_REASON_CHARS // 2]} … {text[-_MAX_REASON_CHARS // 2 :]}"
     named = error.name.partition(".")[2] if isinstance(error, ConfigurationError) else ""
     return (
         text if named in ("", *asked) else f"{text}; what belongs together is set at once, by set_parameters_atomically"

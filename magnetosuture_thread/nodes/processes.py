@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.nodes.scheduling import take_priority
+from magnetosuture_thread.nodes.scheduling import raise_priority
 
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
 LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
@@ -165,7 +165,7 @@ class NodeProcesses:
 
     def prefer(self, name: str, priority: int) -> str:
         """Give a node a real-time priority, where the system allows any; return how it is scheduled then."""
-        return take_priority(priority, self._processes[name].pid)
+        return raise_priority(priority, self._processes[name].pid)
 
     def kill(self, name: str) -> None:
         """End a node without a word to it, as a crash would."""

@@ -34,7 +34,7 @@ STUCK = 3.0  # s without any answer where poses are left: the model refuses them
 DRAIN_TIMEOUT = 30.0  # s after the last input at the most
 DEPTH = 300  # messages that may wait for a slow node before any is lost
 _AT_ONCE = 100  # outputs taken between two inputs at the most
-_ANSWERS = (topics.NEEDLE_POSE, topics.SEEN_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
+_ANSWERS = (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
 
 
 class Recorded(Protocol):
@@ -66,7 +66,7 @@ class LiveReplay:
         nodes: how many nodes there are to be; all follow /clock.
         receive: called with topic, simulated time [ns] and CDR bytes of every output.
         watch: called while waiting; raises if the graph is broken.
-        say: called with a line for a person when time stands still or goes on.
+        log: called with a line for a person when time stands still or goes on.
 
     Attributes:
         published: of each input topic, when the message of a stamp was published [s].
@@ -83,13 +83,13 @@ class LiveReplay:
         nodes: int,
         receive: Callable[[str, int, bytes], None],
         watch: Callable[[], None],
-        say: Callable[[str], None] = lambda text: None,
+        log: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._time = timeline
         self._nodes = nodes
         self._receive = receive
         self._watch = watch
-        self._say = say
+        self._say = log
         self._last_answer = time.perf_counter()
         self._still, self._last_clock = timeline.start, 0.0
         self._taken = 0

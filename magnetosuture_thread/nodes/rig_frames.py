@@ -10,7 +10,7 @@ from magnetosuture_thread.messages.packing import packed_path
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.rig import Frame
+from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
 
 
@@ -28,15 +28,15 @@ class FramePublisher:
         self._compressed = topics.COMPRESSED_IMAGE.publisher(node)
         self._raw = topics.IMAGE.publisher(node)
         self._info = topics.CAMERA_INFO.publisher(node)
-        self._needle = topics.TRUTH_NEEDLE.publisher(node)
-        self._thread = topics.TRUTH_THREAD.publisher(node)
+        self._needle = topics.GROUND_TRUTH_NEEDLE.publisher(node)
+        self._thread = topics.GROUND_TRUTH_THREAD.publisher(node)
         self.take(camera)
 
     def take(self, camera: DishCamera) -> None:
         """Publish frames of another camera from now on."""
         self._camera = MESSAGES.camera_info(Time().to_msg(), camera.size, camera.view, self._distance)
 
-    def publish(self, nanoseconds: int, frame: Frame) -> None:
+    def publish(self, nanoseconds: int, frame: RigFrame) -> None:
         """Publish a frame with its stamp [ns]; one that got lost has its truth all the same."""
         stamp = Time(nanoseconds=nanoseconds).to_msg()
         if frame.image is not None:

@@ -26,7 +26,7 @@ from magnetosuture_thread.nodes.rig_time import RigTime
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.rig.faults import Fault
-from magnetosuture_thread.rig.rig import Frame, Rig
+from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene
 
@@ -43,7 +43,7 @@ class RigSimulatorNode(Node):
         self._settings = settings = declare(self, RigSettings)
         # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
         simulated = bool(self.get_parameter("use_sim_time").value)
-        pace = settings.pace if simulated else 1.0
+        rate = settings.rate if simulated else 1.0
         self.get_logger().info("loading the rig's kernels; the first start on a machine compiles them")
         scene = initial_scene(settings.scene)
         if scene is None:
@@ -53,18 +53,18 @@ class RigSimulatorNode(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health = Health(self)
         epoch = EPOCH if simulated else self.get_clock().now().nanoseconds
-        self.time = RigTime(self, epoch, pace, simulated=simulated)
+        self.time = RigTime(self, epoch, rate, simulated=simulated)
         self._phase: float | None = None
         self._last_index = -1
         self._frames = self._skipped = 0
-        self._late: deque[tuple[float, int, Frame]] = deque()
+        self._late: deque[tuple[float, int, RigFrame]] = deque()
         self._publisher = FramePublisher(self, self.rig.camera, settings)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
         self._scene = SceneFollower(self, self._health, scene, self.on_scene)
         if simulated:
             self._clocks = topics.CLOCK.publisher(self)
-            self.create_timer(CLOCK_PERIOD / pace, self.on_clock, clock=self._steady)
-        self.create_timer(1.0 / (settings.frame_rate * pace), self.on_frame, clock=self._steady)
+            self.create_timer(CLOCK_PERIOD / rate, self.on_clock, clock=self._steady)
+        self.create_timer(1.0 / (settings.frame_rate * rate), self.on_frame, clock=self._steady)
         self.currents = RigCurrents(self, settings, self._steady, self._apply)
         self.get_logger().info("ready: everything here is simulated")
 
@@ -76,7 +76,7 @@ class RigSimulatorNode(Node):
     def on_fault(self, message: String) -> None:
         """Take a fault that begins now."""
         try:
-            self.rig.faults.add(Fault.asked_for(message.data, max(0.0, self.rig.running)))
+            self.rig.faults.add(Fault.requested_faults(message.data, max(0.0, self.rig.running)))
         except InvalidInputError as error:
             self._health.refuse(error)
 

@@ -21,13 +21,13 @@ class RigTime:
     Args:
         node: that gets the service.
         epoch: the stamp of its beginning, which is now [ns].
-        pace: how much faster than real time it runs.
+        rate: how much faster than real time it runs.
         simulated: whether the stamps are those of a simulated clock.
     """
 
-    def __init__(self, node: Node, epoch: int, pace: float, *, simulated: bool) -> None:
-        self._epoch, self._pace, self._simulated = epoch, pace, simulated
-        self._timeline = Timeline(epoch, pace)
+    def __init__(self, node: Node, epoch: int, rate: float, *, simulated: bool) -> None:
+        self._epoch, self._rate, self._simulated = epoch, rate, simulated
+        self._timeline = Timeline(epoch, rate)
         self._timeline.begin()
         self._began = time.perf_counter()
         self._stood = 0.0  # s of real time, in all pauses that are over
@@ -40,7 +40,7 @@ class RigTime:
 
     def elapsed(self) -> float:
         """Return the rig's own time since its beginning [s]."""
-        return self._timeline.running() * self._pace
+        return self._timeline.running() * self._rate
 
     def stamp(self, elapsed: float) -> int:
         """Return the stamp of a moment in the rig's own time, given in seconds [ns]."""

@@ -8,7 +8,7 @@ from pathlib import Path
 ORDINARY = "ordinary"
 
 
-def take_priority(priority: int, process: int | None = None) -> str:
+def raise_priority(priority: int, process: int | None = None) -> str:
     """Give all threads of a process a real-time priority, and say what came of it.
 
     Under the ordinary scheduling a process that wakes up waits for others that are busy, here by up to some

@@ -63,7 +63,7 @@ class ThreadModelNode(Node):
 
     def listen(self) -> None:
         """Take poses and seen threads from their topics."""
-        topics.SEEN_THREAD.subscribe(self, self.on_measured_thread_message, raw=True)
+        topics.MEASURED_THREAD.subscribe(self, self.on_measured_thread_message, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
 
     def on_scene(self, scene: Scene) -> None:
@@ -97,10 +97,10 @@ class ThreadModelNode(Node):
         only the stamp is read of those.
         """
         stamp = header_stamp(data) or 0
-        if not self._session.wants_seen(stamp):
+        if not self._session.needs_measured_thread(stamp):
             return
         try:
-            centreline = reading.path_points(decoded(topics.SEEN_THREAD, data))
+            centreline = reading.path_points(decoded(topics.MEASURED_THREAD, data))
         except InvalidInputError as error:
             self._health.refuse(error)
             return

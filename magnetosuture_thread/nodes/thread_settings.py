@@ -16,7 +16,7 @@ from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import decoded
 from magnetosuture_thread.nodes.parameters import Changeable
 
-LARGEST = 1 << 18  # bytes of a message; what is larger is not even read
+MAX_MESSAGE_BYTES = 1 << 18  # bytes of a message; what is larger is not even read
 
 
 class ThreadSettings:
@@ -39,9 +39,11 @@ class ThreadSettings:
     def on_material(self, data: bytes) -> None:
         """Take what is newly known of the thread and the liquid, or say why that cannot be."""
         try:
-            if len(data) > LARGEST:
-                raise InvalidInputError(topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {LARGEST}")
-            self._parameters.set(changes.told_material(decoded(topics.MATERIAL, data)))
+            if len(data) > MAX_MESSAGE_BYTES:
+                raise InvalidInputError(
+                    topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}"
+                )
+            self._parameters.set(changes.parse_material(decoded(topics.MATERIAL, data)))
         except MagnetosutureError as error:
             self._health.refuse(error)
 

@@ -32,7 +32,7 @@ RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
-FAR = 10_000  # numbers so far apart are of different publishers
+MAX_SEQUENCE_GAP = 10_000  # numbers so far apart are of different publishers
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Topic:
             taken += 1
             number = info["publication_sequence_number"]
             if number is None or number == UNNUMBERED:
-                number = taken if subscription.get_publisher_count() <= 1 else taken * FAR
+                number = taken if subscription.get_publisher_count() <= 1 else taken * MAX_SEQUENCE_GAP
             callback(message, number)
 
         options = QoSOverridingOptions.with_default_policies()
@@ -120,13 +120,13 @@ CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR)
 NEEDLE_POSE = Topic(interface.NEEDLE_POSE, SENSOR)
 TRACKER_STATE = Topic(interface.TRACKER_STATE, RELIABLE)
 TIP_SETPOINT = Topic(interface.TIP_SETPOINT, RELIABLE)
-TRUTH_NEEDLE = Topic(interface.TRUTH_NEEDLE, RELIABLE)
-TRUTH_THREAD = Topic(interface.TRUTH_THREAD, RELIABLE)
+GROUND_TRUTH_NEEDLE = Topic(interface.GROUND_TRUTH_NEEDLE, RELIABLE)
+GROUND_TRUTH_THREAD = Topic(interface.GROUND_TRUTH_THREAD, RELIABLE)
 OPERATOR_COMMAND = Topic(interface.OPERATOR_COMMAND, RELIABLE)
 FILTER_STATE = Topic(interface.FILTER_STATE, RELIABLE)
 NEEDLE_COMMAND = Topic(interface.NEEDLE_COMMAND, RELIABLE)
 NEEDLE_SETPOINT = Topic(interface.NEEDLE_SETPOINT, RELIABLE)
-SEEN_THREAD = Topic(interface.SEEN_THREAD, RELIABLE)
+MEASURED_THREAD = Topic(interface.MEASURED_THREAD, RELIABLE)
 PREDICTED_THREAD = Topic(interface.PREDICTED_THREAD, RELIABLE)
 MARGINS = Topic(interface.MARGINS, RELIABLE)
 THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE)
@@ -144,7 +144,7 @@ INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND, OPERATOR_COMMAND
 OUTPUTS = (
     NEEDLE_POSE,
     TRACKER_STATE,
-    SEEN_THREAD,
+    MEASURED_THREAD,
     PREDICTED_THREAD,
     MARGINS,
     THREAD_MARKERS,
@@ -156,7 +156,7 @@ OUTPUTS = (
 )
 
 SETTINGS = (SCENE, SCENE_MARKERS, MATERIAL)  # what may be told at any time, or never
-SIMULATED = (TRUTH_NEEDLE, TRUTH_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
+SIMULATED = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
 
 
 def lossless(depth: int) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class VisionTrackerNode(Node):
         self._poses = topics.NEEDLE_POSE.publisher(self)
         self._states = topics.TRACKER_STATE.publisher(self)
         self._followers: list[Follower] = []
-        self._threads = topics.SEEN_THREAD.publisher(self)
+        self._threads = topics.MEASURED_THREAD.publisher(self)
         if settings.image_transport == "compressed":
             topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
         else:

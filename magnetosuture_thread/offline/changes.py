@@ -25,5 +25,5 @@ def changed(
     """
     if record.topic == SCENE.recorded:
         return settings, parse_scene_message(record.decode())
-    values = changes.told_material(record.decode())
+    values = changes.parse_material(record.decode())
     return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values}), scene

@@ -19,7 +19,7 @@ from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.changes import changed
-from magnetosuture_thread.offline.sights import Sights
+from magnetosuture_thread.offline.observations import ObservationReader
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 
@@ -27,7 +27,7 @@ SOURCES = ("auto", "camera", "poses")
 Progress = Callable[[float], None]
 
 
-def sights(
+def read_observations(
     recording: Recording,
     setup: Setup,
     *,
@@ -35,7 +35,7 @@ def sights(
     start: float = 0.0,
     duration: float | None = None,
     progress: Progress = lambda share: None,
-) -> Sights:
+) -> ObservationReader:
     """Return what each camera frame, or each recorded pose, of a bag says, in their order.
 
     Args:
@@ -50,7 +50,7 @@ def sights(
     Raises:
         BagError: the bag does not hold the source; or while going through, a length is not in metres.
     """
-    return Sights(recording, setup, chosen_source(recording, source), start, duration, progress)
+    return ObservationReader(recording, setup, chosen_source(recording, source), start, duration, progress)
 
 
 def chosen_source(recording: Recording, source: str) -> str:
@@ -123,7 +123,7 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
         return Step(sight, outcome, outcome.margins, taken, session.settings, session.scene)
 
     for sight in given:
-        if isinstance(given, Sights):
+        if isinstance(given, ObservationReader):
             _change(session, given)
         if not sight.found:
             continue
@@ -139,7 +139,7 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
             del waiting[next(iter(waiting))]
 
 
-def _change(session: ThreadSession, given: Sights) -> None:
+def _change(session: ThreadSession, given: ObservationReader) -> None:
     """Take what the bag says of scene and thread; what cannot be used is counted, as live."""
     for record in given.changes():
         try:

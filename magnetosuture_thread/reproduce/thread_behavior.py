@@ -21,7 +21,7 @@ from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.simulate import judge, simulate
+from magnetosuture_thread.jobs.simulate import measure_loop, simulate
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.images import decode_image
@@ -31,7 +31,7 @@ SHOWN = 4  # instants of each run
 BORDER = 0.06  # of the dish's diameter, around it in a picture
 ROW = 2.9  # height of a run [inch]
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -60,7 +60,7 @@ def thread_behavior(
     output: Path,
     scenarios: Sequence[str] = TESTS,
     *,
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> list[BehaviorRun]:
     """Run each scenario in a closed loop and put prediction, what was seen, and truth side by side.
@@ -71,7 +71,7 @@ def thread_behavior(
     Args:
         output: folder to make.
         scenarios: names or paths of set-ups with a path for the needle.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -87,8 +87,8 @@ def thread_behavior(
             def advance(share: float, done: int = index) -> None:
                 progress((done + share) / len(setups))
 
-            say(setup.name)
-            simulate(str(setup.path), folder / setup.name, say=say, progress=advance)
+            log(setup.name)
+            simulate(str(setup.path), folder / setup.name, log=log, progress=advance)
             runs.append(_judged(folder / setup.name, setup))
         figures = [run.summary.to_json() for run in runs]
         (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -99,7 +99,7 @@ def thread_behavior(
 def _judged(path: Path, setup: Setup) -> BehaviorRun:
     """Return a run's figures and the frames to show."""
     bag = Bag(path)
-    collector = judge(bag, setup)
+    collector = measure_loop(bag, setup)
     summary = collector.summary(setup.name)
     if not collector.instants:
         raise BagError(path, "holds no predicted thread")

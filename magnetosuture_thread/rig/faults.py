@@ -25,7 +25,7 @@ LIFT_TIME = 0.6  # s in which the needle is carried over the rim
 SKIN_BGR = (120.0, 145.0, 195.0)
 STEEL_BGR = (115.0, 112.0, 108.0)
 GLARE_BGR = (265.0, 265.0, 265.0)
-MOST_FAULTS = 100
+MAX_FAULTS = 100
 HAND_WIDTH, TOOL_WIDTH = 0.28, 0.07  # of the dish's diameter
 GLARE_SIZE = (0.3, 0.55)  # least and greatest radius, of the needle's length
 
@@ -65,7 +65,7 @@ class Fault:
         return cls(words[0], start, duration)
 
     @classmethod
-    def asked_for(cls, text: str, time: float) -> Fault:
+    def requested_faults(cls, text: str, time: float) -> Fault:
         """Read `KIND DURATION` as a fault that begins at a time [s].
 
         >>> Fault.asked_for("glare 0.5", 7.0)
@@ -108,7 +108,7 @@ class FaultSchedule:
 
     def add(self, fault: Fault) -> None:
         """Take one more fault, and forget those that are over."""
-        self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-MOST_FAULTS:]
+        self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-MAX_FAULTS:]
 
     def kinds(self, time: float) -> frozenset[str]:
         """Return the kinds in force at a time [s]."""

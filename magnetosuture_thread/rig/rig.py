@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Frame:
+class RigFrame:
     """One frame and the truth of its moment.
 
     Attributes:
@@ -155,7 +155,7 @@ class Rig:
         text = "running" if self.running >= 0.0 else "waiting for the first current"
         return f"{text}, with {faults}" if faults else text
 
-    def look(self, time: float) -> Frame:
+    def look(self, time: float) -> RigFrame:
         """Take a frame at a time since the start [s]."""
         self.advance(time)
         faults, dynamics, running = self.faults, self._dynamics, self.running
@@ -165,4 +165,4 @@ class Rig:
         if not faults.drops(running, float(self._random.uniform())):
             covers = faults.covers(running, tail, dynamics.tip + away)
             image = self.camera.render(tail, dynamics.heading, thread, covers, faults.gain(running))
-        return Frame(self.time, image, faults.lateness(running), tail, dynamics.heading, thread)
+        return RigFrame(self.time, image, faults.lateness(running), tail, dynamics.heading, thread)

@@ -16,19 +16,18 @@ from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import LOOK_OF_KIND, LOOKS, Lighting, Look
-from magnetosuture_thread.rig.camera.scene import Scene as CameraScene
+from magnetosuture_thread.rig.camera.scene import LOOK_OF_KIND, LOOKS, CameraScene, Lighting, Look
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
+from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
 from magnetosuture_thread.rig.power.process import StageProcess
 from magnetosuture_thread.scene import Scene, find_collision
 from magnetosuture_thread.shared_parameters import shared_parameter
 
-LARGEST_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
+MAX_STEP = 4e-3  # s; twice the step costs half the time and is as exact to 0.01 % of the length
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class RigSettings(Configuration):
 
     GROUP: ClassVar[str] = "rig_simulator"
 
-    pace: float = quantity(
+    rate: float = quantity(
         1.0, "how much faster than real time /clock runs, where use_sim_time is set", minimum=0.5, maximum=5.0
     )
     seed: int = quantity(0, "of dust, sensor noise and faults", minimum=0, maximum=2**31 - 1)
@@ -242,7 +241,7 @@ class RigSettings(Configuration):
                 stretching_stiffness=self.thread_stretching_stiffness,
                 drag_across=self.thread_drag_across,
                 drag_along=self.thread_drag_along,
-                attachment=Attachment(self.thread_attachment),
+                attachment=NeedleJoint(self.thread_attachment),
                 diameter=self.thread_diameter,
             ),
             surface=self.surface(scene),
@@ -250,5 +249,5 @@ class RigSettings(Configuration):
             tail=tail,
             heading=heading,
             thread_points=behind,
-            largest_step=LARGEST_STEP,
+            largest_step=MAX_STEP,
         )

@@ -50,7 +50,7 @@ def measure(
     points: Points,
     scene: PackedScene,
     distances: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> None:
     """Write the signed distance of each point from each disc, then polygon, (m, s), and its gradient, (m, s, 2)."""
     nowhere, none, nor = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
@@ -63,10 +63,10 @@ def measure(
                 qx, qy = x - scene.discs[s, 0], y - scene.discs[s, 1]
                 away = math.hypot(qx, qy)
                 distances[i, s] = away - scene.discs[s, 2]
-                outward[i, s, 0], outward[i, s, 1] = (qx / away, qy / away) if away > 0.0 else (1.0, 0.0)
+                normal[i, s, 0], normal[i, s, 1] = (qx / away, qy / away) if away > 0.0 else (1.0, 0.0)
             else:
                 found = polygon_distance(x, y, s - discs, guess, scene, nowhere, none, nor)
-                distances[i, s], outward[i, s, 0], outward[i, s, 1], guess = found
+                distances[i, s], normal[i, s, 0], normal[i, s, 1], guess = found
 
 
 @compiled
@@ -78,7 +78,7 @@ def find_rows(
     keep_wall: float,
     scene: PackedScene,
     distances: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
     margin: NDArray[np.float64],
     gradient: NDArray[np.float64],
     bend: NDArray[np.float64],
@@ -94,7 +94,7 @@ def find_rows(
         keep_wall: the same from the wall [m].
         scene: packed.
         distances: see `measure`.
-        outward: see `measure`.
+        normal: see `measure`.
         margin: h, shape (k,) [m].
         gradient: of h by the point, unit vectors, shape (k, 2).
         bend: second derivative of h along the boundary, shape (k,) [1/m].
@@ -132,7 +132,7 @@ def find_rows(
                     got = search_edges(x, y, far, scene.edges, base, nowhere, -1, edges, least, found, ways)
                     local = got.rows if got.rows >= 0 else least
             if local == 0 or distance <= 0.0:
-                found[0], ways[0, 0], ways[0, 1], local = distance, outward[i, s, 0], outward[i, s, 1], 1
+                found[0], ways[0, 0], ways[0, 1], local = distance, normal[i, s, 0], normal[i, s, 1], 1
             for k in range(local):
                 if rows >= len(margin):
                     break
@@ -253,7 +253,7 @@ def nearest_clear(
     band: float,
     scene: PackedScene,
     distances: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
     added: AddedRows,
     touched: NDArray[np.bool_],
 ) -> tuple[float, float]:
@@ -281,13 +281,13 @@ def nearest_clear(
         band: by which the barriers keep farther away than the certificate asks for [m].
         scene: packed.
         distances: see `measure`.
-        outward: see `measure`.
+        normal: see `measure`.
         added: rows of the barriers that a user has added.
         touched: set for each shape, then each added barrier, then the wall, that changed the velocity.
     """
     speed = math.hypot(vx, vy)
     time, what, where = safe_time(
-        points, turning, ends_only, chord_x, chord_y, turn, vx, vy, hold, keep, keep_wall, scene, distances, outward
+        points, turning, ends_only, chord_x, chord_y, turn, vx, vy, hold, keep, keep_wall, scene, distances, normal
     )
     swiftest = 0.0
     for i in range(len(points)):
@@ -303,7 +303,7 @@ def nearest_clear(
         keep_wall + band,
         scene,
         distances,
-        outward,
+        normal,
         margin,
         gradient,
         bend,
@@ -334,7 +334,7 @@ def nearest_clear(
         if not holds:
             break
         time, ended, where = safe_time(
-            points, turning, ends_only, chord_x, chord_y, turn, x, y, hold, keep, keep_wall, scene, distances, outward
+            points, turning, ends_only, chord_x, chord_y, turn, x, y, hold, keep, keep_wall, scene, distances, normal
         )
         share = 1.0 if time >= hold else SURE * time / hold
         off = (share * x - vx) ** 2 + (share * y - vy) ** 2

@@ -198,7 +198,7 @@ def safe_time(
     keep_wall: float,
     scene: PackedScene,
     distances: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> tuple[float, int, int]:
     """Return for how long a motion keeps the needle clear, at most `hold`, what ends it, and which point meets it.
 
@@ -219,7 +219,7 @@ def safe_time(
         keep_wall: least distance of a point from the wall [m].
         scene: packed.
         distances: signed distance of each point from each disc, then polygon, shape (m, s) [m].
-        outward: its gradient, shape (m, s, 2).
+        normal: its gradient, shape (m, s, 2).
 
     Returns:
         The time [s]; the index of the shape in the scene, `WALL` or `NOTHING`; the index of the point, and -1 for none.
@@ -255,8 +255,8 @@ def safe_time(
                     py,
                     omega,
                     distances[i, s],
-                    outward[i, s, 0],
-                    outward[i, s, 1],
+                    normal[i, s, 0],
+                    normal[i, s, 1],
                     s - discs,
                     keep,
                     best,

@@ -61,7 +61,7 @@ class _Pose:
     turning: Vector
     chord: tuple[float, float]
     distances: Vector
-    outward: Vector
+    normal: Vector
 
 
 class NeedleSafetyFilter:
@@ -236,7 +236,7 @@ class NeedleSafetyFilter:
             BAND,
             self._packed,
             pose.distances,
-            pose.outward,
+            pose.normal,
             self._added_rows(pose) if self._barriers else NO_ROWS,
             self._touched,
         )
@@ -282,7 +282,7 @@ class NeedleSafetyFilter:
             self._keep_wall,
             self._packed,
             pose.distances,
-            pose.outward,
+            pose.normal,
         )
         found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
         if not self._barriers:
@@ -364,9 +364,9 @@ class NeedleSafetyFilter:
         e = self.kinematics.chord_direction(np.array([c, s]))
         points = self._points @ turn + tail
         shapes = len(self._packed.shapes)
-        distances, outward = np.empty((len(points), shapes)), np.empty((len(points), shapes, 2))
-        measure(points, self._packed, distances, outward)
-        self._pose = _Pose(key, points, self._turning @ turn, (float(e[0]), float(e[1])), distances, outward)
+        distances, normal = np.empty((len(points), shapes)), np.empty((len(points), shapes, 2))
+        measure(points, self._packed, distances, normal)
+        self._pose = _Pose(key, points, self._turning @ turn, (float(e[0]), float(e[1])), distances, normal)
         return self._pose
 
 

@@ -86,7 +86,7 @@ def polygon_distance(
     scene: PackedScene,
     nowhere: NDArray[np.int32],
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> tuple[float, float, float, int]:
     """Return the signed distance of a point from a polygon, its gradient (2), and the block that is nearest.
 
@@ -100,13 +100,13 @@ def polygon_distance(
         scene: packed.
         nowhere: an empty array.
         distance: an empty array.
-        outward: an empty array of shape (0, 2).
+        normal: an empty array of shape (0, 2).
     """
     first, last = scene.polygons[polygon, 0], scene.polygons[polygon, 1]
     best, block = Nearest(0, np.inf, np.inf, 0.0, 0.0, 0.0), -1
     if first <= guess < last:
         base, count = scene.ranges[guess, 0] * EDGE_WIDTH, scene.ranges[guess, 1]
-        best = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, outward)
+        best = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, normal)
         block = guess
     reach = math.sqrt(best.square)
     for k in range(first, last):
@@ -115,7 +115,7 @@ def polygon_distance(
         if k == guess or dx * dx + dy * dy >= far * far:
             continue
         base, count = scene.ranges[k, 0] * EDGE_WIDTH, scene.ranges[k, 1]
-        found = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, outward)
+        found = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, normal)
         if found.square < best.square:
             best, block, reach = found, k, math.sqrt(found.square)
     return best.signed, best.x, best.y, block

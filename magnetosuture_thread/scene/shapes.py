@@ -112,7 +112,7 @@ def _rectangle(fields: ShapeFields, corner_radius: float) -> Polygon:
 def _polygon(fields: ShapeFields, corner_radius: float) -> Polygon:
     """Return a polygon; a corner at an edge too short for the corner radius gets a smaller one."""
     polygon = Polygon(fields.ring("outline"), tuple(fields.rings("holes", ())))
-    if corner_radius > 0.0 and not Polygon(polygon.outline).has_room_for(corner_radius):
+    if corner_radius > 0.0 and not Polygon(polygon.outline).can_contain(corner_radius):
         raise fields.corner_error(corner_radius, "a radius of which a disc fits into the outline [m]")
     return _rounded(polygon, corner_radius)
 

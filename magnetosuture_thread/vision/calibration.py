@@ -16,8 +16,8 @@ from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-LARGEST_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, the camera is not overhead
-LARGEST_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
+MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, the camera is not overhead
+MAX_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
 CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))  # of a square, clockwise as seen from the top left
 SHARE_WITH_DISH = 0.5  # of the frames must show the dish
 
@@ -114,16 +114,16 @@ def calibrate_by_markers(
     square = np.array(CORNERS, dtype=float)
     points = np.vstack([0.5 * spacing * centre + 0.5 * side * square for centre in square])
     view, residual = _similarity(points, pixels)
-    if residual > LARGEST_RESIDUAL_PX:
-        expected = f"at most {LARGEST_RESIDUAL_PX} px, from a camera straight above markers at these distances"
+    if residual > MAX_RESIDUAL_PX:
+        expected = f"at most {MAX_RESIDUAL_PX} px, from a camera straight above markers at these distances"
         raise InvalidInputError("frames", f"marker corners off by {residual:.2f} px", expected)
     return Calibration(view, len(grays), residual, scatter, dish_diameter)
 
 
 def _check_scatter(what: str, scatter_px: float) -> None:
     """Refuse frames between which the camera moved."""
-    if scatter_px > LARGEST_SCATTER_PX:
-        expected = f"a camera that stands still: at most {LARGEST_SCATTER_PX} px"
+    if scatter_px > MAX_SCATTER_PX:
+        expected = f"a camera that stands still: at most {MAX_SCATTER_PX} px"
         raise InvalidInputError("frames", f"{what} that differ by {scatter_px:.2f} px", expected)
 
 

@@ -12,13 +12,13 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, prepare
-from magnetosuture_thread.vision.needle.body import SeenNeedle
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 
-LONGEST = 1.05  # of the thread's length, after which the walk ends
+MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 WALL_PX = 4.0  # before which the walk ends
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
@@ -112,7 +112,7 @@ def needles_in(
     settings: VisionTrackerSettings,
     diameter: float,
     toward: np.ndarray | None = None,
-) -> tuple[list[SeenNeedle], list[str]]:
+) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find the needles in a picture, in its own pixels; see `find_needles`."""
     radius, length, width = 0.5 * diameter, settings.needle_length, settings.needle_width
     return find_needles(picture, _local(view, picture), radius, length, width, toward)
@@ -124,12 +124,12 @@ def why_none(refused: list[str]) -> str:
 
 
 def tracked(
-    picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needle: SeenNeedle
+    picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needle: MeasuredNeedle
 ) -> Track:
     """Return what a frame shows whose needle is known, in the picture's own pixels, with the thread's centreline."""
     local = _local(view, picture)
     reach = 0.5 * diameter / view.metres_per_pixel - WALL_PX
-    longest = LONGEST * settings.thread_length / view.metres_per_pixel
+    longest = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
     walk = find_centreline(picture, needle, longest, local.centre_px, reach)
     heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
     covariance = _in_dish(needle, view)
@@ -174,7 +174,7 @@ def _local(view: DishView, picture: Picture) -> DishView:
     return DishView((u - picture.origin[0], v - picture.origin[1]), view.metres_per_pixel, view.rotation)
 
 
-def _in_dish(needle: SeenNeedle, view: DishView) -> np.ndarray:
+def _in_dish(needle: MeasuredNeedle, view: DishView) -> np.ndarray:
     """Return the covariance of tail and heading in the dish frame, shape (3, 3)."""
     along = view.directions_to_dish(needle.direction_px)
     aside = view.directions_to_dish(np.array([-needle.direction_px[1], needle.direction_px[0]]))

@@ -13,7 +13,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.look import State, Track
-from magnetosuture_thread.vision.scene_mask import outlines
+from magnetosuture_thread.vision.scene_mask import mask_outlines
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
 SHIFT = 4  # binary places of a coordinate
@@ -59,7 +59,7 @@ def draw_scene(image: np.ndarray, view: DishView, scene: Scene) -> None:
     """Draw the dish's circle and the outlines of the shapes into a BGR image."""
     _circle(image, np.asarray(view.centre_px), scene.dish.radius / view.metres_per_pixel, DISH, 1)
     for geometry in scene.obstacles:
-        for ring in outlines(geometry):
+        for ring in mask_outlines(geometry):
             _line(image, view.to_pixels(np.vstack([ring, ring[:1]])), SHAPE, 1)
 
 

@@ -26,7 +26,7 @@ DISC_VERTICES = 128
 BLUR_PX = 2.0  # beyond the tolerance, up to which an edge still looks like a dark line
 COVERED_SHARE = 0.1  # of a cell, covered by shapes, from which it does not show the floor
 RIM_STEP_PX = 4.0
-FAR_PX = 1e4  # depth of a pixel in an image without any outline
+OUTSIDE_DEPTH_PX = 1e4  # depth of a pixel in an image without any outline
 
 Mask = NDArray[np.uint8]
 
@@ -92,7 +92,7 @@ class SceneMask:
         """Return how deep the deepest pixel of a box (u, v) to (u, v) lies in a shape; negative if it touches none."""
         left, top = (max(0, int(value)) for value in low)
         box = self.depth[top : max(top, int(high[1]) + 1), left : max(left, int(high[0]) + 1)]
-        return float(cv2.minMaxLoc(box)[1]) if box.size else -FAR_PX
+        return float(cv2.minMaxLoc(box)[1]) if box.size else -OUTSIDE_DEPTH_PX
 
     def without_shapes(self, gray: Mask, floor: Mask, low: Points, high: Points, beyond_px: float) -> Mask:
         """Return a frame in which the shapes have the floor's brightness within a box.
@@ -148,7 +148,7 @@ def scene_mask(
     inside = np.zeros((rows, columns), np.uint8)
     for geometry in scene.obstacles:  # One after the other: shapes may overlap, and even-odd filling would undo it.
         own = np.zeros_like(inside)
-        rings = [np.round(view.to_pixels(ring) * 16.0).astype(np.int32) for ring in outlines(geometry)]
+        rings = [np.round(view.to_pixels(ring) * 16.0).astype(np.int32) for ring in mask_outlines(geometry)]
         cv2.fillPoly(own, rings, 255, cv2.LINE_8, 4)
         cv2.bitwise_or(inside, own, inside)
     # Filling takes every pixel that an edge touches: half a pixel too many, as blur makes a dark shape look too.
@@ -171,7 +171,7 @@ def scene_mask(
     )
 
 
-def outlines(geometry: Disc | Polygon) -> list[Points]:
+def mask_outlines(geometry: Disc | Polygon) -> list[Points]:
     """Return the rings of a shape, a disc as a polygon, each of shape (m, 2) [m]."""
     if isinstance(geometry, Disc):
         turn = np.linspace(0.0, 2.0 * np.pi, DISC_VERTICES, endpoint=False)
@@ -197,7 +197,7 @@ def _rim(scene: Scene, view: DishView) -> Points:
     """Return points along all outlines, with the index of their shape, shape (m, 3) [px]."""
     parts = []
     for index, geometry in enumerate(scene.obstacles):
-        for ring in outlines(geometry):
+        for ring in mask_outlines(geometry):
             closed = view.to_pixels(np.vstack([ring, ring[:1]]))
             points = points_at(closed, np.arange(0.0, arc_lengths(closed)[-1], RIM_STEP_PX))
             parts.append(np.column_stack([points, np.full(len(points), float(index))]))
@@ -207,7 +207,7 @@ def _rim(scene: Scene, view: DishView) -> Points:
 def _distance(inside: Mask) -> NDArray[np.float32]:
     """Return the distance of each pixel of a mask from its edge, half a pixel from the next one; 0 outside [px]."""
     if inside.all():
-        return np.full(inside.shape, FAR_PX, np.float32)
+        return np.full(inside.shape, OUTSIDE_DEPTH_PX, np.float32)
     apart = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(np.maximum(apart - 0.5, 0.0), dtype=np.float32)
 

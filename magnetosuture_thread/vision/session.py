@@ -17,7 +17,7 @@ CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in t
 
 
 @dataclass(frozen=True)
-class Seen:
+class FrameMeasurement:
     """What is told of one frame.
 
     Attributes:
@@ -65,7 +65,7 @@ class TrackerSession:
         """Take another scene; see `VisionTracker.set_scene`."""
         self._tracker.set_scene(scene)
 
-    def on_image(self, time_s: float, image: np.ndarray) -> Seen:
+    def on_image(self, time_s: float, image: np.ndarray) -> FrameMeasurement:
         """Look at the next frame, taken at a time [s]; see `VisionTracker.track`."""
         try:
             track = self._tracker.track(image, time_s)
@@ -78,9 +78,9 @@ class TrackerSession:
             if len(track.centreline) > 1:
                 at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
                 centreline = points_at(track.centreline, at)
-        return Seen(track, centreline)
+        return FrameMeasurement(track, centreline)
 
-    def on_broken(self, problem: InvalidInputError) -> Seen:
+    def on_broken(self, problem: InvalidInputError) -> FrameMeasurement:
         """Count a frame that cannot be looked at, and say why."""
         self.frames += 1
-        return Seen(no_pose(self.missing, str(problem), None), np.empty((0, 2)), problem)
+        return FrameMeasurement(no_pose(self.missing, str(problem), None), np.empty((0, 2)), problem)

@@ -23,20 +23,20 @@ from magnetosuture_thread.vision.look import (
     tracked,
     why_none,
 )
-from magnetosuture_thread.vision.needle.body import SeenNeedle
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 JUMP_BACK = 1.0  # s; time that goes back by more begins anew, as a bag that was wound back
 GATE_PX = 3.0  # that a needle may be off its prediction, beside what its greatest speed allows
 GATE_ANGLE = math.radians(6.0)
-LONGEST_PREDICTION = 0.2  # s; a motion is not extrapolated farther
+MAX_PREDICTION = 0.2  # s; a motion is not extrapolated farther
 MEMORY = 0.5  # weight of the newest velocity
 MARGIN_PX = 32.0  # around the needle and the thread, that is looked at
 BORDER_PX = 20.0  # a thread that ends so near to the region's border may go on
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
 MASKS = 8  # kept
-LEAST_SHARE = 0.9  # of the thread seen before; if less is seen in the region, the whole frame is looked at
+MIN_SHARE = 0.9  # of the thread seen before; if less is seen in the region, the whole frame is looked at
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class _Pose:
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
         """Return tail and heading angle predicted with constant velocity."""
-        after = min(time - self.time, LONGEST_PREDICTION)
+        after = min(time - self.time, MAX_PREDICTION)
         return self.tail + after * self.velocity, self.angle + after * self.turn_rate
 
 
@@ -176,7 +176,7 @@ class VisionTracker:
         """Say whether the thread may go on beyond the part of the frame that was looked at."""
         assert found.view is not None
         line = found.view.to_pixels(found.centreline)
-        if _length(line) < LEAST_SHARE * _length(self._thread[2:]):
+        if _length(line) < MIN_SHARE * _length(self._thread[2:]):
             return True
         u, v = line[-1] - picture.origin
         rows, columns = picture.gray.shape
@@ -187,7 +187,7 @@ class VisionTracker:
 
     def _choose(
         self, gray: np.ndarray, view: DishView, mask: SceneMask | None, time: float
-    ) -> tuple[SeenNeedle | None, Picture | None, str]:
+    ) -> tuple[MeasuredNeedle | None, Picture | None, str]:
         """Return the needle of this frame and the picture it is in, or why there is none."""
         diameter = self._scene.dish.diameter
         if self._last is not None:
@@ -260,13 +260,13 @@ class VisionTracker:
         return left, top, right, bottom
 
 
-def _pose(needle: SeenNeedle, picture: Picture, view: DishView, time: float) -> _Pose:
+def _pose(needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> _Pose:
     heading = view.directions_to_dish(needle.direction_px)
     tail = view.to_dish(needle.tail_px + picture.origin)
     return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0)
 
 
-def _in_whole(part: Picture, needle: SeenNeedle, whole: Picture) -> tuple[Picture, SeenNeedle]:
+def _in_whole(part: Picture, needle: MeasuredNeedle, whole: Picture) -> tuple[Picture, MeasuredNeedle]:
     """Return the whole frame, and a needle of a part of it in the whole frame's pixels."""
     return whole, needle.shifted(part.origin)
 

@@ -28,7 +28,7 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.transforms import rotation_from_message
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.interface import NEEDLE_COMMAND, TRUTH_NEEDLE
+from magnetosuture_thread.interface import GROUND_TRUTH_NEEDLE, NEEDLE_COMMAND
 from test.bags.bags import STRING, cdr, make, read, stamped, texts, write_mcap, write_rosbag
 
 KEPT = QosTime(0, 0)
@@ -192,14 +192,14 @@ def test_a_broken_transform_and_a_far_future_are_refused_and_counted(tmp_path: P
     pose = make("geometry_msgs/msg/PoseStamped", stamped(1, "world"), make("geometry_msgs/msg/Pose", point, turn))
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/tf_static", "tf2_msgs/msg/TFMessage")
-        bag.add_topic(TRUTH_NEEDLE.recorded, TRUTH_NEEDLE.type_name)
+        bag.add_topic(GROUND_TRUTH_NEEDLE.recorded, GROUND_TRUTH_NEEDLE.type_name)
         bag.add_topic(NEEDLE_COMMAND.recorded, "geometry_msgs/msg/Twist")
         bag.write("/tf_static", 1, b"\0\1\0\0\xff\xff\xff\x7f")
         bag.write_message("/tf_static", 2, make("tf2_msgs/msg/TFMessage", [to_world]))
-        bag.write_message(TRUTH_NEEDLE.recorded, 3, pose)
+        bag.write_message(GROUND_TRUTH_NEEDLE.recorded, 3, pose)
         bag.write_message(NEEDLE_COMMAND.recorded, 2**63, make("geometry_msgs/msg/Twist", vector, vector))
     recording = Recording(Bag(tmp_path / "bag"))
-    (found,) = recording.records([TRUTH_NEEDLE])
+    (found,) = recording.records([GROUND_TRUTH_NEEDLE])
     assert found.decode().pose.position.x == 2.0
     assert any("/tf_static: a message cannot be decoded" in reason for reason in recording.refused)
     assert list(recording.records([NEEDLE_COMMAND])) == []

@@ -21,12 +21,12 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
+    GROUND_TRUTH_NEEDLE,
+    GROUND_TRUTH_THREAD,
     IMAGE,
+    MEASURED_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
-    SEEN_THREAD,
-    TRUTH_NEEDLE,
-    TRUTH_THREAD,
 )
 from magnetosuture_thread.messages.cdr import DISH_END, is_in_dish_frame, stamp_and_frame
 from test.bags.bags import STRING, make, stamped
@@ -112,11 +112,11 @@ NO_TWIST = make(
     ],
 )
 def test_every_kind_of_pose(tmp_path: Path, message: Any, variance: float):
-    for number, channel in enumerate((NEEDLE_POSE, TRUTH_NEEDLE)):
+    for number, channel in enumerate((NEEDLE_POSE, GROUND_TRUTH_NEEDLE)):
         bag = bag_of(tmp_path / str(number), ("/theirs", message), remap={"/theirs": channel.recorded})
         found = only(Recording(bag), channel)
         assert (found.header.stamp.sec, found.header.frame_id) == (1, "dish")
-        held = found.pose if channel is TRUTH_NEEDLE else found.pose.pose
+        held = found.pose if channel is GROUND_TRUTH_NEEDLE else found.pose.pose
         assert place(held) == (1.0, 2.0, 3.0)
         if channel is NEEDLE_POSE:
             assert found.pose.covariance[7] == variance
@@ -150,7 +150,7 @@ def marker(kind: int = 4, action: int = 0) -> Any:
     return typestore().types["visualization_msgs/msg/Marker"](**fields)
 
 
-@pytest.mark.parametrize("channel", [SEEN_THREAD, TRUTH_THREAD])
+@pytest.mark.parametrize("channel", [MEASURED_THREAD, GROUND_TRUTH_THREAD])
 @pytest.mark.parametrize(
     "message",
     [
@@ -177,10 +177,10 @@ def test_every_kind_of_thread(tmp_path: Path, message: Any, channel: Any):
 
 
 def test_a_marker_that_is_no_line_is_refused_and_counted(tmp_path: Path):
-    topic = SEEN_THREAD.recorded
+    topic = MEASURED_THREAD.recorded
     bag = bag_of(tmp_path, (topic, marker()), (topic, marker(kind=5)), (topic, marker(action=2)))
     recording = Recording(bag)
-    assert len(list(recording.records([SEEN_THREAD]))) == 1
+    assert len(list(recording.records([MEASURED_THREAD]))) == 1
     assert recording.refused == {"/thread/measured: a marker that is no line strip being added": 2}
 
 
@@ -194,16 +194,20 @@ def test_a_command_without_a_stamp_is_stamped_when_it_was_recorded(tmp_path: Pat
 
 
 def test_what_is_ours_is_passed_on_byte_for_byte(tmp_path: Path):
-    bag = bag_of(tmp_path, (TRUTH_NEEDLE.recorded, pose_stamped()), (TRUTH_NEEDLE.recorded, pose_stamped(2)))
+    bag = bag_of(
+        tmp_path, (GROUND_TRUTH_NEEDLE.recorded, pose_stamped()), (GROUND_TRUTH_NEEDLE.recorded, pose_stamped(2))
+    )
     recording = Recording(bag)
-    assert [r.data for r in recording.records([TRUTH_NEEDLE, IMAGE])] == [r.data for r in bag.records()]
-    assert [r.time for r in recording.records([TRUTH_NEEDLE], start=0.5)] == [2 * SECOND]
+    assert [r.data for r in recording.records([GROUND_TRUTH_NEEDLE, IMAGE])] == [r.data for r in bag.records()]
+    assert [r.time for r in recording.records([GROUND_TRUTH_NEEDLE], start=0.5)] == [2 * SECOND]
 
 
 @pytest.mark.parametrize("little", [True, False])
 @pytest.mark.parametrize("frame", ["dish", "/dish", "dis", "dishes", "", "DISH"])
 def test_the_dish_frame_is_told_from_the_bytes(frame: str, little: bool):
-    data = bytes(typestore().serialize_cdr(pose_stamped(frame=frame), TRUTH_NEEDLE.type_name, little_endian=little))
+    data = bytes(
+        typestore().serialize_cdr(pose_stamped(frame=frame), GROUND_TRUTH_NEEDLE.type_name, little_endian=little)
+    )
     assert stamp_and_frame("/topic", data) == (SECOND, frame)
     assert is_in_dish_frame(data) == (frame == "dish")
     assert not is_in_dish_frame(b"\0\7" + data[2:])  # an order that nobody knows
@@ -237,19 +241,21 @@ def test_poses_of_another_frame_are_transformed(tmp_path: Path):
         ("/tf_static", tf(transform("world", "dish", 10.0, TURN), transform("arm", "tool", 0.5))),
         ("/tf", tf(transform("world", "arm", 10.0, index=2))),
         ("/tf", tf(transform("world", "arm", 20.0, index=4))),
-        (TRUTH_NEEDLE.recorded, pose_stamped(1, "tool")),
-        (TRUTH_NEEDLE.recorded, pose_stamped(3, "/tool")),
-        (TRUTH_NEEDLE.recorded, pose_stamped(4, "tool")),
-        (TRUTH_NEEDLE.recorded, pose_stamped(9, "dish")),
+        (GROUND_TRUTH_NEEDLE.recorded, pose_stamped(1, "tool")),
+        (GROUND_TRUTH_NEEDLE.recorded, pose_stamped(3, "/tool")),
+        (GROUND_TRUTH_NEEDLE.recorded, pose_stamped(4, "tool")),
+        (GROUND_TRUTH_NEEDLE.recorded, pose_stamped(9, "dish")),
     )
     recording = Recording(bag)
-    found: list[Any] = [typestore().deserialize_cdr(r.data, r.type_name) for r in recording.records([TRUTH_NEEDLE])]
+    found: list[Any] = [
+        typestore().deserialize_cdr(r.data, r.type_name) for r in recording.records([GROUND_TRUTH_NEEDLE])
+    ]
     # At 3 s the tool is at x = 10.5 in the world: a point at x = 1 of it is at 1.5 ahead of the dish's origin.
     assert np.allclose([place(m.pose) for m in found], [[2.0, -1.5, 3.0], [2.0, -11.5, 3.0], [1.0, 2.0, 3.0]])
     assert {m.header.frame_id for m in found} == {"dish"}
     turned = found[0].pose.orientation
     assert np.allclose([turned.x, turned.y, turned.z, turned.w], TURN.inv().as_quat())
-    assert recording.refused == {"/ground_truth/needle: nothing tells where its frame tool was at its time": 1}
+    assert recording.refused == {"/ground_truth/needle: no transform from its frame tool at its time": 1}
 
 
 def test_covariances_and_velocities_turn_too(tmp_path: Path):
@@ -275,15 +281,15 @@ def test_a_frame_that_leads_nowhere_says_how_to_help(tmp_path: Path, frame: str)
     bag = bag_of(
         tmp_path,
         ("/tf_static", tf(transform("world", "dish", 10.0))),
-        (TRUTH_NEEDLE.recorded, pose_stamped(1, frame)),
-        (TRUTH_THREAD.recorded, make("nav_msgs/msg/Path", stamped(1), [])),
+        (GROUND_TRUTH_NEEDLE.recorded, pose_stamped(1, frame)),
+        (GROUND_TRUTH_THREAD.recorded, make("nav_msgs/msg/Path", stamped(1), [])),
     )
     with pytest.raises(BagError, match="/ground_truth/needle") as caught:
-        Recording(bag).records([TRUTH_NEEDLE, TRUTH_THREAD])
-    assert "frames told on /tf and /tf_static: dish, world" in str(caught.value)
+        Recording(bag).records([GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD])
+    assert "frames on /tf and /tf_static: dish, world" in str(caught.value)
     assert f"--frame {frame or repr('')}" in str(caught.value)
-    assert len(list(Recording(bag).records([TRUTH_THREAD]))) == 1
-    found = only(Recording(bag, dish_frame=frame), TRUTH_NEEDLE)
+    assert len(list(Recording(bag).records([GROUND_TRUTH_THREAD]))) == 1
+    found = only(Recording(bag, dish_frame=frame), GROUND_TRUTH_NEEDLE)
     assert (place(found.pose), found.header.frame_id) == ((1.0, 2.0, 3.0), "dish")
 
 
@@ -291,13 +297,13 @@ def test_a_topic_of_an_unfit_type_is_named_when_it_is_asked_for(tmp_path: Path):
     text = make(STRING, "here")
     bag = bag_of(
         tmp_path,
-        (TRUTH_NEEDLE.recorded, text),
-        (TRUTH_THREAD.recorded, make("nav_msgs/msg/Path", stamped(1), [])),
+        (GROUND_TRUTH_NEEDLE.recorded, text),
+        (GROUND_TRUTH_THREAD.recorded, make("nav_msgs/msg/Path", stamped(1), [])),
     )
     recording = Recording(bag)
-    assert list(recording.unfit) == [TRUTH_NEEDLE.recorded]
-    assert len(list(recording.records([TRUTH_THREAD]))) == 1
-    for ask in (lambda: recording.records([TRUTH_NEEDLE]), lambda: recording.require(TRUTH_NEEDLE)):
+    assert list(recording.unfit) == [GROUND_TRUTH_NEEDLE.recorded]
+    assert len(list(recording.records([GROUND_TRUTH_THREAD]))) == 1
+    for ask in (lambda: recording.records([GROUND_TRUTH_NEEDLE]), lambda: recording.require(GROUND_TRUTH_NEEDLE)):
         with pytest.raises(
             BagError, match=r"topic /ground_truth/needle is of type std_msgs/msg/String, expected .*PoseStamped"
         ):

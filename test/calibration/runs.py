@@ -17,7 +17,7 @@ from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.rig.mechanics.dynamics import Attachment, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 
 SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, max_step=0.07)  # one step a pose
@@ -40,7 +40,7 @@ def path(time: float, scale: float = 6e-3, period: float = 8.0, phase: float = 0
 def rig_run(ratio: float, duration: float = 6.0, phase: float = 0.0, clamped: bool = False) -> tuple[Observation, ...]:
     """Return what is seen of a thread with this B = EI / zeta_perp [m^4/s], by the rig's rod, exactly."""
     thread = ThreadProperties(
-        LENGTH, 40, ratio * DRAG, 5.6, DRAG, 0.5 * DRAG, Attachment.CLAMPED if clamped else Attachment.PINNED
+        LENGTH, 40, ratio * DRAG, 5.6, DRAG, 0.5 * DRAG, NeedleJoint.CLAMPED if clamped else NeedleJoint.PINNED
     )
     tail, heading = path(0.0, phase=phase)
     behind = tail - LENGTH * np.linspace(0.0, 1.0, 3)[:, None] * [math.cos(heading), math.sin(heading)]

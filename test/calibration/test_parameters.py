@@ -19,9 +19,9 @@ from magnetosuture_thread.calibration.parameters import (
 )
 from magnetosuture_thread.calibration.result import (
     FIXED,
-    AttachmentVerdict,
+    AttachmentDecision,
     BagErrors,
-    Calibration,
+    CalibrationResult,
     Estimate,
 )
 from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
@@ -65,7 +65,7 @@ def test_names_of_settings_are_checked():
         chosen("rod", ["drag_anisotopy"])
 
 
-def found(**changes: Any) -> Calibration:
+def found(**changes: Any) -> CalibrationResult:
     """Return a calibration as a search gives it."""
     settings = replace(
         with_stiffness_over_drag(SETTINGS, 2e-9),
@@ -85,12 +85,12 @@ def found(**changes: Any) -> Calibration:
         "start": SETTINGS,
         "against": "seen",
         "estimates": estimates,
-        "attachment": AttachmentVerdict("clamped", "pinned", {"pinned": 9.0, "clamped": 0.4}),
+        "attachment": AttachmentDecision("clamped", "pinned", {"pinned": 9.0, "clamped": 0.4}),
         "scores": (BagErrors("a/bag", 600, 3.0, 0.4, 0.5, 2.9, 0.1, 0.2), BagErrors("b", 100, 3.0, 0.4)),
         "simulated": ("camera frames", ""),
         "replays": 60,
     }
-    return Calibration(**{**given, **changes})
+    return CalibrationResult(**{**given, **changes})
 
 
 def loaded(text: str, folder: Path) -> ThreadModelSettings:
@@ -128,7 +128,7 @@ def test_a_whole_number_is_written_with_its_point(tmp_path: Path):
 
 
 def test_an_attachment_that_cannot_be_told_is_left_out():
-    verdict = AttachmentVerdict("pinned", "pinned", {"pinned": 0.4, "clamped": 0.41}, "clamped is worse by 0.01 only")
+    verdict = AttachmentDecision("pinned", "pinned", {"pinned": 0.4, "clamped": 0.41}, "clamped is worse by 0.01 only")
     text = to_yaml(found(attachment=verdict))
     assert "# attachment is left out, as this data cannot tell it: clamped is worse by 0.01 only" in text
     assert "    attachment: " not in text

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.calibration.passage import MOST_FRAMES, SETTLING, passage_of
-from magnetosuture_thread.calibration.replays import across, apart, frame_errors, replay
+from magnetosuture_thread.calibration.passage import MAX_FRAMES, SETTLING, passage_of
+from magnetosuture_thread.calibration.replays import across, apart, frame_errors, replay_with_parameters
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import prediction_error_percent
@@ -32,7 +32,7 @@ def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on(
     assert passage.stamps[0] == SIGHTS[5].stamp
     assert SIGHTS[50].stamp not in passage.stamps
     assert passage.times[0] == pytest.approx(SETTLING, abs=0.1)
-    assert len(passage.frames) <= MOST_FRAMES
+    assert len(passage.frames) <= MAX_FRAMES
     assert passage.targets.shape == (len(passage.frames), SETTINGS.segments, 2)
     assert passage.known[:, :-1].all()  # the chords of the seen curve are a little shorter than the thread
     steps = [np.linalg.norm(path(k + 0.01)[0] - path(k)[0]) / 0.01 for k in np.arange(0.3, 6.0, 0.1)]
@@ -48,7 +48,9 @@ def test_after_a_gap_it_begins_anew_from_the_thread_as_seen():
     assert not ((times >= 0.0) & (times < SETTLING)).any()
     model = stiff(TRUE)
     whole, parts = (passage_of("bag", sights, SETTINGS) for sights in (SIGHTS, gap))
-    last = [frame_errors(replay(passage, model), passage.targets, LENGTH)[-1] for passage in (whole, parts)]
+    last = [
+        frame_errors(replay_with_parameters(passage, model), passage.targets, LENGTH)[-1] for passage in (whole, parts)
+    ]
     assert last == pytest.approx([0.0, 0.0], abs=0.3)
 
 
@@ -57,13 +59,13 @@ def test_what_is_not_seen_is_not_known():
     passage = passage_of("bag", part, SETTINGS)
     seen = 39.0 / 63.0 * SETTINGS.segments
     assert (passage.known.sum(axis=1) == int(seen)).all()
-    vertices = replay(passage, SETTINGS)
+    vertices = replay_with_parameters(passage, SETTINGS)
     assert not across(vertices, passage, LENGTH)[~passage.known].any()
 
 
 def test_errors_are_those_of_the_score():
     passage = passage_of("bag", SIGHTS, SETTINGS)
-    vertices = replay(passage, SETTINGS)
+    vertices = replay_with_parameters(passage, SETTINGS)
     found = frame_errors(vertices, passage.targets, LENGTH)
     for slot in (0, 30, -1):
         curve = SIGHTS[int(passage.frames[slot])].seen
@@ -76,7 +78,7 @@ def test_errors_are_those_of_the_score():
 def test_a_thread_that_cannot_start_is_as_wrong_as_can_be():
     passage = passage_of("bag", SIGHTS, SETTINGS)
     passage = replace(passage, initials=(passage.initials[0] + 0.01,))
-    vertices = replay(passage, SETTINGS)
+    vertices = replay_with_parameters(passage, SETTINGS)
     assert np.isnan(vertices).all()
     assert (across(vertices, passage, LENGTH)[passage.known] == 1.0).all()
     assert frame_errors(vertices, passage.targets, LENGTH) == pytest.approx(100.0)

@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.calibration.passage import passage_of
 from magnetosuture_thread.calibration.replays import Best
-from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, Calibration, Estimate
+from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, CalibrationResult, Estimate
 from magnetosuture_thread.calibration.search import calibrate, unfinished
 from magnetosuture_thread.calibration.starts import local_minima
 from magnetosuture_thread.errors import ConfigurationError
@@ -20,7 +20,7 @@ from test.calibration.runs import SETTINGS, SILK, model_run, noisy, rig_passage,
 TRUE = 1.3e-9  # m^4/s
 
 
-def of(found: Calibration, name: str) -> Estimate:
+def of(found: CalibrationResult, name: str) -> Estimate:
     """Return an estimate by its name."""
     return next(estimate for estimate in found.estimates if estimate.name == name)
 

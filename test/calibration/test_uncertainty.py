@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.calibration.fit import Solution, scale_of
+from magnetosuture_thread.calibration.fit import FitSolution, scale_of
 from magnetosuture_thread.calibration.identifiability import assess_identifiability
 from magnetosuture_thread.calibration.parameters import DRAG_ANISOTROPY, REST_CURVATURE, STIFFNESS_OVER_DRAG
 from magnetosuture_thread.calibration.passage import Passage
@@ -22,9 +22,9 @@ X = np.array([STIFFNESS_OVER_DRAG.to_fit(1.3e-9), DRAG_ANISOTROPY.to_fit(0.5), 0
 Array = NDArray[np.float64]
 
 
-def solved(jacobian: Array, residuals: Array, x: Array = X) -> Solution:
+def solved(jacobian: Array, residuals: Array, x: Array = X) -> FitSolution:
     """Return a solution as a fit gives it."""
-    return Solution(SETTINGS, PARAMETERS, x, [residuals], [jacobian], math.inf, 0.0)
+    return FitSolution(SETTINGS, PARAMETERS, x, [residuals], [jacobian], math.inf, 0.0)
 
 
 def random(seed: int, *shape: int) -> Array:
@@ -32,7 +32,7 @@ def random(seed: int, *shape: int) -> Array:
     return np.random.default_rng(seed).standard_normal(shape)
 
 
-def names(solution: Solution, passages: list[Passage]) -> list[str]:
+def names(solution: FitSolution, passages: list[Passage]) -> list[str]:
     """Return why each number cannot be identified."""
     return [verdict.reason for verdict in assess_identifiability(solution, passages)]
 
@@ -65,7 +65,7 @@ def test_residuals_that_stay_for_long_widen_the_interval():
 def test_bags_that_disagree_widen_the_interval():
     jacobian = 0.02 * np.ones((*SHAPE, 1)) + 0.002 * random(1, *SHAPE, 1)
     passages, signs = [PASSAGE] * 4, (1.0, -1.0, 1.0, -1.0)
-    bags = Solution(
+    bags = FitSolution(
         SETTINGS, PARAMETERS[:1], X[:1], [s * 1e-3 * np.ones(SHAPE) for s in signs], [jacobian] * 4, math.inf, 0.0
     )
     alone = uncertainty_of(solved(np.repeat(jacobian, 3, axis=2), 1e-6 * np.ones(SHAPE)), [PASSAGE], [0])

@@ -13,7 +13,7 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene
 
 VIEW = DishView((322.0, 238.0), 8e-5)
 NODES = 40
@@ -55,7 +55,7 @@ def heading() -> float:
 def picture() -> bytes:
     """Return a frame of the scene as the bytes of a JPEG file."""
     obstacles: list[Obstacle] = [Disc((0.0, 0.0), RING), *(Polygon(tuple(block)) for block in BLOCKS)]
-    camera = DishCamera(Scene(obstacles=obstacles), VIEW, seed=5)
+    camera = DishCamera(CameraScene(obstacles=obstacles), VIEW, seed=5)
     return encode_jpeg(camera.render(thread()[0], heading(), thread(200, 4e-5)), 90).tobytes()
 
 

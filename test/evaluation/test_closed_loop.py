@@ -33,22 +33,22 @@ class Loop:
     def truth(self, stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> None:
         """Say where the needle really was."""
         message = Fake(header=header(stamp), pose=planar(x, y, angle))
-        self.collector.take("/ground_truth/needle", stamp, message)
+        self.collector.add("/ground_truth/needle", stamp, message)
 
     def pose(self, stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0, after: int = 0) -> None:
         """Say where it was tracked, and what the tracker said of the frame."""
         message = Fake(header=header(stamp), pose=Fake(pose=planar(x, y, angle)))
-        self.collector.take("/needle/measured_cp", stamp + after, message)
+        self.collector.add("/needle/measured_cp", stamp + after, message)
         self.state(stamp, 1)
 
     def state(self, stamp: int, state: int) -> None:
         """Say what the tracker said of a frame."""
         message = Fake(header=header(stamp), state=state, processing_time=0.004)
-        self.collector.take("/needle/tracker_state", stamp, message)
+        self.collector.add("/needle/tracker_state", stamp, message)
 
     def wish(self, stamp: int, x: float, y: float = 0.0) -> None:
         """Say where the path wanted the tip."""
-        self.collector.take("/needle/setpoint_cp", stamp, Fake(header=header(stamp), pose=planar(x, y, 0.0)))
+        self.collector.add("/needle/setpoint_cp", stamp, Fake(header=header(stamp), pose=planar(x, y, 0.0)))
 
 
 def test_errors_are_against_the_truth_of_the_same_frame():
@@ -102,7 +102,7 @@ def test_only_the_time_of_steering_counts():
         else:
             loop.state(stamp, 2)
     done = Fake(name="path_follower: state", message="done")
-    loop.collector.take("/diagnostics", 10**9, Fake(header=header(10**9), status=[done]))
+    loop.collector.add("/diagnostics", 10**9, Fake(header=header(10**9), status=[done]))
     summary = loop.collector.summary("x")
     assert (summary.frames, summary.tracked, summary.lost, summary.skipped) == (4, 3, 1, 0)
 
@@ -136,6 +136,6 @@ def test_a_run_without_a_pose_says_what_the_nodes_said():
     loop = Loop()
     loop.truth(10**9)
     status = Fake(name="vision_tracker: state", message="searching: no dish in the image")
-    loop.collector.take("/diagnostics", 10**9, Fake(header=header(10**9), status=[status]))
+    loop.collector.add("/diagnostics", 10**9, Fake(header=header(10**9), status=[status]))
     with pytest.raises(GraphError, match="no dish in the image"):
         loop.collector.summary("x")

@@ -20,7 +20,7 @@ def series(*messages: Any) -> CurrentSeries:
     """Return a series of messages."""
     made = CurrentSeries()
     for each in messages:
-        made.take(each)
+        made.add(each)
     return made
 
 

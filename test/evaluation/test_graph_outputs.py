@@ -63,12 +63,12 @@ STRAIGHT = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])
 def test_messages_of_one_stamp_are_put_together():
     collector = GraphCollector(length=1.0)
     for k, clearance in ((1, 0.5), (2, -0.1), (3, 0.2)):
-        collector.take("/thread/predicted", prediction(k * 10**9, STRAIGHT))
-        collector.take("/thread/measured", path(k * 10**9, STRAIGHT + np.array([0.0, 0.01])))
-        collector.take("/thread/margins", margins(k * 10**9, clearance))
-    collector.take("/ground_truth/thread", path(2 * 10**9, STRAIGHT + np.array([0.0, 0.02])))
-    collector.take("/thread/measured", path(9 * 10**9, STRAIGHT))  # without a prediction
-    collector.take("/thread/margins", margins(9 * 10**9, -7.0, valid=False))
+        collector.add("/thread/predicted", prediction(k * 10**9, STRAIGHT))
+        collector.add("/thread/measured", path(k * 10**9, STRAIGHT + np.array([0.0, 0.01])))
+        collector.add("/thread/margins", margins(k * 10**9, clearance))
+    collector.add("/ground_truth/thread", path(2 * 10**9, STRAIGHT + np.array([0.0, 0.02])))
+    collector.add("/thread/measured", path(9 * 10**9, STRAIGHT))  # without a prediction
+    collector.add("/thread/margins", margins(9 * 10**9, -7.0, valid=False))
     metrics, instants = collector.metrics(start=10**9), collector.frames()
     assert [instant.stamp for instant in instants] == [10**9, 2 * 10**9, 3 * 10**9]
     assert [instant.error_seen for instant in instants] == pytest.approx([1.0] * 3)
@@ -85,8 +85,8 @@ def test_messages_of_one_stamp_are_put_together():
 
 def test_a_command_counts_as_driven_only_if_it_was_followed():
     collector = GraphCollector(length=1.0)
-    collector.take("/coils/currents", Message(header=header(7), command=header(5).stamp, stop=""))
-    collector.take("/coils/currents", Message(header=header(8), command=header(6).stamp, stop="no command for 0.2 s"))
+    collector.add("/coils/currents", Message(header=header(7), command=header(5).stamp, stop=""))
+    collector.add("/coils/currents", Message(header=header(8), command=header(6).stamp, stop="no command for 0.2 s"))
     assert collector.driven == {5}
 
 
@@ -94,7 +94,7 @@ def test_the_last_word_of_every_node_is_kept():
     collector = GraphCollector(length=1.0)
     for text in ("starting", "lost"):
         status = Message(name="vision_tracker: state", message=text)
-        collector.take("/diagnostics", Message(header=header(1), status=[status]))
+        collector.add("/diagnostics", Message(header=header(1), status=[status]))
     assert collector.health == {"vision_tracker": "lost"}
 
 

@@ -86,7 +86,7 @@ def test_oddities_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     write_mcap(path, [*messages, ("/b", 4, b"")], types)
     assert cli.main(["bag", "check", str(path), "--remap", "/a:=/both"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "/ground_truth/needle has the frame world, from which nothing leads to dish" in shown
+    assert "/ground_truth/needle has the frame world, which is not connected to dish" in shown
     assert "/ground_truth/thread is of type std_msgs/msg/String, expected" in shown
     assert "/b: 1 stamps cannot be read" in shown
 

@@ -17,8 +17,8 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.jobs.calibrate import Request, calibrate, material_named, settings_of
-from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.jobs.calibrate import Request, calibrate_bags, material_named, settings_of
+from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.setups import read_setup
 from test.calibration.runs import LENGTH, rig_run
 
@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     setup = folder / "lab.yaml"
     setup.write_text(SETUP)
     for name, phase in (("one", 0.0), ("two", 1.5)):
-        record(trajectory(phase), read_setup(str(setup)), folder / name, rate=15.0, poses=True, noise=2e-5)
+        render_bag(trajectory(phase), read_setup(str(setup)), folder / name, rate=15.0, poses=True, noise=2e-5)
     return folder
 
 
@@ -153,20 +153,20 @@ def test_what_is_wrong_is_said_in_one_line(
 def test_bags_of_different_threads_are_refused(folder: Path, tmp_path: Path):
     setup = read_setup("petri_150mm_silk")
     still = replace(trajectory(), metadata={})
-    record(still, setup, tmp_path / "silk", rate=15.0, poses=True)
-    record(still, read_setup("petri_35mm_polyamide"), tmp_path / "polyamide", rate=15.0, poses=True)
+    render_bag(still, setup, tmp_path / "silk", rate=15.0, poses=True)
+    render_bag(still, read_setup("petri_35mm_polyamide"), tmp_path / "polyamide", rate=15.0, poses=True)
     request = Request(setup=str(folder / "lab.yaml"))
     with pytest.raises(
         InvalidInputError, match="silk: got a thread with material silk_6_0, expected polyamide_7_0, as"
     ):
-        calibrate([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", request)
+        calibrate_bags([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", request)
 
 
 def test_a_bag_of_another_length_is_refused(folder: Path, tmp_path: Path):
     setup = tmp_path / "long.yaml"
     setup.write_text(SETUP.replace("0.019", "0.15"))
     with pytest.raises(BagError, match="is it another thread"):
-        calibrate([folder / "one"], tmp_path / "found.yaml", Request(setup=str(setup)))
+        calibrate_bags([folder / "one"], tmp_path / "found.yaml", Request(setup=str(setup)))
 
 
 def test_a_material_is_told_by_how_it_begins():

@@ -19,10 +19,10 @@ from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.bag_table import TIMES, Row
-from magnetosuture_thread.evaluation.report.pictures import Picture, draw_worst_frame
+from magnetosuture_thread.evaluation.report.pictures import ReportPicture, draw_worst_frame
 from magnetosuture_thread.evaluation.series import WorstFrame
 from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
-from magnetosuture_thread.interface import CURRENTS, NEEDLE_POSE, PREDICTED_THREAD, SCENE, SEEN_THREAD, Channel
+from magnetosuture_thread.interface import CURRENTS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, SCENE, Channel
 from magnetosuture_thread.jobs import evaluate_bag as job
 from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
 from magnetosuture_thread.jobs.evaluate_bag import Options
@@ -62,7 +62,7 @@ def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
 
 def test_what_is_wrong_with_one_bag_is_in_its_row(tmp_path: Path, short_bag: Path):
     said: list[str] = []
-    rows = evaluate_bags([broken(tmp_path / "=x"), short_bag], tmp_path / "out", Options(duration=0.4), say=said.append)
+    rows = evaluate_bags([broken(tmp_path / "=x"), short_bag], tmp_path / "out", Options(duration=0.4), log=said.append)
     assert "nothing intact" in str(rows[0]["problem"])
     assert rows[1]["problem"] == ""
     assert not (tmp_path / "out" / "=x.html").exists()
@@ -206,7 +206,7 @@ def test_a_picture_has_the_obstacles_that_were_in_force(
     bag = copied(short_bag, tmp_path / "changed", [(SCENE, Bag(short_bag).start, data)], leave=SCENE.recorded)
     shown: list[WorstFrame] = []
 
-    def draw(worst: WorstFrame, *arguments: Any, **named: Any) -> Picture:
+    def draw(worst: WorstFrame, *arguments: Any, **named: Any) -> ReportPicture:
         shown.append(worst)
         return draw_worst_frame(worst, *arguments, **named)
 
@@ -225,7 +225,7 @@ def test_broken_currents_cost_no_figure(tmp_path: Path, short_bag: Path):
 
 def test_why_nothing_was_predicted_is_said(tmp_path: Path, short_bag: Path):
     replay_offline(short_bag, tmp_path / "replay")
-    bag = copied(tmp_path / "replay" / "bag", tmp_path / "b", [], leave=SEEN_THREAD.recorded)
+    bag = copied(tmp_path / "replay" / "bag", tmp_path / "b", [], leave=MEASURED_THREAD.recorded)
     (row,) = evaluate_bags([bag], tmp_path / "out", Options(source="poses"))
     assert str(row["problem"]).endswith("had a needle; waiting for the thread to be seen")
 
@@ -248,7 +248,7 @@ def test_recorded_predictions_of_frames_that_nobody_asks_for_hide_none(monkeypat
 def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short_bag: Path):
     said: list[str] = []
     bag = shutil.copytree(short_bag, tmp_path / "a\n\x1b[31m[b]<i>")
-    (row,) = evaluate_bags([bag], tmp_path / "out", Options(duration=0.3), say=said.append)
+    (row,) = evaluate_bags([bag], tmp_path / "out", Options(duration=0.3), log=said.append)
     assert str(row["bag"]).isprintable()
     assert str(row["path"]).isprintable()
     assert (tmp_path / "out" / f"{row['bag']}.html").exists()

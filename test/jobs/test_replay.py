@@ -30,9 +30,9 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.interface import IMAGE, MARGINS, NEEDLE_POSE, PREDICTED_THREAD, SEEN_THREAD, Channel
-from magnetosuture_thread.jobs.record import record
-from magnetosuture_thread.jobs.replay import replay
+from magnetosuture_thread.interface import IMAGE, MARGINS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, Channel
+from magnetosuture_thread.jobs.render import render_bag
+from magnetosuture_thread.jobs.replay import replay_live
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.images import decode_image
@@ -44,14 +44,14 @@ pytestmark = pytest.mark.whole_graph
 def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceTrajectory) -> Path:
     """Return a bag of poses of two seconds."""
     path = tmp_path_factory.mktemp("poses") / "pull"
-    record(straight_pull, read_setup("petri_35mm_polyamide"), path, poses=True, noise=1e-5)
+    render_bag(straight_pull, read_setup("petri_35mm_polyamide"), path, poses=True, noise=1e-5)
     return path
 
 
 def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
     said: list[str] = []
     shares: list[float] = []
-    summary = replay(short_bag, tmp_path / "out", say=said.append, progress=shares.append)
+    summary = replay_live(short_bag, tmp_path / "out", log=said.append, progress=shares.append)
     assert summary.setup == "petri_35mm_polyamide"
     assert "straight_pull" in summary.simulated
     assert (summary.frames, summary.tracked, summary.predicted) == (30, 28, 28)  # the first in the third frame
@@ -111,7 +111,7 @@ def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
 def agree(live: Path, offline: Path, predictions: int) -> None:
     """Check that both replays made the same of a bag, to the last bit; but for the times that steps took."""
     made = [content(live), content(offline)]
-    for channel in (NEEDLE_POSE, SEEN_THREAD, PREDICTED_THREAD, MARGINS):
+    for channel in (NEEDLE_POSE, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
         ours, theirs = ({key: what for key, what in each.items() if key[0] == channel} for each in made)
         assert ours == theirs
     assert sum(key[0] == PREDICTED_THREAD for key in made[0]) == predictions
@@ -121,7 +121,7 @@ def content(output: Path) -> dict[tuple[Channel, int], bytes]:
     """Return what a replay said of each stamp, without times and without what waited for the thread to be seen."""
     bag, store = Bag(output / "bag"), typestore()
     found = {}
-    for channel in (NEEDLE_POSE, SEEN_THREAD, PREDICTED_THREAD, MARGINS):
+    for channel in (NEEDLE_POSE, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
         for each in bag.records({channel.recorded}):
             message = each.decode()
             if channel == PREDICTED_THREAD:
@@ -134,7 +134,7 @@ def content(output: Path) -> dict[tuple[Channel, int], bytes]:
 
 def test_a_window_of_a_bag_of_poses_is_played_without_a_tracker(pose_bag: Path, tmp_path: Path):
     """And agrees with offline: the thread starts as it is first seen in the window."""
-    summary = replay(pose_bag, tmp_path / "out", start=0.5, duration=1.0)
+    summary = replay_live(pose_bag, tmp_path / "out", start=0.5, duration=1.0)
     assert (summary.source, summary.frames, summary.tracked, summary.predicted) == ("poses", 31, 31, 31)
     assert summary.error_truth is not None
     assert summary.error_truth["maximum"] < 1.0
@@ -169,7 +169,7 @@ def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]
 
 def test_an_interruption_waits_until_a_message_is_played(pose_bag: Path, tmp_path: Path, interrupting):
     with pytest.raises(KeyboardInterrupt):
-        replay(pose_bag, tmp_path / "out", progress=interrupting)
+        replay_live(pose_bag, tmp_path / "out", progress=interrupting)
     assert len(interrupting.went_on) == 1
     assert not (tmp_path / "out").exists()
 
@@ -264,7 +264,7 @@ class Watch:
 
 def test_what_is_too_short_to_go_round_is_refused(short_bag: Path, tmp_path: Path):
     with pytest.raises(BagError, match=r"gives 0\.97 s to play over and over; expected 1\.5 s or more"):
-        replay(short_bag, tmp_path / "out", loop=True)
+        replay_live(short_bag, tmp_path / "out", loop=True)
     assert not (tmp_path / "out").exists()
 
 
@@ -273,8 +273,8 @@ def rewritten(bag: Path, folder: Path, types: dict[str, str], notes: dict[str, s
     with BagWriter(folder, notes) as writer:
         for topic, type_name in types.items():
             writer.add_topic(topic, type_name)
-        for record in Bag(bag).records(set(types)):
-            writer.write(record.topic, record.time, record.data)
+        for render_bag in Bag(bag).records(set(types)):
+            writer.write(render_bag.topic, render_bag.time, render_bag.data)
     return folder
 
 
@@ -298,7 +298,7 @@ def test_bad_bags_are_refused_before_anything_is_written(short_bag: Path, tmp_pa
         (odd, f"topic {COMMANDS} is of type std_msgs/msg/Header, expected"),
     ):
         with pytest.raises(BagError) as caught:
-            replay(bag, tmp_path / "out")
+            replay_live(bag, tmp_path / "out")
         assert words in str(caught.value)
         assert bag.name in str(caught.value)
         assert "\n" not in str(caught.value)
@@ -309,7 +309,7 @@ def test_an_output_that_exists_is_not_touched(short_bag: Path, tmp_path: Path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").write_text("precious")
     with pytest.raises(BagError, match="exists already"):
-        replay(short_bag, tmp_path / "out")
+        replay_live(short_bag, tmp_path / "out")
     assert (tmp_path / "out" / "mine").read_text() == "precious"
 
 
@@ -317,7 +317,7 @@ def test_a_bad_setup_is_refused_before_anything_starts(short_bag: Path, tmp_path
     path = tmp_path / "bad.yaml"
     path.write_text("/**/thread_model: {ros__parameters: {segments: 1}}\n")
     with pytest.raises(ConfigurationError, match=r"thread_model\.segments: got 1"):
-        replay(short_bag, tmp_path / "out", setup_name=str(path))
+        replay_live(short_bag, tmp_path / "out", setup_name=str(path))
     assert not (tmp_path / "out").exists()
 
 
@@ -340,7 +340,7 @@ def test_a_bag_of_raw_frames_alone_is_played(short_bag: Path, tmp_path: Path):
             )
             writer.write_message(IMAGE.recorded, each.time, image)
     said: list[str] = []
-    summary = replay(tmp_path / "raw", tmp_path / "out", say=said.append)
+    summary = replay_live(tmp_path / "raw", tmp_path / "out", log=said.append)
     assert (summary.frames, summary.tracked, summary.commands, summary.driven) == (30, 28, 0, 0)
     assert summary.error_truth is None
     assert any(line.startswith("the bag names no set-up; taking petri_35mm_polyamide") for line in said)
@@ -355,7 +355,7 @@ def test_a_bag_in_which_nothing_is_seen_fails_and_leaves_nothing(short_bag: Path
         GraphError,
         match=r"none of 30 frames gave a prediction, 0 had a needle; .*vision_tracker: .*searching: no needle",
     ):
-        replay(short_bag, tmp_path / "out", setup_name=str(path), rate=4.0)
+        replay_live(short_bag, tmp_path / "out", setup_name=str(path), rate=4.0)
     assert [p.name for p in tmp_path.iterdir()] == ["other.yaml"]
 
 
@@ -381,7 +381,7 @@ def test_an_interrupted_replay_ends_its_nodes_and_leaves_nothing(tmp_path: Path,
 
 def test_the_example_bag_is_tracked_in_every_frame(tmp_path: Path):
     example = Path(__file__).parents[2] / "examples" / "post_wrap"
-    summary = replay(example, tmp_path / "out")
+    summary = replay_live(example, tmp_path / "out")
     assert summary.frames == 240
     assert summary.tracked == summary.predicted == summary.frames - 2  # the first pose comes in the third frame
     assert summary.commands == 240

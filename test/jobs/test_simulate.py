@@ -14,7 +14,7 @@ import pytest
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
-from magnetosuture_thread.jobs.replay import replay
+from magnetosuture_thread.jobs.replay import replay_live
 from magnetosuture_thread.jobs.simulate import simulate
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.reproduce.thread_behavior import thread_behavior
@@ -51,7 +51,7 @@ def run(scenario: Path, tmp_path_factory: pytest.TempPathFactory):
     bag = tmp_path_factory.mktemp("run") / "bag"
     said: list[str] = []
     shares: list[float] = []
-    summary = simulate(str(scenario), bag, say=said.append, progress=shares.append)
+    summary = simulate(str(scenario), bag, log=said.append, progress=shares.append)
     return bag, summary, said, shares
 
 
@@ -74,12 +74,12 @@ def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
 def test_a_run_whose_bridge_is_stopped_ends_and_says_so(scenario: Path, tmp_path: Path):
     """The emergency stop is pressed from another process than the bridge's, as the run begins."""
 
-    def say(text: str) -> None:
+    def log(text: str) -> None:
         if text == "running":
             assert main(["coils", "stop"]) == 0
 
     with pytest.raises(GraphError, match="coil_bridge: fault: emergency stop; what was recorded is in"):
-        simulate(str(scenario), tmp_path / "bag", say=say)
+        simulate(str(scenario), tmp_path / "bag", log=log)
     states = [record.decode() for record in Bag(tmp_path / "bag").records({"/coils/state"})]
     assert states[-1].emergency_stopped
     assert not any(states[-1].current)
@@ -131,7 +131,7 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
 def test_replay_takes_the_bag(run, scenario: Path, tmp_path: Path):
     scenario.rename(scenario.with_suffix(".gone"))  # the bag must know it by itself
     try:
-        summary = replay(run[0], tmp_path / "out")
+        summary = replay_live(run[0], tmp_path / "out")
     finally:
         scenario.with_suffix(".gone").rename(scenario)
     assert summary.setup == "short"
@@ -155,11 +155,11 @@ def test_with_a_simulated_clock_it_runs_faster_than_real_time(scenario: Path, tm
     said: list[str] = []
     at: dict[str, float] = {}
 
-    def say(text: str) -> None:
+    def log(text: str) -> None:
         said.append(text)
         at[text] = time.monotonic()
 
-    summary = simulate(str(scenario), tmp_path / "bag", pace=2.0, duration=4.0, say=say)
+    summary = simulate(str(scenario), tmp_path / "bag", rate=2.0, duration=4.0, log=log)
     assert "running at 2 times the speed" in said
     assert summary.tracked >= 0.5 * summary.frames
     bag = Bag(tmp_path / "bag")

@@ -22,7 +22,7 @@ from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.jobs import frames
 from magnetosuture_thread.jobs.frames import FrameSource
-from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.track import settings_with, track
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import read_setup
@@ -112,7 +112,7 @@ def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
 
 
 def test_an_overlay_video_has_the_rate_of_the_bag(tmp_path: Path, straight_pull: ReferenceTrajectory):
-    record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "slow", duration=0.8, rate=7.0)
+    render_bag(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "slow", duration=0.8, rate=7.0)
     track([tmp_path / "slow"], VisionTrackerSettings(), Scene(), overlay=tmp_path / "seen.mp4")
     assert rate_of(tmp_path / "seen.mp4") == pytest.approx(7.0, abs=0.01)
     track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene(), overlay=tmp_path / "pictures.mp4")
@@ -246,7 +246,7 @@ def test_a_damaged_bag_is_said(tmp_path: Path):
     file = tmp_path / "bag" / "bag_0.mcap"
     file.write_bytes(file.read_bytes()[:-40])
     said: list[str] = []
-    track([file], VisionTrackerSettings(), Scene(), say=said.append)
+    track([file], VisionTrackerSettings(), Scene(), log=said.append)
     assert any("is damaged" in line for line in said)
 
 

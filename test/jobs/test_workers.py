@@ -38,7 +38,7 @@ def test_each_task_is_done_once_and_a_process_that_dies_takes_only_its_own_with_
     results: dict[int, Any] = {}
     said: list[str] = []
     shares: list[float] = []
-    run_all(work, [1, 2, 3, 4, 5], 2, done=results.__setitem__, say=said.append, progress=shares.append)
+    run_all(work, [1, 2, 3, 4, 5], 2, done=results.__setitem__, log=said.append, progress=shares.append)
     assert isinstance(results.pop(2), WorkerDiedError)
     assert {index: square for index, (square, _, _) in results.items()} == {0: 1, 1: 4, 3: 16, 4: 25}
     assert all(threads == ["1"] * len(ONE_THREAD) for _, _, threads in results.values())
@@ -53,7 +53,7 @@ def test_what_ends_the_call_ends_the_processes(work: Any, workers: int):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_all(work, [1, 2, 4], workers, done=lambda index, result: None, say=interrupt)
+        run_all(work, [1, 2, 4], workers, done=lambda index, result: None, log=interrupt)
 
 
 def test_one_task_needs_no_process_of_its_own(work: Any):

@@ -82,37 +82,37 @@ def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it(
 
 def test_speeds_are_averaged():
     motion, still = NodeMotion(0.2), np.zeros((3, 2))
-    np.testing.assert_array_equal(motion.take(still, 0.0), np.zeros(3))
+    np.testing.assert_array_equal(motion.update(still, 0.0), np.zeros(3))
     moved, interval = still.copy(), 0.1
     expected = 0.0
     for k in range(1, 6):
         moved = still + np.array([1e-4 * k, 0.0])
         expected += (1.0 - np.exp(-0.5)) * (1e-3 - expected)
-        np.testing.assert_allclose(motion.take(moved, interval), np.full(3, expected), rtol=1e-12)
+        np.testing.assert_allclose(motion.update(moved, interval), np.full(3, expected), rtol=1e-12)
     back = NodeMotion(0.2)
     back.follow_on(motion)
-    np.testing.assert_allclose(back.take(moved, interval), np.full(3, expected * np.exp(-0.5)), rtol=1e-12)
+    np.testing.assert_allclose(back.update(moved, interval), np.full(3, expected * np.exp(-0.5)), rtol=1e-12)
 
 
 def test_without_an_interval_it_begins_anew():
     motion = NodeMotion(0.0)
-    motion.take(np.zeros((3, 2)), 0.1)
-    assert motion.take(np.full((3, 2), 1e-3), 0.1).min() > 0.0
-    np.testing.assert_array_equal(motion.take(np.full((3, 2), 9e-3), 0.0), np.zeros(3))
+    motion.update(np.zeros((3, 2)), 0.1)
+    assert motion.update(np.full((3, 2), 1e-3), 0.1).min() > 0.0
+    np.testing.assert_array_equal(motion.update(np.full((3, 2), 9e-3), 0.0), np.zeros(3))
 
 
 def test_trembling_is_no_motion():
     """A pose that is off by 0.02 mm, back and forth at 30 Hz, which is 1.2 mm/s from each to the next."""
     motion, thread = NodeMotion(0.2), np.zeros((3, 2))
-    speeds = [motion.take(thread + np.array([(-1.0) ** k * 2e-5, 0.0]), 1.0 / 30.0).max() for k in range(60)]
+    speeds = [motion.update(thread + np.array([(-1.0) ** k * 2e-5, 0.0]), 1.0 / 30.0).max() for k in range(60)]
     assert max(speeds) < 2e-4
 
 
 def test_without_averaging_or_with_other_nodes_it_begins_anew():
     motion = NodeMotion(0.0)
-    motion.take(np.zeros((3, 2)), 0.0)
-    np.testing.assert_allclose(motion.take(np.full((3, 2), 3e-4), 0.1), np.full(3, np.hypot(3e-3, 3e-3)))
-    np.testing.assert_array_equal(motion.take(np.ones((5, 2)), 0.1), np.zeros(5))
+    motion.update(np.zeros((3, 2)), 0.0)
+    np.testing.assert_allclose(motion.update(np.full((3, 2), 3e-4), 0.1), np.full(3, np.hypot(3e-3, 3e-3)))
+    np.testing.assert_array_equal(motion.update(np.ones((5, 2)), 0.1), np.zeros(5))
 
 
 def test_colours_tell_the_state():

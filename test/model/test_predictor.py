@@ -231,7 +231,7 @@ def test_any_motion_keeps_the_promises(
             (-0.009 + r * np.cos(a), -0.006 + r * np.sin(a)) for a, (_, r) in zip(angles, corners, strict=True)
         )
         polygon = Polygon(star)
-        if polygon.has_room_for(0.5 * THREAD.segment_length):
+        if polygon.can_contain(0.5 * THREAD.segment_length):
             obstacles.append(polygon.smoothed(1e-4))
     predictor = started(tuple(obstacles))
     around = Workspace(obstacles, 5e-3)

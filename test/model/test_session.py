@@ -165,13 +165,13 @@ def test_a_step_that_is_not_solved_is_told_and_the_next_goes_on_from_before():
 
 def test_only_threads_that_are_of_use_are_wanted():
     session = ThreadSession(made(), None)
-    assert session.wants_seen(0)
+    assert session.needs_measured_thread(0)
     session.on_measured_thread(SECOND, seen())
     go(session, 1.0)
-    assert not session.wants_seen(2 * SECOND)
-    assert not session.wants_seen(SECOND // 2)  # late
-    assert session.wants_seen(-SECOND)  # time was set back
-    assert not straight().wants_seen(SECOND)
+    assert not session.needs_measured_thread(2 * SECOND)
+    assert not session.needs_measured_thread(SECOND // 2)  # late
+    assert session.needs_measured_thread(-SECOND)  # time was set back
+    assert not straight().needs_measured_thread(SECOND)
 
 
 def test_time_set_back_starts_anew():

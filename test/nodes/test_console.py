@@ -157,7 +157,7 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     margins = no_margins(stamp, "no pose")
     tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
-    tell(graph, topics.SEEN_THREAD, path, lambda: console.state()["measured"], "the seen thread")
+    tell(graph, topics.MEASURED_THREAD, path, lambda: console.state()["measured"], "the seen thread")
     tell(graph, topics.MARGINS, margins, lambda: console.state()["margins"], "the margins")
     state = console.state()
     assert state["needle"]["tail"] == [0.003, -0.004]

@@ -74,9 +74,9 @@ def test_a_stamp_goes_there_and_back(sec: int, nanosec: int):
 
 def test_a_material_becomes_parameters():
     """Plain numbers: of arrays, as messages have them, no parameter is made."""
-    assert changes.told_material(ThreadMaterial()) == {}
+    assert changes.parse_material(ThreadMaterial()) == {}
     message = ThreadMaterial(name="silk_6_0", viscosity=0.9, attachment_offset=[1e-3, 0.0], rest_curvature=[0.0])
-    values = changes.told_material(message)
+    values = changes.parse_material(message)
     assert values == {
         "material": "silk_6_0",
         "diameter": 0.0,

@@ -41,7 +41,7 @@ def together(graph: Graph, **parameters: Any) -> tuple[VisionTrackerNode, Thread
 
 def met(graph: Graph, tracker: VisionTrackerNode, model: ThreadModelNode) -> None:
     """Wait until the model hears what the tracker says."""
-    names = {f"/{topic.name}" for topic in (topics.NEEDLE_POSE, topics.SEEN_THREAD)}
+    names = {f"/{topic.name}" for topic in (topics.NEEDLE_POSE, topics.MEASURED_THREAD)}
     said = [entry for entry in tracker.publishers if entry.topic_name in names]
     heard = [entry for entry in model.subscriptions if entry.topic_name in names]
     assert len(said) == len(heard) == len(names)
@@ -52,7 +52,7 @@ def met(graph: Graph, tracker: VisionTrackerNode, model: ThreadModelNode) -> Non
 def answers(graph: Graph, frames: list[np.ndarray]) -> tuple[list[PredictedThread], list[SafetyMargins]]:
     """Return what comes of frames, one after the other."""
     predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
-    measured, states = graph.listen(topics.SEEN_THREAD), graph.listen(topics.TRACKER_STATE)
+    measured, states = graph.listen(topics.MEASURED_THREAD), graph.listen(topics.TRACKER_STATE)
 
     def answered(count: int) -> bool:
         return len(states) >= count

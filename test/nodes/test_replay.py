@@ -144,7 +144,7 @@ def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pyte
     live = LiveReplay(
         graph.domain,
         Timeline(10**9, 5.0),
-        played=[topics.NEEDLE_POSE, topics.SEEN_THREAD],
+        played=[topics.NEEDLE_POSE, topics.MEASURED_THREAD],
         nodes=1,
         receive=lambda topic, time, data: heard.append((topic, time)),
         watch=lambda: None,
@@ -155,7 +155,9 @@ def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pyte
         with pytest.raises(GraphError, match=r"nobody at /thread/measured"):
             live.wait_for_graph()
         monkeypatch.setattr(replay, "START_TIMEOUT", 20.0)
-        graph.probe.create_subscription(topics.SEEN_THREAD.message, topics.SEEN_THREAD.name, lambda message: None, 100)
+        graph.probe.create_subscription(
+            topics.MEASURED_THREAD.message, topics.MEASURED_THREAD.name, lambda message: None, 100
+        )
         live.wait_for_graph()
         times: list[float] = []
         live.play([Recorded(10**9 + k * 50_000_000) for k in range(8)], times.append)

@@ -40,7 +40,7 @@ def nanoseconds(stamp) -> int:
 
 def test_frames_come_with_their_truth_and_the_camera(graph):
     frames, infos = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.CAMERA_INFO)
-    needles, threads = graph.listen_later(topics.TRUTH_NEEDLE), graph.listen_later(topics.TRUTH_THREAD)
+    needles, threads = graph.listen_later(topics.GROUND_TRUTH_NEEDLE), graph.listen_later(topics.GROUND_TRUTH_THREAD)
     graph.add(RigSimulatorNode, **SMALL)
     graph.wait(lambda: min(len(frames), len(infos), len(needles), len(threads)) > 3, "frames and truth")
     image = cv2.imdecode(np.frombuffer(bytes(frames[-1].data), np.uint8), cv2.IMREAD_COLOR)
@@ -55,7 +55,7 @@ def test_frames_come_with_their_truth_and_the_camera(graph):
 
 
 def test_a_frame_period_is_kept_in_the_stamps(graph):
-    needles = graph.listen_later(topics.TRUTH_NEEDLE)
+    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     graph.add(RigSimulatorNode, frame_rate=50.0, **SMALL)
 
     def periods() -> np.ndarray:
@@ -69,7 +69,7 @@ def test_a_frame_period_is_kept_in_the_stamps(graph):
 
 
 def test_a_tick_that_comes_late_leaves_no_frame_out_and_moves_none(graph, monkeypatch):
-    needles = graph.listen_later(topics.TRUTH_NEEDLE)
+    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     late = [0.0, 0.05, 0.0, 0.6, 0.02, 0.0, 0.3, 0.85, 0.0]  # of a period
     ticks = iter([0.02 * (1 + number + part) for number, part in enumerate(late)])
     monkeypatch.setattr(RigTime, "elapsed", lambda rig_time: next(ticks, 1.0))
@@ -82,7 +82,7 @@ def test_a_tick_that_comes_late_leaves_no_frame_out_and_moves_none(graph, monkey
 
 
 def test_nothing_moves_without_a_current_then_the_needle_is_pulled(graph):
-    needles = graph.listen_later(topics.TRUTH_NEEDLE)
+    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     graph.add(RigSimulatorNode, faults=["dim 0.0 60.0"], **SMALL)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.RIG_CURRENTS, currents(graph, 0, 0, 0, 0))
@@ -113,7 +113,7 @@ def test_bad_currents_are_refused_and_said(graph, bad):
 
 def test_currents_beyond_all_measure_end_nothing(graph):
     node = graph.add(RigSimulatorNode, **SMALL)
-    needles = graph.listen(topics.TRUTH_NEEDLE)
+    needles = graph.listen(topics.GROUND_TRUTH_NEEDLE)
     graph.publish(topics.RIG_CURRENTS, currents(graph, 1e160, -1e300, 0, 0))
     graph.wait(lambda: node.rig.running > 0.05, "the currents")
     count = len(needles)
@@ -148,7 +148,7 @@ def test_a_fault_can_be_asked_for_now(graph):
 
 
 def test_late_frames_come_late_with_their_own_stamps(graph):
-    frames, needles = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.TRUTH_NEEDLE)
+    frames, needles = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     node = graph.add(RigSimulatorNode, faults=["late_frames 0 60"], **SMALL)
     graph.publish(topics.RIG_CURRENTS, currents(graph, 0.01, 0, 0, 0))
     graph.wait(lambda: node.rig.running > 0.0, "the fault's time")
@@ -158,7 +158,7 @@ def test_late_frames_come_late_with_their_own_stamps(graph):
 
 
 def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
-    needles = graph.listen_later(topics.TRUTH_NEEDLE)
+    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     ports = (str(tmp_path / "a"), str(tmp_path / "b"))
     node = graph.add(RigSimulatorNode, power_stage="roboclaw", power_stage_ports=list(ports), **SMALL)
     driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=ports))
@@ -180,9 +180,9 @@ def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
 
 
 def test_a_simulated_clock_runs_at_its_pace(graph):
-    node = graph.add(RigSimulatorNode, use_sim_time=True, pace=3.0, **SMALL)
+    node = graph.add(RigSimulatorNode, use_sim_time=True, rate=3.0, **SMALL)
     real, elapsed = time.perf_counter(), node.time.elapsed()
-    clocks, needles = graph.listen(topics.CLOCK), graph.listen(topics.TRUTH_NEEDLE)
+    clocks, needles = graph.listen(topics.CLOCK), graph.listen(topics.GROUND_TRUTH_NEEDLE)
     graph.wait(lambda: len(clocks) > 20 and len(needles) > 5, "clocks and frames")
     simulated = (nanoseconds(clocks[-1].clock) - nanoseconds(clocks[0].clock)) * 1e-9
     assert simulated > 0.0
@@ -193,7 +193,7 @@ def test_a_simulated_clock_runs_at_its_pace(graph):
 
 
 def test_a_paused_rig_stands_still_and_goes_on_from_there_with_stamps_of_now(graph):
-    needles = graph.listen_later(topics.TRUTH_NEEDLE)
+    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     node = graph.add(RigSimulatorNode, **SMALL)
     console = graph.probe.create_client(SetBool, PAUSE_RIG)
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from magnetosuture_thread.nodes.scheduling import take_priority
+from magnetosuture_thread.nodes.scheduling import raise_priority
 
 PRIORITY = 3
 SLEEPER = "import threading, sys; threading.Thread(target=sys.stdin.read).start(); print(flush=True)"
@@ -34,7 +34,7 @@ def policies(process: int) -> set[tuple[int, int]]:
 
 def test_every_thread_of_another_process_gets_the_priority_or_it_says_why_not(sleeper: int):
     own = policies(os.getpid())
-    said = take_priority(PRIORITY, sleeper)
+    said = raise_priority(PRIORITY, sleeper)
     if said.startswith("ordinary; "):
         assert said == f"ordinary; real-time priority {PRIORITY} refused (Operation not permitted), see `ulimit -r`"
         assert policies(sleeper) == {(os.SCHED_OTHER, 0)}
@@ -45,7 +45,7 @@ def test_every_thread_of_another_process_gets_the_priority_or_it_says_why_not(sl
 
 
 def test_no_priority_asks_for_nothing(sleeper: int):
-    assert take_priority(0, sleeper) == "ordinary"
+    assert raise_priority(0, sleeper) == "ordinary"
     assert policies(sleeper) == {(os.SCHED_OTHER, 0)}
 
 
@@ -54,10 +54,10 @@ def test_what_the_system_refuses_is_said(sleeper: int, monkeypatch: pytest.Monke
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert take_priority(PRIORITY, sleeper).startswith("ordinary; real-time priority 3 refused (Operation not perm")
+    assert raise_priority(PRIORITY, sleeper).startswith("ordinary; real-time priority 3 refused (Operation not perm")
 
 
 def test_a_process_that_has_ended_is_no_error():
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         process.wait()
-    assert take_priority(PRIORITY, process.pid).startswith("ordinary; real-time priority 3 refused (No such file")
+    assert raise_priority(PRIORITY, process.pid).startswith("ordinary; real-time priority 3 refused (No such file")

@@ -45,7 +45,7 @@ def test_the_thread_starts_where_it_is_seen_and_follows(graph):
     graph.add(ThreadModelNode)
     predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
     markers = graph.listen(topics.THREAD_MARKERS)
-    graph.publish(topics.SEEN_THREAD, seen(1.0))
+    graph.publish(topics.MEASURED_THREAD, seen(1.0))
     graph.publish(topics.NEEDLE_POSE, pose(1.0))
     graph.wait(lambda: len(predicted) == 1, "the start")
     for k in range(1, 11):
@@ -125,7 +125,7 @@ def test_the_order_of_pose_and_centreline_does_not_matter(graph):
     assert not margins[0].valid
     assert margins[0].reason == "waiting for the thread to be seen"
     assert not margins[0].value
-    graph.publish(topics.SEEN_THREAD, seen(1.0))
+    graph.publish(topics.MEASURED_THREAD, seen(1.0))
     graph.wait(lambda: bool(predicted), "the start")
 
 
@@ -135,7 +135,7 @@ def test_poses_that_come_before_the_centreline_of_their_frame_are_not_lost(graph
     for k in range(4):
         graph.publish(topics.NEEDLE_POSE, pose(1.0 + 0.1 * k, 1e-4 * k))
     graph.wait(lambda: len(margins) == 4, "four poses")
-    graph.publish(topics.SEEN_THREAD, seen(1.1))  # the first frame's centreline was lost
+    graph.publish(topics.MEASURED_THREAD, seen(1.1))  # the first frame's centreline was lost
     graph.wait(lambda: len(predicted) == 3, "three predictions")
     assert [p.header.stamp for p in predicted] == [pose(1.0 + 0.1 * k).header.stamp for k in (1, 2, 3)]
 
@@ -279,7 +279,7 @@ def test_the_first_and_the_last_stamp_that_there_are_go_there_and_back(graph, at
 def test_the_thread_hangs_where_it_is_fixed_to_the_needle(graph):
     graph.add(ThreadModelNode, attachment_offset=[1e-3, -5e-4])
     predicted = graph.listen(topics.PREDICTED_THREAD)
-    graph.publish(topics.SEEN_THREAD, seen(1.0))
+    graph.publish(topics.MEASURED_THREAD, seen(1.0))
     for k in range(3):
         graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, k * 1e-4))
         graph.wait(lambda k=k: len(predicted) == k + 1, "a prediction")
@@ -300,11 +300,11 @@ def test_time_set_back_starts_anew(graph):
 def test_time_set_back_starts_anew_from_what_is_seen_then(graph):
     graph.add(ThreadModelNode)
     predicted = graph.listen(topics.PREDICTED_THREAD)
-    graph.publish(topics.SEEN_THREAD, seen(100.0))
+    graph.publish(topics.MEASURED_THREAD, seen(100.0))
     graph.publish(topics.NEEDLE_POSE, pose(100.0))
     graph.wait(lambda: len(predicted) == 1, "the start")
     for k in range(3):
-        graph.publish(topics.SEEN_THREAD, seen(1.0 + 0.1 * k))
+        graph.publish(topics.MEASURED_THREAD, seen(1.0 + 0.1 * k))
         graph.publish(topics.NEEDLE_POSE, pose(1.0 + 0.1 * k))
         graph.wait(lambda k=k: len(predicted) == 2 + k, "a prediction after the bag began again")
     assert [p.solver_status for p in predicted[1:]] == ["started", "solved", "solved"]

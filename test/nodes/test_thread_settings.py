@@ -304,7 +304,7 @@ def test_a_scene_may_come_while_the_thread_is_waited_for(graph):
     assert [margins.reason for margins in bench.margins] == ["waiting for the thread to be seen"] * 3
     bench.place(scene_with(POST))
     thread = np.column_stack([1e-4 - np.linspace(0.0, 0.019, 60), np.full(60, 2e-5)])
-    graph.publish(topics.SEEN_THREAD, MESSAGES.path_message(MESSAGES.time(1_033_000_000), thread))
+    graph.publish(topics.MEASURED_THREAD, MESSAGES.path_message(MESSAGES.time(1_033_000_000), thread))
     graph.wait(lambda: len(bench.predicted) == 2 and len(bench.margins) == 5, "the poses that waited")
     assert [prediction.solver_status for prediction in bench.predicted] == ["started", "solved"]
     assert 0 in bench.margins[-1].obstacle

@@ -38,7 +38,7 @@ def states(diagnostics) -> list[str]:
 
 def test_a_frame_becomes_a_pose_and_a_centreline_with_its_stamp(graph, camera, thread_arc):
     graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
-    poses, threads = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.SEEN_THREAD)
+    poses, threads = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.MEASURED_THREAD)
     stamp = graph.now()
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), stamp))
     graph.wait(lambda: bool(poses and threads), "pose and centreline")

@@ -23,20 +23,20 @@ from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
+    GROUND_TRUTH_THREAD,
     MARGINS,
     MATERIAL,
+    MEASURED_THREAD,
     NEEDLE_POSE,
     PREDICTED_THREAD,
     SCENE,
-    SEEN_THREAD,
-    TRUTH_THREAD,
 )
-from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.messages.packing import packed_margins, packed_prediction
 from magnetosuture_thread.messages.reading import margins_of, read_path, read_pose, stamp_of
 from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState
-from magnetosuture_thread.offline.predictions import predictions, sights
+from magnetosuture_thread.offline.predictions import predictions, read_observations
 from magnetosuture_thread.scene import SceneShape
 from magnetosuture_thread.setups import read_setup
 
@@ -47,7 +47,7 @@ SETUP = read_setup("petri_35mm_polyamide")
 def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceTrajectory) -> Path:
     """Return a bag of poses of one second."""
     path = tmp_path_factory.mktemp("poses") / "pull"
-    record(straight_pull, SETUP, path, duration=1.0, poses=True, noise=1e-5)
+    render_bag(straight_pull, SETUP, path, duration=1.0, poses=True, noise=1e-5)
     return path
 
 
@@ -72,7 +72,7 @@ def at(message: Any, stamp: int) -> Any:
 
 def test_sights_of_poses_hold_what_was_recorded(pose_bag: Path, straight_pull: ReferenceTrajectory):
     shares: list[float] = []
-    found = sights(Recording(Bag(pose_bag)), SETUP, progress=shares.append)
+    found = read_observations(Recording(Bag(pose_bag)), SETUP, progress=shares.append)
     assert found.source == "poses"
     seen = list(found)
     assert (found.count, found.found, found.refused) == (30, 30, {})
@@ -91,7 +91,7 @@ def test_sights_of_poses_hold_what_was_recorded(pose_bag: Path, straight_pull: R
 
 
 def test_sights_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_pull: ReferenceTrajectory):
-    found = sights(Recording(Bag(short_bag)), SETUP)
+    found = read_observations(Recording(Bag(short_bag)), SETUP)
     seen = list(found)
     assert (found.source, found.count, found.found) == ("camera", 30, 28)
     assert found.refused == {"no needle for sure": 2}
@@ -105,19 +105,21 @@ def test_sights_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_p
 
 def test_a_window_is_a_part_of_the_whole(pose_bag: Path):
     recording = Recording(Bag(pose_bag))
-    whole = [s.stamp for s in sights(recording, SETUP)]
-    assert [s.stamp for s in sights(recording, SETUP, start=0.5, duration=0.25)] == [
+    whole = [s.stamp for s in read_observations(recording, SETUP)]
+    assert [s.stamp for s in read_observations(recording, SETUP, start=0.5, duration=0.25)] == [
         stamp for stamp in whole if 0.5e9 <= stamp - whole[0] <= 0.75e9
     ]
 
 
 def test_the_source_must_be_there(pose_bag: Path, tmp_path: Path):
     with pytest.raises(BagError, match="camera/image_raw/compressed"):
-        sights(Recording(Bag(pose_bag)), SETUP, source="camera")
-    blind = changed(pose_bag, tmp_path / "blind", lambda old, m: m if old.topic == TRUTH_THREAD.recorded else None)
+        read_observations(Recording(Bag(pose_bag)), SETUP, source="camera")
+    blind = changed(
+        pose_bag, tmp_path / "blind", lambda old, m: m if old.topic == GROUND_TRUTH_THREAD.recorded else None
+    )
     for source in ("auto", "poses"):
         with pytest.raises(BagError, match="has no messages on"):
-            sights(Recording(Bag(blind)), SETUP, source=source)
+            read_observations(Recording(Bag(blind)), SETUP, source=source)
     (tmp_path / "empty.mcap").write_bytes(b"")
     with pytest.raises(BagError, match=r"empty\.mcap"):
         replay_offline(tmp_path / "empty.mcap", tmp_path / "out")
@@ -147,7 +149,7 @@ def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
     counts = Bag(one / "bag").counts
     assert {topic: counts[topic] for topic in counts if counts[topic]} == {
         SCENE.recorded: 1,
-        **{channel.recorded: 30 for channel in (NEEDLE_POSE, SEEN_THREAD, PREDICTED_THREAD, MARGINS)},
+        **{channel.recorded: 30 for channel in (NEEDLE_POSE, MEASURED_THREAD, PREDICTED_THREAD, MARGINS)},
     }
 
 
@@ -158,12 +160,12 @@ def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path):
         return message
 
     def thread(old: RecordedMessage, message: Any) -> Any:
-        if old.topic == SEEN_THREAD.recorded:
+        if old.topic == MEASURED_THREAD.recorded:
             for each in message.poses:
                 each.pose.position.x *= 1e3
         return message
 
-    for name, change in ((NEEDLE_POSE.recorded, pose), (SEEN_THREAD.recorded, thread)):
+    for name, change in ((NEEDLE_POSE.recorded, pose), (MEASURED_THREAD.recorded, thread)):
         bag = changed(pose_bag, tmp_path / name.replace("/", "_"), change)
         with pytest.raises(BagError) as caught:
             replay_offline(bag, tmp_path / "out")
@@ -174,13 +176,13 @@ def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path):
 
 def test_a_thread_of_another_length_is_said(pose_bag: Path, tmp_path: Path):
     def short(old: RecordedMessage, message: Any) -> Any:
-        if old.topic == SEEN_THREAD.recorded:
+        if old.topic == MEASURED_THREAD.recorded:
             message.poses = message.poses[:8]
         return message
 
     bag = changed(pose_bag, tmp_path / "short", short)
     said: list[str] = []
-    summary = replay_offline(bag, tmp_path / "out", say=said.append)
+    summary = replay_offline(bag, tmp_path / "out", log=said.append)
     assert "is it another thread?" in summary.remark
     assert summary.remark in said
 
@@ -224,12 +226,14 @@ def test_broken_pictures_and_poses_are_counted(pose_bag: Path, short_bag: Path, 
 
 
 def test_nothing_predicted_is_said_with_the_reason(pose_bag: Path, tmp_path: Path):
-    blind = changed(pose_bag, tmp_path / "blind", lambda old, m: None if old.topic == SEEN_THREAD.recorded else m)
+    blind = changed(pose_bag, tmp_path / "blind", lambda old, m: None if old.topic == MEASURED_THREAD.recorded else m)
     with pytest.raises(BagError, match="30 of 30 poses had a needle; waiting for the thread to be seen"):
         replay_offline(blind, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     steps = list(
-        predictions(sights(Recording(Bag(blind)), SETUP), replace(SETUP.model, initial_shape="straight"), SETUP.scene)
+        predictions(
+            read_observations(Recording(Bag(blind)), SETUP), replace(SETUP.model, initial_shape="straight"), SETUP.scene
+        )
     )
     assert len(steps) == 30
     assert all(step.outcome.prediction is not None for step in steps)
@@ -241,7 +245,7 @@ def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_pat
     damage = Bag(tmp_path / "cut.mcap").damage
     assert damage is not None
     said: list[str] = []
-    summary = replay_offline(tmp_path / "cut.mcap", tmp_path / "out", say=said.append)
+    summary = replay_offline(tmp_path / "cut.mcap", tmp_path / "out", log=said.append)
     assert 0 < summary.predicted < 28
     assert summary.damage == str(damage)
     assert any(str(damage) in line for line in said)
@@ -250,7 +254,7 @@ def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_pat
 def test_poses_may_wait_for_their_thread(pose_bag: Path):
     """The thread is seen late: poses before are answered, and not predicted."""
     recording = Recording(Bag(pose_bag))
-    seen = list(sights(recording, SETUP))
+    seen = list(read_observations(recording, SETUP))
     late = [replace(s, seen=np.empty((0, 2))) if k < 5 else s for k, s in enumerate(seen)]
     steps = list(predictions(late, SETUP.model, SETUP.scene))
     assert [step.outcome.waiting for step in steps] == [True] * 5 + [False] * 25
@@ -264,13 +268,13 @@ def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
     message = MESSAGES.path_message(5 * 10**9 + 7, points)
     for pose in message.poses:
         pose.header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id=frame)
-    data = bytes(typestore().serialize_cdr(message, SEEN_THREAD.type_name))
-    given = RecordedMessage(SEEN_THREAD.recorded, SEEN_THREAD.type_name, 3, data)
+    data = bytes(typestore().serialize_cdr(message, MEASURED_THREAD.type_name))
+    given = RecordedMessage(MEASURED_THREAD.recorded, MEASURED_THREAD.type_name, 3, data)
     assert np.array_equal(read_path(given), points)
     assert stamp_of(given) == 5 * 10**9 + 7
     if count > 1:
         message.poses[1].header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id="longer_than_it")
-        data = bytes(typestore().serialize_cdr(message, SEEN_THREAD.type_name))
+        data = bytes(typestore().serialize_cdr(message, MEASURED_THREAD.type_name))
         assert np.array_equal(read_path(replace(given, data=data)), points)
     for cut in range(0, len(data), 5):
         with pytest.raises(BagError):
@@ -290,7 +294,7 @@ def test_poses_are_read_as_a_node_gets_them():
 
 
 def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
-    steps = list(predictions(list(sights(Recording(Bag(pose_bag)), SETUP))[:3], SETUP.model, SETUP.scene))
+    steps = list(predictions(list(read_observations(Recording(Bag(pose_bag)), SETUP))[:3], SETUP.model, SETUP.scene))
     prediction, margins = steps[-1].outcome.prediction, steps[-1].margins
     assert prediction is not None
     assert margins is not None
@@ -334,12 +338,12 @@ def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
     with BagWriter(tmp_path / "wider", source.notes) as writer:
         for topic, type_name in (*source.topics.items(), (SCENE.recorded, SCENE.type_name)):
             writer.add_topic(topic, type_name)
-        for record in source.records(set(source.topics)):
-            writer.write(record.topic, record.time, record.data)
+        for render_bag in source.records(set(source.topics)):
+            writer.write(render_bag.topic, render_bag.time, render_bag.data)
         stamp = round(1.39e9)
         writer.write_message(SCENE.recorded, stamp, MESSAGES.scene_message(stamp, wider))
     for start, found in ((0.0, 12), (0.5, 0)):
-        seen = sights(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
+        seen = read_observations(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
         # In a dish of twice the diameter, what was the needle is twice as long.
         tracked = [sight.found for sight in seen]
         assert sum(tracked) == sum(tracked[:found]) >= found - 2
@@ -355,8 +359,8 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
             (MATERIAL.recorded, MATERIAL.type_name),
         ):
             writer.add_topic(topic, type_name)
-        for record in source.records(set(source.topics)):
-            writer.write(record.topic, record.time, record.data)
+        for render_bag in source.records(set(source.topics)):
+            writer.write(render_bag.topic, render_bag.time, render_bag.data)
         for time, told, version in ((1.39, scene, scene.version), (1.5, scene, "f" * 16), (1.61, too_fine, "")):
             stamp = round(time * 1e9)
             message = MESSAGES.scene_message(stamp, told)
@@ -376,7 +380,7 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
         )
         writer.write_message(MATERIAL.recorded, stamp, silk)
     for start, first in ((0.0, 12), (0.5, 0)):
-        seen = sights(Recording(Bag(tmp_path / "told")), SETUP, start=start)
+        seen = read_observations(Recording(Bag(tmp_path / "told")), SETUP, start=start)
         steps = list(predictions(seen, SETUP.model, SETUP.scene))
         assert [step.scene for step in steps] == [SETUP.scene] * first + [scene] * (len(steps) - first)
         assert [step.outcome.scene_version for step in steps] == [step.scene.version for step in steps if step.scene]
@@ -385,6 +389,6 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
         assert all(step.outcome.prediction is not None for step in steps)
         assert sum(seen.refused.values()) == 2
     replay_offline(tmp_path / "told", tmp_path / "again")
-    said = [record.decode().version for record in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]
+    said = [render_bag.decode().version for render_bag in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]
     # So that what comes of it can be replayed in its turn.
     assert said[:2] == [SETUP.scene.version, scene.version]

@@ -79,7 +79,7 @@ def test_a_corner_radius_takes_the_four_corners_off_a_sector():
     lost = sharp.area - soft.area
     assert lost == pytest.approx(4.0 * (1.0 - 0.25 * math.pi) * 1e-6, rel=0.06)
     assert solid(sharp).buffer(0.2 * ARC_TOLERANCE).contains(solid(soft))
-    assert soft.has_room_for(0.001)
+    assert soft.can_contain(0.001)
 
 
 def test_the_sides_of_the_hernia_are_mirrored():

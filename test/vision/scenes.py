@@ -12,7 +12,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.rig.camera.dish_camera import Cover, DishCamera
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.scene import Scene as TrackedScene
 from magnetosuture_thread.vision.look import Track
 
@@ -73,7 +73,7 @@ def random_thread(random: np.random.Generator, pose: Pose, length: float = 0.019
 
 
 @lru_cache(maxsize=6)  # a camera holds some 50 MB
-def camera_for(seed: int, lighting: Lighting | None, scene: Scene) -> DishCamera:
+def camera_for(seed: int, lighting: Lighting | None, scene: CameraScene) -> DishCamera:
     """Return a camera; making one takes as long as ten frames."""
     return DishCamera(scene, VIEW, seed=seed, lighting=lighting)
 
@@ -89,7 +89,7 @@ def render(
     **scene: Any,
 ) -> np.ndarray:
     """Draw a frame."""
-    what = Scene(needle_curvature=pose.curvature, **scene)
+    what = CameraScene(needle_curvature=pose.curvature, **scene)
     return camera_for(seed, lighting, what).render(pose.tail, pose.heading, thread, covers, gain)
 
 

@@ -12,7 +12,7 @@ import pytest
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.scene import Scene as DishScene
 from magnetosuture_thread.vision.look import State
@@ -134,7 +134,9 @@ def test_over_many_poses_the_covariance_is_about_right():
 
 def test_a_larger_dish_with_a_faint_thread_is_tracked():
     view = DishView((644.0, 476.0), 0.15 / 875.0)
-    camera = DishCamera(Scene(dish_diameter=0.15, needle_curvature=150.0, thread_diameter=66e-6), view, (1280, 960), 1)
+    camera = DishCamera(
+        CameraScene(dish_diameter=0.15, needle_curvature=150.0, thread_diameter=66e-6), view, (1280, 960), 1
+    )
     s = np.linspace(0.0, 0.15, 500)
     tail, angle = np.array([0.03, 0.01]), np.pi - 0.4 + 35.0 * s
     thread = np.vstack([tail, tail + np.cumsum(0.15 / 500 * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)])

@@ -39,7 +39,7 @@ def described(**shapes: Mapping[str, object]) -> Scene:
 
 def frame_of(scene: Scene, look: Look, pose: Pose, thread: np.ndarray) -> np.ndarray:
     """Draw a frame in which all shapes of a scene look alike."""
-    what = drawn.Scene(obstacles=scene.obstacles, looks=[look] * len(scene.shapes))
+    what = drawn.CameraScene(obstacles=scene.obstacles, looks=[look] * len(scene.shapes))
     return DishCamera(what, VIEW, seed=3).render(pose.tail, pose.heading, thread)
 
 
@@ -184,7 +184,7 @@ def test_the_set_ups_camera_sees_the_needle_among_dark_tissue():
     setup = read_setup("hernia_ring")
     scene = read_scene("hernia_ring")
     rig = setup.rig
-    what = drawn.Scene(
+    what = drawn.CameraScene(
         dish_diameter=0.05, needle_length=0.0025, needle_width=0.00035, obstacles=scene.obstacles, looks=[STEEL] * 3
     )
     tail, heading = np.array([0.004, -0.012]), 2.0

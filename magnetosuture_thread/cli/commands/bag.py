@@ -14,10 +14,10 @@ from rich.text import Text
 
 from magnetosuture_thread.cli.arguments import add_remap, output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, printable, progress, sayer, write_json
+from magnetosuture_thread.cli.terminal import make_console, make_log, printable, progress, write_json
 
 DAMAGED = 1
-LONGEST_NOTE = 200  # characters of a note that are shown; one may hold a whole scenario
+MAX_NOTE_CHARS = 200  # characters of a note that are shown; one may hold a whole scenario
 
 DESCRIPTION = """\
 Look through a bag, or make a whole one of what is intact in it. BAG is an mcap or sqlite3 file of any
@@ -38,9 +38,9 @@ say how many there are and what is lost, where and when.
 
 def add(subparsers: Subparsers) -> None:
     """Add the command."""
-    parser = command(subparsers, "bag", "check a recorded bag, or repair it", DESCRIPTION, run_check)
+    parser = command(subparsers, "bag", "check a recorded bag, or repair it", DESCRIPTION, run_bag_check)
     actions = parser.add_subparsers(title="what to do", metavar="ACTION", required=True)
-    check = command(actions, "check", "say what a bag holds, and whether it is whole", CHECK, run_check)
+    check = command(actions, "check", "say what a bag holds, and whether it is whole", CHECK, run_bag_check)
     repair = command(actions, "repair", "make a whole bag of what is intact", REPAIR, run_repair)
     for action in (check, repair):
         action.add_argument("bag", type=Path, metavar="BAG", help="a bag's file or folder")
@@ -50,7 +50,7 @@ def add(subparsers: Subparsers) -> None:
     repair.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
 
 
-def run_check(options: argparse.Namespace) -> int:
+def run_bag_check(options: argparse.Namespace) -> int:
     """Say what a bag holds, and whether it is whole."""
     from magnetosuture_thread.bags.reader import Bag
     from magnetosuture_thread.bags.report import inspect_bag
@@ -61,7 +61,7 @@ def run_check(options: argparse.Namespace) -> int:
         found = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share)).to_json()
     console.print(_table(found))
     for line in _lines(found):
-        sayer(console)(line)
+        make_log(console)(line)
     write_json(options.json, found)
     return DAMAGED if found["damage"] or found["refused"] else DONE
 
@@ -74,7 +74,7 @@ def run_repair(options: argparse.Namespace) -> int:
     from magnetosuture_thread.jobs.output import whole_folder
 
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     refused: Counter[str] = Counter()
     with progress(console, "bag repair") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
@@ -83,14 +83,14 @@ def run_repair(options: argparse.Namespace) -> int:
                 bag, folder, options.output.name, refused, lambda share: advance(0.5 + 0.5 * share)
             )
     if bag.damage is not None:
-        say(str(bag.damage))
+        log(str(bag.damage))
     elif not refused:
-        say(bag.unchecked or "is not damaged: the new bag holds the same")
+        log(bag.unchecked or "is not damaged: the new bag holds the same")
     for reason, lost in refused.items():
-        say(f"{reason}: {pluralize(lost, 'message')} lost")
+        log(f"{reason}: {pluralize(lost, 'message')} lost")
     for place in bag.damage.regions if bag.damage is not None else ():
-        say(f"  {place}{_times(place.first, place.last, bag.start)}")
-    say(f"{count} messages in {options.output}")
+        log(f"  {place}{_times(place.first, place.last, bag.start)}")
+    log(f"{count} messages in {options.output}")
     return DONE
 
 
@@ -138,7 +138,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         if topic["unreadable_stamps"]:
             lines.append(f"{name}: {topic['unreadable_stamps']} stamps cannot be read")
     lines += ["; ".join(f"{key} {value}" for key, value in file.items()) for file in found["files"]]
-    lines += [f"{key}: {shorten(value, LONGEST_NOTE, placeholder=' ...')}" for key, value in found["notes"].items()]
+    lines += [f"{key}: {shorten(value, MAX_NOTE_CHARS, placeholder=' ...')}" for key, value in found["notes"].items()]
     if found["unchecked"]:
         lines.append(found["unchecked"])
     lines += [

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from magnetosuture_thread.cli.arguments import add_source, output_file, whole_number
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, progress, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress
 
 INTERRUPTED = 130  # as shells have it
 
@@ -72,10 +72,10 @@ def add(subparsers: Subparsers) -> None:
 def run(options: argparse.Namespace) -> int:
     """Fit the thread's parameters to recorded bags."""
     from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
-    from magnetosuture_thread.jobs.calibrate import Request, calibrate
+    from magnetosuture_thread.jobs.calibrate import Request, calibrate_bags
 
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     request = Request(
         setup=options.setup,
         material=options.material,
@@ -88,19 +88,19 @@ def run(options: argparse.Namespace) -> int:
         frame=options.frame,
     )
     with progress(console, "calibrate") as advance:
-        found = calibrate(
+        found = calibrate_bags(
             options.bags,
             options.output,
             request,
             picture=options.picture,
             json_file=options.json,
-            say=say,
+            log=log,
             progress=advance,
         )
     values = found.to_json()
     console.print(parameter_table(values))
     console.print(bag_table(values))
     for line in calibration_lines(values):
-        say(line)
-    say(f"parameters: {options.output}")
+        log(line)
+    log(f"parameters: {options.output}")
     return DONE if found.finished else INTERRUPTED

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from magnetosuture_thread.cli.arguments import add_remap, number, output_file
+from magnetosuture_thread.cli.arguments import add_remap, number_argument, output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log
 
 if TYPE_CHECKING:
     from magnetosuture_thread.vision.calibration import Calibration
@@ -31,11 +31,15 @@ def add(subparsers: Subparsers) -> None:
     parser = command(subparsers, "calibrate-camera", "find where the dish is in the camera's image", DESCRIPTION, run)
     parser.add_argument("frames", type=Path, nargs="+", metavar="FRAMES", help="pictures, a folder of them, or a bag")
     parser.add_argument(
-        "--dish-diameter", type=number(0.005, 0.5), required=True, metavar="D", help="inner diameter of the dish [m]"
+        "--dish-diameter",
+        type=number_argument(0.005, 0.5),
+        required=True,
+        metavar="D",
+        help="inner diameter of the dish [m]",
     )
     parser.add_argument(
         "--markers",
-        type=number(1e-3, 2.0),
+        type=number_argument(1e-3, 2.0),
         nargs=2,
         metavar=("SPACING", "SIDE"),
         help="of the ArUco markers around the dish [m] (default: by the dish's rim)",
@@ -51,7 +55,7 @@ def calibrate_camera(
     markers: tuple[float, float] | None = None,
     *,
     remap: Mapping[str, str] | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    log: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Calibrate from frames and write a section `vision_tracker` of a ROS 2 parameter file.
 
@@ -61,7 +65,7 @@ def calibrate_camera(
         output: the file to write.
         markers: spacing and side of the ArUco markers [m]; None to calibrate by the dish's rim.
         remap: new name of a bag's topic by its recorded name.
-        say: called with a line for a person on what of a bag is damaged or not checked.
+        log: called with a line for a person on what of a bag is damaged or not checked.
 
     Raises:
         BagError: there are no frames that can be read, or the file cannot be written.
@@ -75,11 +79,11 @@ def calibrate_camera(
 
     source = FrameSource(paths, remap=remap)
     for doubt in source.doubts:
-        say(f"{paths[0]} {doubt}")
+        log(f"{paths[0]} {doubt}")
     every = -(-source.count // MAX_FRAMES)
     images = [np.asarray(f.image) for i, f in enumerate(source) if i % every == 0 and f.image is not None]
     for line in source.refused:
-        say(line)
+        log(line)
     if not images:
         raise BagError(paths[0], "holds no frame that can be read")
     if markers is None:
@@ -95,15 +99,15 @@ def calibrate_camera(
 
 def run(options: argparse.Namespace) -> int:
     """Find out where the dish is in the camera's image."""
-    say = sayer(make_console())
+    log = make_log(make_console())
     markers = tuple(options.markers) if options.markers else None
     found = calibrate_camera(
-        options.frames, options.dish_diameter, options.output, markers, remap=dict(options.remap), say=say
+        options.frames, options.dish_diameter, options.output, markers, remap=dict(options.remap), log=log
     )
     u, v = found.view.centre_px
     scale, turned = found.view.metres_per_pixel * 1e3, found.view.rotation
-    say(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
+    log(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
     by = f"markers, residual {found.residual_px:.2f} px" if markers else "the dish's rim"
-    say(f"by {by}; {found.frames} frames, scatter {found.scatter_px:.2f} px")
-    say(f"parameters: {options.output}")
+    log(f"by {by}; {found.frames} frames, scatter {found.scatter_px:.2f} px")
+    log(f"parameters: {options.output}")
     return DONE

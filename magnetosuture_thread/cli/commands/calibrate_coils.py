@@ -13,7 +13,7 @@ from rich.table import Table
 
 from magnetosuture_thread.cli.arguments import output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log
 from magnetosuture_thread.errors import BagError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -49,12 +49,12 @@ def add(subparsers: Subparsers) -> None:
 def run(options: argparse.Namespace) -> int:
     """Find the coils' properties from probe measurements."""
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     found = calibrate_coils(options.measurements, options.output, options.model, options.name).to_json()
     console.print(_table(found))
     for line in _lines(found):
-        say(line)
-    say(f"calibration: {options.output}")
+        log(line)
+    log(f"calibration: {options.output}")
     return DONE
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log
 
 ACTIONS = ("state", "arm", "disarm", "stop", "reset", "configure", "activate", "deactivate", "cleanup")
 
@@ -35,12 +35,12 @@ def run(options: argparse.Namespace) -> int:
     """Press a switch of the running coil bridge."""
     from magnetosuture_thread.nodes.coil_client import CoilClient
 
-    say = sayer(make_console())
+    log = make_log(make_console())
     with CoilClient() as client:
         if options.action != "state":
             client.execute(options.action)
         state = client.state()
     width = max(len(name) for name in state)
     for name, value in state.items():
-        say(f"{name:{width}}  {value}")
+        log(f"{name:{width}}  {value}")
     return DONE

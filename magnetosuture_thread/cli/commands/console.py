@@ -8,7 +8,7 @@ from pathlib import Path
 
 from magnetosuture_thread.cli.arguments import whole_number
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
 
@@ -66,6 +66,6 @@ def run(options: argparse.Namespace) -> int:
         address=options.address,
         port=options.port,
         token=options.token or os.environ.pop(TOKEN, None) or None,  # no node gets it
-        say=sayer(make_console()),
+        log=make_log(make_console()),
     )
     return DONE

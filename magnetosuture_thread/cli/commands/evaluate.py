@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
-from magnetosuture_thread.cli.arguments import add_source, number, output_file, segments, whole_number
+from magnetosuture_thread.cli.arguments import add_source, number_argument, output_file, segments, whole_number
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, progress, sayer, write_json
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
 
 DESCRIPTION = """\
 Score the thread model: on bags, or on reference trajectories; not on both in one call.
@@ -22,7 +22,7 @@ two folders below. DIR, which must not exist, gets
 A bag that cannot be evaluated has its row too, with the problem in it; the exit code is 1 then.
 
 Reference trajectories: files DIR/*.npz with the needle's poses and the thread that followed (arrays t, pose, X and
-meta, as for `record`). The model starts from the first thread, is driven by the poses and nothing else, with each
+meta, as for `render`). The model starts from the first thread, is driven by the poses and nothing else, with each
 file's own thread and parameters, and is compared at every sample.
 
 Errors are mean distances of the nodes in % of the thread's length.
@@ -64,9 +64,11 @@ def add(subparsers: Subparsers) -> None:
     )
     add_source(bags)
     bags.add_argument(
-        "--start", type=number(0.0, 1e9), default=0.0, metavar="S", help="seconds into each bag to begin at"
+        "--start", type=number_argument(0.0, 1e9), default=0.0, metavar="S", help="seconds into each bag to begin at"
     )
-    bags.add_argument("--duration", type=number(0.0, 1e9), metavar="S", help="seconds (default: to each bag's end)")
+    bags.add_argument(
+        "--duration", type=number_argument(0.0, 1e9), metavar="S", help="seconds (default: to each bag's end)"
+    )
     bags.add_argument("--workers", type=_workers, default=1, metavar="N", help="processes (default: 1)")
     references = parser.add_argument_group("reference trajectories")
     references.add_argument("--solver", choices=("banded", "osqp"), help="what solves a step (default: banded)")
@@ -126,11 +128,11 @@ def _evaluate_bags(options: argparse.Namespace) -> int:
         duration=options.duration,
     )
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     with progress(console, "evaluate") as advance:
-        rows = evaluate_bags(options.paths, options.output, given, workers=options.workers, say=say, progress=advance)
+        rows = evaluate_bags(options.paths, options.output, given, workers=options.workers, log=log, progress=advance)
     console.print(bags_table(rows))
-    say(f"results: {options.output}")
+    log(f"results: {options.output}")
     return FAILED if any(row["problem"] for row in rows) else DONE
 
 

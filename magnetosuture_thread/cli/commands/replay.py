@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from magnetosuture_thread.cli.arguments import add_source, number
+from magnetosuture_thread.cli.arguments import add_source, number_argument
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, progress, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress
 from magnetosuture_thread.errors import ConfigurationError
 
 DESCRIPTION = """\
@@ -40,10 +40,10 @@ def add(subparsers: Subparsers) -> None:
         "--setup", default="", metavar="NAME", help="a set-up's name or YAML file (default: the one the bag names)"
     )
     parser.add_argument("--offline", action="store_true", help="without a graph, as fast as the machine can")
-    parser.add_argument("--rate", type=number(0.05, 20.0), help="how much faster than recorded (default: 1)")
+    parser.add_argument("--rate", type=number_argument(0.05, 20.0), help="how much faster than recorded (default: 1)")
     parser.add_argument("--loop", action="store_true", help="play over and over, until Ctrl-C")
-    parser.add_argument("--start", type=number(0.0, 1e6), default=0.0, help="seconds into the bag to begin at")
-    parser.add_argument("--duration", type=number(1e-3, 1e6), help="[s] (default: to the bag's end)")
+    parser.add_argument("--start", type=number_argument(0.0, 1e6), default=0.0, help="seconds into the bag to begin at")
+    parser.add_argument("--duration", type=number_argument(1e-3, 1e6), help="[s] (default: to the bag's end)")
     add_source(parser)
 
 
@@ -54,11 +54,11 @@ def run(options: argparse.Namespace) -> int:
             raise ConfigurationError(f"--{name}", getattr(options, name), "none with --offline, which knows no time")
 
     from magnetosuture_thread.evaluation.tables import summary_table
-    from magnetosuture_thread.jobs.replay import replay
+    from magnetosuture_thread.jobs.replay import replay_live
     from magnetosuture_thread.jobs.replay_offline import replay_offline
 
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     with progress(console, "replay") as advance:
         given = {
             "setup_name": options.setup,
@@ -67,13 +67,13 @@ def run(options: argparse.Namespace) -> int:
             "duration": options.duration,
             "remap": dict(options.remap),
             "frame": options.frame,
-            "say": say,
+            "say": log,
             "progress": advance,
         }
         if options.offline:
             summary = replay_offline(options.bag, options.output, **given)
         else:
-            summary = replay(options.bag, options.output, rate=options.rate or 1.0, loop=options.loop, **given)
+            summary = replay_live(options.bag, options.output, rate=options.rate or 1.0, loop=options.loop, **given)
     console.print(summary_table(summary))
-    say(f"results: {options.output}")
+    log(f"results: {options.output}")
     return DONE

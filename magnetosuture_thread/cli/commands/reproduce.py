@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, progress, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress
 
 DESCRIPTION = """\
 Reproduce a result of the paper. Everything is simulated.
@@ -53,7 +53,7 @@ def run_hernia(options: argparse.Namespace) -> int:
     from magnetosuture_thread.reproduce.hernia.replay import hernia_lines, hernia_table, replay_hernia
 
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     with progress(console, "hernia") as advance:
         summary = replay_hernia(
             options.bag,
@@ -61,12 +61,12 @@ def run_hernia(options: argparse.Namespace) -> int:
             setup_name=options.setup,
             formulation=options.formulation,
             animation=options.animation,
-            say=say,
+            log=log,
             progress=advance,
         )
     console.print(hernia_table(summary))
     for line in (*hernia_lines(summary), f"results: {options.output}"):
-        say(line)
+        log(line)
     return DONE
 
 
@@ -75,9 +75,9 @@ def run_thread_behavior(options: argparse.Namespace) -> int:
     from magnetosuture_thread.reproduce.thread_behavior import behavior_table, thread_behavior
 
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     with progress(console, "thread-behavior") as advance:
-        runs = thread_behavior(options.output, say=say, progress=advance)
+        runs = thread_behavior(options.output, log=log, progress=advance)
     console.print(behavior_table(runs))
-    say(f"results: {options.output}")
+    log(f"results: {options.output}")
     return DONE

@@ -11,9 +11,9 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from magnetosuture_thread.cli.arguments import number, output_file
+from magnetosuture_thread.cli.arguments import number_argument, output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, sayer, write_json
+from magnetosuture_thread.cli.terminal import make_console, make_log, write_json
 from magnetosuture_thread.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -44,15 +44,15 @@ Draw a scene file from above, with names and scale, as PNG or SVG.
 
 def add(subparsers: Subparsers) -> None:
     """Add the command."""
-    parser = command(subparsers, "scene", "check a scene file, or draw it", DESCRIPTION, run_check)
+    parser = command(subparsers, "scene", "check a scene file, or draw it", DESCRIPTION, run_scene_check)
     actions = parser.add_subparsers(title="what to do", metavar="ACTION", required=True)
-    check = command(actions, "check", "show what a scene holds, and what to look at", CHECK, run_check)
+    check = command(actions, "check", "show what a scene holds, and what to look at", CHECK, run_scene_check)
     draw = command(actions, "draw", "draw a scene as PNG or SVG", DRAW, run_draw)
     for action in (check, draw):
         action.add_argument("file", metavar="FILE", help="a scene's file or name")
     check.add_argument(
         "--needle-width",
-        type=number(0.0, 0.1),
+        type=number_argument(0.0, 0.1),
         default=NEEDLE_WIDTH,
         metavar="W",
         help="gaps narrower than this are reported [m] (default: %(default)s)",
@@ -63,7 +63,7 @@ def add(subparsers: Subparsers) -> None:
     )
 
 
-def run_check(options: argparse.Namespace) -> int:
+def run_scene_check(options: argparse.Namespace) -> int:
     """Show what a scene holds, and what to look at."""
     from magnetosuture_thread.scene import read_scene
     from magnetosuture_thread.scene.checks import scene_warnings
@@ -81,7 +81,7 @@ def run_check(options: argparse.Namespace) -> int:
     console.print(_table(report))
     for warning in warnings:
         console.print("warning:", style="bold yellow", end=" ")
-        sayer(console)(warning.text)
+        make_log(console)(warning.text)
     write_json(options.json, report)
     return DONE
 
@@ -91,14 +91,14 @@ def run_draw(options: argparse.Namespace) -> int:
     if options.output.suffix not in PICTURES:
         raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
 
-    from magnetosuture_thread.evaluation.scene_plot import draw_scene
+    from magnetosuture_thread.evaluation.scene_plot import plot_scene
     from magnetosuture_thread.jobs.output import whole_file
     from magnetosuture_thread.scene import read_scene
 
     scene = read_scene(options.file)
     with whole_file(options.output) as partial:
-        draw_scene(partial, scene, Path(options.file).stem)
-    sayer(make_console())(f"{options.output}: {len(scene.shapes)} shapes, version {scene.version}")
+        plot_scene(partial, scene, Path(options.file).stem)
+    make_log(make_console())(f"{options.output}: {len(scene.shapes)} shapes, version {scene.version}")
     return DONE
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from magnetosuture_thread.cli.arguments import number, output_file
+from magnetosuture_thread.cli.arguments import number_argument, output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, progress, sayer, write_json
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
 
 DESCRIPTION = """\
 Run the whole graph without a robot: rig_simulator stands in for coils, dish, needle, thread and camera;
@@ -27,12 +27,14 @@ def add(subparsers: Subparsers) -> None:
     parser.add_argument("scenario", metavar="SCENARIO", help="a set-up's name or YAML file")
     parser.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
     parser.add_argument(
-        "--duration", type=number(0.1, 1e5), help="end after this many seconds (default: at the end of the path)"
+        "--duration",
+        type=number_argument(0.1, 1e5),
+        help="end after this many seconds (default: at the end of the path)",
     )
     either = parser.add_mutually_exclusive_group()
     either.add_argument(
-        "--pace",
-        type=number(0.5, 5.0),
+        "--rate",
+        type=number_argument(0.5, 5.0),
         help="run with a simulated clock, this much faster than real time (default: in real time)",
     )
     either.add_argument(
@@ -47,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     from magnetosuture_thread.jobs.simulate import simulate
 
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     new = not options.output.exists()
     try:
         with progress(console, "simulate") as advance:
@@ -55,16 +57,16 @@ def run(options: argparse.Namespace) -> int:
                 options.scenario,
                 options.output,
                 duration=options.duration,
-                pace=options.pace,
+                rate=options.rate,
                 boards=options.boards,
-                say=say,
+                log=log,
                 progress=advance,
             )
     except KeyboardInterrupt:
         if new and options.output.exists():
-            say(f"what was recorded is in {options.output}")
+            log(f"what was recorded is in {options.output}")
         raise
     console.print(loop_table(summary))
-    say(f"bag: {options.output}")
+    log(f"bag: {options.output}")
     write_json(options.json, summary.to_json())
     return DONE

@@ -11,9 +11,9 @@ from typing import Any
 
 from rich.table import Table
 
-from magnetosuture_thread.cli.arguments import add_remap, number, output_file
+from magnetosuture_thread.cli.arguments import add_remap, number_argument, output_file
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, progress, sayer, write_json
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
 
 MAX_ROWS = 20  # beyond, only the summary is shown
 
@@ -42,13 +42,13 @@ def add(subparsers: Subparsers) -> None:
     parser.add_argument("--scene", default="", metavar="NAME", help="a scene's name or file (default: the set-up's)")
     parser.add_argument(
         "--metres-per-pixel",
-        type=number(1e-7, 1e-2),
+        type=number_argument(1e-7, 1e-2),
         metavar="S",
         help="the scale (default: the set-up's, or from the dish's diameter)",
     )
     parser.add_argument(
         "--centre",
-        type=number(0.0, 1e5),
+        type=number_argument(0.0, 1e5),
         nargs=2,
         metavar=("U", "V"),
         help="the dish's centre [px] (default: the set-up's, or found)",
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
     from magnetosuture_thread.setups import read_setup
 
     console = make_console()
-    say = sayer(console)
+    log = make_log(console)
     setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
     settings = settings_with(setup.vision, options.metres_per_pixel, options.centre)
     with progress(console, "track") as advance:
@@ -77,13 +77,13 @@ def run(options: argparse.Namespace) -> int:
             setup.scene,
             overlay=options.overlay,
             remap=dict(options.remap),
-            say=say,
+            log=log,
             progress=advance,
         )
     rows = [frame.to_json() for frame in frames]
     console.print(track_table(rows))
     for line in track_lines(rows):
-        say(line)
+        log(line)
     write_json(options.json, rows)
     return DONE
 

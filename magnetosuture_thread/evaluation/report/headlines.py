@@ -58,8 +58,9 @@ def _error(about: BagDetails, figures: BagFigures, target: str) -> Headline:
     millimetres = 10.0 * found["mean"] * about.length
     grades = ((CLOSE, GOOD, "close"), (FAIR, MIDDLING, "off, but usable"), (math.inf, BAD, "far off"))
     grade, words = next((grade, words) for limit, grade, words in grades if found["mean"] <= limit)
-    detail = f"mean over {_frames_of(found['count'])}; {number(millimetres)} mm. Greatest {number(found['maximum'])} %"
-    return Headline(name, f"{number(found['mean'])} %", detail, grade, words)
+    greatest = f"Greatest {format_number(found['maximum'])} %"
+    detail = f"mean over {_frames_of(found['count'])}; {format_number(millimetres)} mm. {greatest}"
+    return Headline(name, f"{format_number(found['mean'])} %", detail, grade, words)
 
 
 def _frames_of(count: float) -> str:
@@ -115,7 +116,7 @@ def _strain(figures: BagFigures) -> Headline:
     grade, words = (GOOD, "inextensible") if figures.strain <= EXACT else (MIDDLING, "more than 0.1 %")
     if figures.strain > 10.0 * EXACT:
         grade, words = BAD, "more than 1 %"
-    return Headline(name, f"{number(100.0 * figures.strain)} %", detail, grade, words)
+    return Headline(name, f"{format_number(100.0 * figures.strain)} %", detail, grade, words)
 
 
 def _speed(name: str, spread: Percentiles | None, interval: float, detail: str) -> Headline:
@@ -143,7 +144,7 @@ def _latency(figures: BagFigures) -> Headline:
     return Headline(name, milliseconds(spread.median), detail, grade, words)
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Return a number with three figures, never in powers of ten unless it is very small or large."""
     if not math.isfinite(value):
         return "none"
@@ -157,7 +158,7 @@ def number(value: float) -> str:
 
 def milliseconds(seconds: float) -> str:
     """Return a time in ms."""
-    return f"{number(1e3 * seconds)} ms"
+    return f"{format_number(1e3 * seconds)} ms"
 
 
 def micrometres(metres: float) -> str:
@@ -165,5 +166,5 @@ def micrometres(metres: float) -> str:
     if abs(metres) <= 1e-9:
         return "0 µm"
     if abs(metres) >= 1e-4:
-        return f"{number(1e3 * metres)} mm"
-    return f"{number(1e6 * metres)} µm"
+        return f"{format_number(1e3 * metres)} mm"
+    return f"{format_number(1e6 * metres)} µm"

@@ -16,13 +16,13 @@ from plotly.offline import get_plotlyjs
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report import headlines
 from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures
-from magnetosuture_thread.evaluation.report.pictures import Picture
+from magnetosuture_thread.evaluation.report.pictures import ReportPicture
 from magnetosuture_thread.evaluation.report.plots import page_data
 
 SINCE_EPOCH = 1_000_000_000  # s; a bag's time before it is no date
 
 
-def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pictures: Sequence[Picture]) -> str:
+def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pictures: Sequence[ReportPicture]) -> str:
     """Return the page.
 
     It loads nothing: style, script, plots' library, data and pictures are in it, and its own policy forbids the browser
@@ -58,7 +58,7 @@ def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pict
 def _template() -> Template:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
     environment.filters.update(
-        number=headlines.number, milliseconds=headlines.milliseconds, micrometres=headlines.micrometres
+        number=headlines.format_number, milliseconds=headlines.milliseconds, micrometres=headlines.micrometres
     )
     environment.globals["margin_verdict"] = headlines.margin_verdict
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}

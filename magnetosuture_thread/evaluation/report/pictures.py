@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.metrics import node_errors, target_points
 from magnetosuture_thread.evaluation.plots import INK, TRUTH, draw_threads
-from magnetosuture_thread.evaluation.report.headlines import AGAINST, number
+from magnetosuture_thread.evaluation.report.headlines import AGAINST, format_number
 from magnetosuture_thread.evaluation.series import WorstFrame
 from magnetosuture_thread.geometry.camera import DishView
 
@@ -41,7 +41,7 @@ class Photo:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReportPicture:
     """A picture of one of the worst frames.
 
     Attributes:
@@ -65,7 +65,7 @@ def draw_worst_frame(
     length: float,
     dish_diameter: float,
     simulated: bool = False,
-) -> Picture:
+) -> ReportPicture:
     """Draw one of the worst frames: the whole dish, and close by where the prediction is farthest off.
 
     Args:
@@ -111,10 +111,10 @@ def draw_worst_frame(
         scene.text(0.02, 0.98, "simulated", transform=scene.transAxes, color="#5c4300", fontsize=11, va="top", bbox=box)
     words = (
         f"{kind} at {worst.time:.2f} s with predicted, seen and true thread, and a close-up of node {node}, which is "
-        f"{number(0.01 * float(np.nanmax(errors)) * length * 1e3)} mm from {AGAINST[target]}; "
-        f"prediction error {number(worst.error)} % of the length."
+        f"{format_number(0.01 * float(np.nanmax(errors)) * length * 1e3)} mm from {AGAINST[target]}; "
+        f"prediction error {format_number(worst.error)} % of the length."
     )
-    return Picture(worst, _as_uri(figure), words, photo is None)
+    return ReportPicture(worst, _as_uri(figure), words, photo is None)
 
 
 def _plan(dish_diameter: float) -> Photo:

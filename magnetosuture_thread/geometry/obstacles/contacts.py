@@ -67,12 +67,12 @@ def nearest_of(
     data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> Nearest:
     """Return the nearest boundary point of a polygon or mesh; see `search_edges` for the arguments."""
     table = data.tables[obstacle + 1]
     if table[0] == EDGES:
-        return search_edges(x, y, reach, data.numbers, table[6], data.entries, first, last, count, distance, outward)
+        return search_edges(x, y, reach, data.numbers, table[6], data.entries, first, last, count, distance, normal)
     return search_faces(
         x,
         y,
@@ -87,7 +87,7 @@ def nearest_of(
         last,
         count,
         distance,
-        outward,
+        normal,
     )
 
 
@@ -100,7 +100,7 @@ def _ball_contact(
     data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> int:
     """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
     frame = data.frames[obstacle + 1]
@@ -112,7 +112,7 @@ def _ball_contact(
         rx, ry, rz = rx / length, ry / length, rz / length
     else:
         rx = 1.0
-    return add_row(count, count, length - frame[5], rx, ry, rz, distance, outward)
+    return add_row(count, count, length - frame[5], rx, ry, rz, distance, normal)
 
 
 @compiled
@@ -138,7 +138,7 @@ def _shape_contacts(
     data: WorkspaceData,
     count: int,
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> int:
     """Write the rows of a polygon or mesh at one point; return the new count, -1 when they are too many."""
     cell = cell_of(x, y, z, obstacle + 1, data)
@@ -148,16 +148,16 @@ def _shape_contacts(
     if first == last and inside == 0:
         return count
     start = count
-    found = nearest_of(x, y, z, data.reach, obstacle, first, last, data, count, distance, outward)
+    found = nearest_of(x, y, z, data.reach, obstacle, first, last, data, count, distance, normal)
     if math.sqrt(found.square) > data.frames[obstacle + 1, 4]:
         # Nothing of the boundary within the growth, so none within the cell: all of it is on one side.
         if inside == 0:
             return count
         features = int(data.tables[obstacle + 1, 5])
-        found = nearest_of(x, y, z, -1.0, obstacle, -1, features, data, count, distance, outward)
-        return add_row(start, start, -math.sqrt(found.square), found.x, found.y, found.z, distance, outward)
+        found = nearest_of(x, y, z, -1.0, obstacle, -1, features, data, count, distance, normal)
+        return add_row(start, start, -math.sqrt(found.square), found.x, found.y, found.z, distance, normal)
     if found.signed < 0.0:
-        return add_row(start, start, found.signed, found.x, found.y, found.z, distance, outward)
+        return add_row(start, start, found.signed, found.x, found.y, found.z, distance, normal)
     if found.rows < 0 or found.signed > data.reach:
         return found.rows
     least = np.inf
@@ -165,7 +165,7 @@ def _shape_contacts(
         least = min(least, distance[row])
     if least > found.signed * (1.0 + 1e-9) + 1e-12:
         # Between two features that rounding gave to neither.
-        return add_row(start, found.rows, found.signed, found.x, found.y, found.z, distance, outward)
+        return add_row(start, found.rows, found.signed, found.x, found.y, found.z, distance, normal)
     return found.rows
 
 
@@ -176,7 +176,7 @@ def find_contacts(
     node: NDArray[np.int64],
     obstacle: NDArray[np.int64],
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
     nearest: NDArray[np.bool_],
 ) -> int:
     """Write the contacts of points into the caller's arrays; see `Workspace.near` for what they are.
@@ -187,7 +187,7 @@ def find_contacts(
         node: index of the point, shape (c,), c rows of room.
         obstacle: index of the obstacle, `WALL` for the wall, shape (c,).
         distance: signed distance, shape (c,) [m].
-        outward: gradient of the signed distance, shape (c, d).
+        normal: gradient of the signed distance, shape (c, d).
         nearest: whether the row is the nearest of its point and obstacle, shape (c,).
 
     Returns:
@@ -203,7 +203,7 @@ def find_contacts(
         if inner_square < x * x + y * y < np.inf:
             wall_distance, wall_x, wall_y = wall_contact(x, y, data.wall_radius)
             before = count
-            count = add_row(count, count, wall_distance, wall_x, wall_y, 0.0, distance, outward)
+            count = add_row(count, count, wall_distance, wall_x, wall_y, 0.0, distance, normal)
             if count < 0:
                 return -1
             node[before], obstacle[before], nearest[before] = i, WALL, True
@@ -214,9 +214,9 @@ def find_contacts(
             o = int(data.entries[slot])
             start = count
             if data.tables[o + 1, 0] == BALL:
-                count = _ball_contact(x, y, z, o, data, count, distance, outward)
+                count = _ball_contact(x, y, z, o, data, count, distance, normal)
             else:
-                count = _shape_contacts(x, y, z, o, data, count, distance, outward)
+                count = _shape_contacts(x, y, z, o, data, count, distance, normal)
             if count < 0:
                 return -1
             best = start

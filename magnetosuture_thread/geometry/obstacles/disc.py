@@ -37,5 +37,5 @@ class Disc:
         first_axis = np.zeros_like(offset)
         first_axis[:, 0] = 1.0
         safe = np.where(distance > 0.0, distance, 1.0)[:, None]
-        outward = np.where(distance[:, None] > 0.0, offset / safe, first_axis)
-        return distance - self.radius, outward
+        normal = np.where(distance[:, None] > 0.0, offset / safe, first_axis)
+        return distance - self.radius, normal

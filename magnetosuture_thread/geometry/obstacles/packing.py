@@ -126,7 +126,7 @@ def _mark_inside(
     data: WorkspaceData,
     index: NDArray[np.int32],
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> None:
     """Write into each cell whether its centre is inside.
 
@@ -136,14 +136,14 @@ def _mark_inside(
     frame, table = data.frames[obstacle + 1], data.tables[obstacle + 1]
     size = 1.0 / frame[3]
     for k in range(table[3]):
-        z = frame[2] + (k + 0.5) * size if outward.shape[1] == 3 else 0.0
+        z = frame[2] + (k + 0.5) * size if normal.shape[1] == 3 else 0.0
         for j in range(table[2]):
             y = frame[1] + (j + 0.5) * size
             inside = 0
             for i in range(table[1]):
                 x = frame[0] + (i + 0.5) * size
                 cell = table[4] + 2 * (i + table[1] * (j + table[2] * k))
-                found = nearest_of(x, y, z, -1.0, obstacle, index[cell], index[cell + 2], data, 0, distance, outward)
+                found = nearest_of(x, y, z, -1.0, obstacle, index[cell], index[cell + 2], data, 0, distance, normal)
                 if np.sqrt(found.square) <= frame[4]:
                     inside = 1 if found.signed < 0.0 else 0
                 index[cell + 1] = inside

@@ -66,7 +66,7 @@ class Polygon:
         """Area of the solid, holes taken off [m^2]."""
         return sum(_signed_area(ring) for ring in (self.outline, *self.holes))
 
-    def has_room_for(self, radius: float) -> bool:
+    def can_contain(self, radius: float) -> bool:
         """Return whether a disc of this radius fits into the solid somewhere [m]."""
         solid = shapely.Polygon(self.outline, self.holes)
         return not solid.buffer(-radius).is_empty

@@ -52,7 +52,7 @@ def add_row(
     y: float,
     z: float,
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> int:
     """Write a row unless it is the same boundary point as a row since `start`; return the new count.
 
@@ -60,22 +60,22 @@ def add_row(
     """
     if count < 0:
         return count
-    dimension = outward.shape[1]
+    dimension = normal.shape[1]
     for row in range(start, count):
         if (
             abs(distance[row] - length) <= _SAME_POINT * length + MIN_DISTANCE
-            and abs(outward[row, 0] - x) <= _SAME_POINT
-            and abs(outward[row, 1] - y) <= _SAME_POINT
-            and (dimension == 2 or abs(outward[row, 2] - z) <= _SAME_POINT)
+            and abs(normal[row, 0] - x) <= _SAME_POINT
+            and abs(normal[row, 1] - y) <= _SAME_POINT
+            and (dimension == 2 or abs(normal[row, 2] - z) <= _SAME_POINT)
         ):
             return count
     if count >= len(distance):
         return -1
     distance[count] = length
-    outward[count, 0] = x
-    outward[count, 1] = y
+    normal[count, 0] = x
+    normal[count, 1] = y
     if dimension == 3:
-        outward[count, 2] = z
+        normal[count, 2] = z
     return count + 1
 
 
@@ -91,7 +91,7 @@ def search_edges(
     last: int,
     count: int,
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> Nearest:
     """Return the nearest of some edges, and write a row for each local minimum of the distance outside.
 
@@ -109,7 +109,7 @@ def search_edges(
         last: the one after the last entry.
         count: number of rows so far.
         distance: rows' signed distance, written from `count` on [m].
-        outward: rows' outward direction.
+        normal: rows' outward direction.
     """
     start = count
     limit = reach * reach if reach >= 0.0 else -1.0
@@ -132,9 +132,9 @@ def search_edges(
             ):
                 length = math.sqrt(square)
                 if length > MIN_DISTANCE:
-                    count = add_row(start, count, length, rx / length, ry / length, 0.0, distance, outward)
+                    count = add_row(start, count, length, rx / length, ry / length, 0.0, distance, normal)
                 else:
-                    count = add_row(start, count, length, numbers[k + 9], numbers[k + 10], 0.0, distance, outward)
+                    count = add_row(start, count, length, numbers[k + 9], numbers[k + 10], 0.0, distance, normal)
         elif along >= numbers[k + 6]:
             rx, ry = x - numbers[k + 2], y - numbers[k + 3]
             square = rx * rx + ry * ry
@@ -146,7 +146,7 @@ def search_edges(
             if square < best:
                 best, corner, bx, by, nx, ny = square, False, rx, ry, dy, -dx
             if side >= 0.0 and square <= limit:
-                count = add_row(start, count, side, dy, -dx, 0.0, distance, outward)
+                count = add_row(start, count, side, dy, -dx, 0.0, distance, normal)
     if best == np.inf:
         return Nearest(count, best, best, 0.0, 0.0, 0.0)
     length = math.sqrt(best)
@@ -171,7 +171,7 @@ def search_faces(
     last: int,
     count: int,
     distance: NDArray[np.float64],
-    outward: NDArray[np.float64],
+    normal: NDArray[np.float64],
 ) -> Nearest:
     """Return the nearest of some faces, and write a row for each local minimum of the distance outside.
 
@@ -192,11 +192,11 @@ def search_faces(
         last: the one after the last entry.
         count: number of rows so far.
         distance: rows' signed distance, written from `count` on [m].
-        outward: rows' outward direction.
+        normal: rows' outward direction.
     """
     start = count
     limit = reach * reach if reach >= 0.0 else -1.0
-    best, bx, by, bz, normal, blunt = np.inf, 0.0, 0.0, 0.0, 0, False
+    best, bx, by, bz, face_normal, blunt = np.inf, 0.0, 0.0, 0.0, 0, False
     for slot in range(max(first, 0), last):
         face = index[slot] if first >= 0 else slot
         k = base + FACE_WIDTH * face
@@ -226,7 +226,7 @@ def search_faces(
             side = rx * numbers[at] + ry * numbers[at + 1] + rz * numbers[at + 2]
             square = rx * rx + ry * ry + rz * rz
         if square < best:
-            best, bx, by, bz, normal, blunt = square, rx, ry, rz, at, region == FACE
+            best, bx, by, bz, face_normal, blunt = square, rx, ry, rz, at, region == FACE
         if side < 0.0 or square > limit:
             continue
         mark = marks + FACE_MARKS * face
@@ -247,13 +247,13 @@ def search_faces(
                 continue
         length = math.sqrt(square)
         if region == FACE or length <= MIN_DISTANCE:
-            count = add_row(start, count, length, numbers[at], numbers[at + 1], numbers[at + 2], distance, outward)
+            count = add_row(start, count, length, numbers[at], numbers[at + 1], numbers[at + 2], distance, normal)
         else:
-            count = add_row(start, count, length, rx / length, ry / length, rz / length, distance, outward)
+            count = add_row(start, count, length, rx / length, ry / length, rz / length, distance, normal)
     if best == np.inf:
         return Nearest(count, best, best, 0.0, 0.0, 0.0)
     length = math.sqrt(best)
-    nx, ny, nz = numbers[normal], numbers[normal + 1], numbers[normal + 2]
+    nx, ny, nz = numbers[face_normal], numbers[face_normal + 1], numbers[face_normal + 2]
     sign = 1.0 if bx * nx + by * ny + bz * nz >= 0.0 else -1.0
     if not blunt and length > MIN_DISTANCE:
         nx, ny, nz = sign * bx / length, sign * by / length, sign * bz / length

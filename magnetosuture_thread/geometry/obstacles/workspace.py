@@ -28,14 +28,14 @@ class Contacts:
         node: index of the point, shape (k,).
         obstacle: index of the obstacle, `WALL` for the dish wall, shape (k,).
         distance: signed distance, negative inside of an obstacle and beyond the wall, shape (k,) [m].
-        outward: gradient of the signed distance, unit vectors, shape (k, d).
+        normal: gradient of the signed distance, unit vectors, shape (k, d).
         nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
     """
 
     node: NDArray[np.int64]
     obstacle: NDArray[np.int64]
     distance: NDArray[np.float64]
-    outward: Points
+    normal: Points
     nearest: NDArray[np.bool_]
 
     def __len__(self) -> int:
@@ -106,13 +106,13 @@ class Workspace:
             raise ValueError(f"points of shape {points.shape}, expected (m, {self.dimension})")
         while True:
             node, obstacle = np.empty(self._max_rows, np.int64), np.empty(self._max_rows, np.int64)
-            distance, outward = np.empty(self._max_rows), np.empty((self._max_rows, self.dimension))
+            distance, normal = np.empty(self._max_rows), np.empty((self._max_rows, self.dimension))
             nearest = np.empty(self._max_rows, np.bool_)
-            count = find_contacts(points, self.data, node, obstacle, distance, outward, nearest)
+            count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
             if count >= 0:
                 break
             self._max_rows *= 2
-        found = [array[:count].copy() for array in (node, obstacle, distance, outward, nearest)]
+        found = [array[:count].copy() for array in (node, obstacle, distance, normal, nearest)]
         for array in found:
             array.setflags(write=False)
         return Contacts(*found)

@@ -45,7 +45,7 @@ class RodProperties(NamedTuple):
 
 
 @compiled
-def assemble(
+def assemble_step(
     solves: int,
     rod: RodProperties,
     buffers: StepBuffers,
@@ -301,7 +301,7 @@ def solve_step(
         init_step(motion, positions, velocities, nodes, ends, rod.unit, interval, last_interval)
     worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
     while True:
-        contacts, off = assemble(
+        contacts, off = assemble_step(
             solves,
             rod,
             buffers,
@@ -337,7 +337,7 @@ def solve_step(
             buffers.compliance[:rows],
         )
         u, multipliers = motion.velocities.copy(), buffers.multipliers[:rows].copy()
-        word, _, found = banded.solve_and_judge(axes, program, u, multipliers, solver_buffers)
+        word, _, found = banded.solve_and_check(axes, program, u, multipliers, solver_buffers)
         if not max(found) <= tolerance:
             return UNSOLVED, contacts, solves, off, status, worst
         accept_step(buffers, motion, u, multipliers, interval)

@@ -138,7 +138,7 @@ class StepBuffers(NamedTuple):
         node: contacts: as `find_contacts` writes them, shape (c,).
         obstacle: shape (c,).
         distance: shape (c,).
-        outward: shape (c, d).
+        normal: shape (c, d).
         nearest: shape (c,).
         push: what contacts last pushed each node with, shape (n + 1,).
     """
@@ -158,7 +158,7 @@ class StepBuffers(NamedTuple):
     node: NDArray[np.int64]
     obstacle: NDArray[np.int64]
     distance: Vector
-    outward: Points
+    normal: Points
     nearest: NDArray[np.bool_]
     push: Vector
 
@@ -257,7 +257,7 @@ def contact_rows(
     """
     nodes, dimension = about.shape
     found = find_contacts(
-        about * unit, workspace, buffers.node, buffers.obstacle, buffers.distance, buffers.outward, buffers.nearest
+        about * unit, workspace, buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.nearest
     )
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
@@ -271,10 +271,10 @@ def contact_rows(
         bound = -clearance / unit
         begin, here = min(i, nodes - 3), row + kept
         for a in range(dimension):
-            outward = buffers.outward[c, a]
+            normal = buffers.normal[c, a]
             for k in range(SPAN):
-                buffers.gradient[here, k, a] = outward if begin + k == i else 0.0
-            bound -= outward * (start[i, a] - about[i, a])
+                buffers.gradient[here, k, a] = normal if begin + k == i else 0.0
+            bound -= normal * (start[i, a] - about[i, a])
         buffers.first[here], buffers.value[here] = begin, clearance / unit
         buffers.lower[here], buffers.upper[here] = bound / interval, np.inf
         # A node that has to be pushed out may be held in by something else: then as far as it goes.

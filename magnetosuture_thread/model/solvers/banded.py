@@ -43,7 +43,7 @@ Axes = tuple[int, ...]
 
 
 @compiled
-def assemble(
+def assemble_matrix(
     axes: Axes, program: ChainProgram, weights: Vector, active: NDArray[np.bool_], band: NDArray[np.float64]
 ) -> None:
     """Write the lower band of P + sum w a a': band[j, k] is the entry of row j + k and column j."""
@@ -165,7 +165,7 @@ class BandedSolver:
         nodes, dimension = program.linear.shape
         buffers = self.buffers(nodes, dimension, len(program.first))
         u, found, axes = velocities.copy(), multipliers.copy(), (0, 1, 2)[:dimension]
-        status, iterations, residuals = solve_and_judge(axes, program, u, found, buffers)
+        status, iterations, residuals = solve_and_check(axes, program, u, found, buffers)
         return Solution(u, found, self.name, STATUS[status], iterations, Residuals(*residuals))
 
     def buffers(self, nodes: int, dimension: int, rows: int) -> SolverBuffers:
@@ -337,7 +337,7 @@ def solve(
     changes, stalled, least = 1, 0, np.inf
     for iteration in range(1, iterations + 1):
         if changes:
-            assemble(axes, program, weights, active, band)
+            assemble_matrix(axes, program, weights, active, band)
             if not factorise(axes, band):
                 return INDEFINITE, iteration
         start = end = 0.0
@@ -379,7 +379,7 @@ def solve(
 
 
 @compiled
-def solve_and_judge(
+def solve_and_check(
     axes: Axes,
     program: ChainProgram,
     u: NDArray[np.float64],

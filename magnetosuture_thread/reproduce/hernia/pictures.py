@@ -23,7 +23,7 @@ from magnetosuture_thread.scene import Scene
 FLOOR, RIM = "#f4f1ec", "#c9c3ba"
 TISSUE, EDGE = "#f0b9b4", "#c98680"
 RING, RING_EDGE = "#d9827f", "#a8504f"
-ROOM = 0.04  # of the dish's diameter, around it
+MARGIN = 0.04  # of the dish's diameter, around it
 REACH = 1.2  # s of its way, by which an arrow shows a velocity
 NODE_COLOURS = ("#0b3c5d", "#1f77b4", "#2a9d8f", "#8ab17d", "#e9a03b")
 TOP = 6.0e-3  # m; barriers beyond are not drawn
@@ -52,7 +52,7 @@ def draw_hernia(path: Path, run: HerniaRun) -> None:
     for index, instant in enumerate(run.shown):
         column, row = index % 3, index // 3
         axes = figure.add_axes((0.02 + 0.325 * column, 0.618 - 0.315 * row, 0.31, 0.295))
-        draw_dish(axes, run.scene)
+        draw_hernia_dish(axes, run.scene)
         draw_thread(axes, instant)
         axes.set_title(f"{instant.time:.0f} s: {caption(instant)}", fontsize=10, color=INK, pad=2)
     for index, shape in enumerate(run.scene.shapes):
@@ -123,7 +123,7 @@ def draw_animation(path: Path, run: HerniaRun) -> None:
             instant = run.nearest(k * FASTER / PICTURES)
             figure.clear()
             axes = figure.add_axes((0.0, 0.0, 1.0, 0.9))
-            draw_dish(axes, run.scene)
+            draw_hernia_dish(axes, run.scene)
             draw_thread(axes, instant)
             figure.text(0.03, 0.955, caption(instant), fontsize=10.5, color=INK)
             words = f"{instant.time:.0f} s, shown {FASTER} times as fast; simulated, the thread model alone"
@@ -131,7 +131,7 @@ def draw_animation(path: Path, run: HerniaRun) -> None:
             writer.grab_frame()
 
 
-def draw_dish(axes: Axes, scene: Scene) -> None:
+def draw_hernia_dish(axes: Axes, scene: Scene) -> None:
     """Draw the dish and its shapes, in millimetres; a shape with a hole is a ring, and darker."""
     radius = 1e3 * scene.dish.radius
     axes.add_patch(Circle((0.0, 0.0), radius, facecolor=FLOOR, edgecolor=RIM, linewidth=1.4))
@@ -141,7 +141,7 @@ def draw_dish(axes: Axes, scene: Scene) -> None:
         width = 1.0 if isinstance(obstacle, Disc) else 0.8
         axes.add_patch(shape_patch(obstacle, facecolor=fill, edgecolor=edge, linewidth=width))
     axes.set_aspect("equal")
-    reach = radius * (1.0 + 2.0 * ROOM)
+    reach = radius * (1.0 + 2.0 * MARGIN)
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
     axes.set_axis_off()

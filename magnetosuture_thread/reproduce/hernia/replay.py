@@ -22,7 +22,7 @@ from magnetosuture_thread.setups import Setup, read_setup
 
 START_POINTS = 200  # of the centreline at the start
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -33,7 +33,7 @@ def replay_hernia(
     setup_name: str = "",
     formulation: str = "",
     animation: bool = False,
-    say: Say = lambda text: None,
+    log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> HerniaSummary:
     """Replay a recorded steering in the thread model and draw what the thread does.
@@ -48,7 +48,7 @@ def replay_hernia(
         setup_name: name or path of the set-up; the one the bag names if empty.
         formulation: of the thread model; the set-up's if empty.
         animation: whether to draw one.
-        say: called with a line for a person at each stage.
+        log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -61,7 +61,7 @@ def replay_hernia(
     settings = replace(setup.model, formulation=formulation or setup.model.formulation)
     steering = read_steering(bag)
     with whole_folder(output) as folder:
-        say(f"steering {steering.duration:.0f} s in set-up {setup.name}")
+        log(f"steering {steering.duration:.0f} s in set-up {setup.name}")
         needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
         run = replay_steering(settings, start_centreline(setup), steering, needle, progress)
         summary = run.summary(setup.name)
@@ -69,7 +69,7 @@ def replay_hernia(
         (folder / "hernia.json").write_text(figures + "\n", encoding="utf-8")
         draw_hernia(folder / "hernia.png", run)
         if animation:
-            say("drawing the animation")
+            log("drawing the animation")
             draw_animation(folder / "hernia.gif", run)
     return summary
 

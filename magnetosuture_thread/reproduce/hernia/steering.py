@@ -18,10 +18,10 @@ from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
 
 RATE = 33.0  # Hz, of the paper's simulation
-HELD = 0.1  # s; a command that no other follows ends, as at the coil bridge
+COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil bridge
 SHOWN = (0.0, 12.0, 17.0, 27.0, 35.0, 55.0)  # s; the six instants of the paper's figure
 FIRST_NODES = 5  # whose barriers the paper plots
-_FAR = 1.0  # m; farther than any obstacle of a dish
+_MAX_DISTANCE = 1.0  # m; farther than any obstacle of a dish
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Steering:
     def at(self, time: float) -> NDArray[np.float64]:
         """Return what is asked for at a time [s], shape (2,) [m/s]; zero where no command holds."""
         index = int(np.searchsorted(self.times, time + 1e-9, side="right")) - 1
-        if index < 0 or time - self.times[index] > HELD + 1e-9:
+        if index < 0 or time - self.times[index] > COMMAND_TIMEOUT + 1e-9:
             return np.zeros(2)
         return np.asarray(self.velocities[index])
 
@@ -178,20 +178,20 @@ def replay_steering(
         InvalidInputError: the thread cannot begin there, or a velocity cannot be used.
         SolverError: a step had no solution.
     """
-    around = Workspace(needle.scene.obstacles, _FAR)
+    around = Workspace(needle.scene.obstacles, _MAX_DISTANCE)
     instants = list(_steps(SteeredThread(settings, centreline, needle), steering, progress))
     radius, obstacles = 0.5 * settings.thread().diameter, len(around.shapes)
     barriers = np.array(
         [_distances(around, instant.prediction.positions[1 : 1 + FIRST_NODES], obstacles) for instant in instants]
     )
     middles = [0.5 * (i.prediction.positions[1:] + i.prediction.positions[:-1]) for i in instants]
-    depths = np.array([-_distances(around, points, obstacles).min(initial=_FAR) for points in middles])
+    depths = np.array([-_distances(around, points, obstacles).min(initial=_MAX_DISTANCE) for points in middles])
     return HerniaRun(settings, needle.scene, instants, barriers - radius, depths)
 
 
 def _steps(thread: SteeredThread, steering: Steering, progress: Callable[[float], None]) -> Iterator[SteeredInstant]:
     yield thread.now
-    count = math.ceil((steering.duration + HELD) * RATE)
+    count = math.ceil((steering.duration + COMMAND_TIMEOUT) * RATE)
     for k in range(count):
         yield thread.step(1.0 / RATE, steering.at(k / RATE))
         progress((k + 1) / count)
@@ -200,7 +200,7 @@ def _steps(thread: SteeredThread, steering: Steering, progress: Callable[[float]
 def _distances(around: Workspace, points: Points, obstacles: int) -> NDArray[np.float64]:
     """Return the signed distance of each point from each obstacle, shape (m, obstacles) [m]."""
     near = around.near(points)
-    distances = np.full((len(points), obstacles), _FAR)
+    distances = np.full((len(points), obstacles), _MAX_DISTANCE)
     np.minimum.at(distances, (near.node, near.obstacle), near.distance)
     return distances
 

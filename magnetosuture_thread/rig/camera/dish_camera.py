@@ -16,7 +16,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.coverage import Box, Light, blurred, box_around, covered, lay, line_covered
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.rig.camera.still_life import StillLife
 
 Image = NDArray[np.uint8]
@@ -73,7 +73,7 @@ class DishCamera:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: CameraScene,
         view: DishView,
         size: tuple[int, int] = (640, 480),
         seed: int = 0,

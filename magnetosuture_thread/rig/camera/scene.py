@@ -39,7 +39,7 @@ LOOK_OF_KIND = {"tissue": "tissue", "instrument": "silicone", "wall": "silicone"
 
 
 @dataclass(frozen=True)
-class Scene:
+class CameraScene:
     """The things before the camera, all in the dish frame [m].
 
     Attributes:

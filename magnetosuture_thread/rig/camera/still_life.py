@@ -11,7 +11,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.coverage import Light, box_around, covered
-from magnetosuture_thread.rig.camera.scene import SILICONE, Lighting, Look, Scene
+from magnetosuture_thread.rig.camera.scene import SILICONE, CameraScene, Lighting, Look
 
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
 RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
@@ -32,7 +32,7 @@ class StillLife:
     """
 
     def __init__(
-        self, scene: Scene, lighting: Lighting, view: DishView, size: tuple[int, int], random: np.random.Generator
+        self, scene: CameraScene, lighting: Lighting, view: DishView, size: tuple[int, int], random: np.random.Generator
     ) -> None:
         self._scene = scene
         self._lighting = lighting
@@ -79,7 +79,7 @@ class StillLife:
 
     def _add_obstacle(self, image: Light, obstacle: Obstacle, look: Look) -> None:
         """Add a solid: a soft shadow, its top, a highlight on a disc."""
-        rings = [self._view.to_pixels(ring) for ring in outlines(obstacle)]
+        rings = [self._view.to_pixels(ring) for ring in still_outlines(obstacle)]
         corners = np.vstack(rings)
         box = box_around(corners, self._size, margin=24.0)
         if box is None:
@@ -156,7 +156,7 @@ def circle(corners: int) -> Points:
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def outlines(obstacle: Obstacle) -> list[Points]:
+def still_outlines(obstacle: Obstacle) -> list[Points]:
     """Return an obstacle's outline and those of its holes in the plane, each of shape (m, 2) [m].
 
     Raises:

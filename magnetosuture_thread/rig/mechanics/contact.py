@@ -17,9 +17,9 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 
-LEAST_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
+MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
-FAR = 8.0  # cells; clearances are not found beyond
+MAX_CLEARANCE = 8.0  # cells; clearances are not found beyond
 RUN = 12  # edges of a polygon that share a box: what is far from the box is not compared with each
 
 
@@ -191,7 +191,7 @@ def polygon_gap(x: float, y: float, shapes: Shapes, p: int, reach: float) -> tup
 
 @compiled
 def _find_clearances(shapes: Shapes) -> None:
-    least, side = FAR * shapes.grid[2], shapes.grid[2]
+    least, side = MAX_CLEARANCE * shapes.grid[2], shapes.grid[2]
     for i in range(shapes.clearances.shape[0]):
         for j in range(shapes.clearances.shape[1]):
             x, y = shapes.grid[0] + (j + 0.5) * side, shapes.grid[1] + (i + 0.5) * side
@@ -302,7 +302,7 @@ def segment_contacts(
         if (mx - shapes.discs[i, 0]) ** 2 + (my - shapes.discs[i, 1]) ** 2 > (reach + 0.5 * size) ** 2:
             continue
         half = 0.5 * length / reach
-        reach *= max(half / math.tan(half), LEAST_APOTHEM) if half < 1.5 else LEAST_APOTHEM
+        reach *= max(half / math.tan(half), MIN_APOTHEM) if half < 1.5 else MIN_APOTHEM
         gap, nx, ny, s = _segment_gap(ax, ay, bx, by, shapes.discs[i, 0], shapes.discs[i, 1])
         if 0.0 < s < 1.0 and gap < reach and count < rows.shape[0]:
             rows[count, 0], rows[count, 1], rows[count, 2] = reach - gap, nx, ny

@@ -18,15 +18,15 @@ from magnetosuture_thread.rig.mechanics.field import CoilField
 from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody
 from magnetosuture_thread.rig.mechanics.newton import advance, make_buffers
 from magnetosuture_thread.rig.mechanics.rod import Rod
-from magnetosuture_thread.rig.mechanics.thread import Attachment, ThreadProperties
+from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
 
-__all__ = ["Attachment", "RigDynamics", "Surface", "ThreadProperties"]
+__all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 
-LARGEST_STEP = 2e-3  # s
+MAX_STEP = 2e-3  # s
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
-MOST_HALVINGS = 8
+MAX_HALVINGS = 8
 GREATEST_GROWTH = 2.0  # of a step; the formula is stable up to 1 + sqrt(2)
-MOST_TOUCHING = 48  # points of the needle's outline
+MAX_CONTACTS = 48  # points of the needle's outline
 
 
 class RigDynamics:
@@ -64,7 +64,7 @@ class RigDynamics:
         heading: float,
         thread_points: Points,
         *,
-        largest_step: float = LARGEST_STEP,
+        largest_step: float = MAX_STEP,
     ) -> None:
         self.needle, self.properties, self.field = needle, thread, field
         start = _finite("rig.tail", tail, (2,))
@@ -95,8 +95,8 @@ class RigDynamics:
             thread.rest_curvature * length,
             0.5 * thread.diameter + surface.skin,
         )
-        glue = thread.bending_stiffness / length**3 if thread.attachment is Attachment.CLAMPED else 0.0
-        touching = min(int(2.0 * needle.length / needle.diameter) + 2, MOST_TOUCHING)
+        glue = thread.bending_stiffness / length**3 if thread.attachment is NeedleJoint.CLAMPED else 0.0
+        touching = min(int(2.0 * needle.length / needle.diameter) + 2, MAX_CONTACTS)
         self._needle = Needle(
             np.ascontiguousarray(needle.resistance[np.ix_([2, 0, 1], [2, 0, 1])]),
             needle.tip,
@@ -221,7 +221,7 @@ class RigDynamics:
                 done, h, tries = done + h, regular, 0
                 continue
             tries += 1
-            if tries > MOST_HALVINGS:
+            if tries > MAX_HALVINGS:
                 self.converged = False
                 raise SolverError("rig", "no convergence", self._move, TOLERANCE)
             self.halvings += 1

@@ -16,8 +16,8 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
 
 MU_0 = 4e-7 * math.pi  # T m/A
-LEAST_MEAN = 1e-8  # of c_n: the next one is its square
-MOST_MEANS = 40
+MIN_MEAN = 1e-8  # of c_n: the next one is its square
+MAX_MEANS = 40
 
 
 @dataclass(frozen=True)
@@ -144,12 +144,12 @@ def _integrals(m: float, rest: float) -> tuple[float, float, float]:
     of c_n, so that the third value, K (1 / 4 - (1 - m / 2) T), loses no digits where m is small.
     """
     a, b, weight, total, square = 1.0, math.sqrt(rest), 1.0, 0.0, 1.0
-    for _ in range(MOST_MEANS):
+    for _ in range(MAX_MEANS):
         a, b = 0.5 * (a + b), math.sqrt(a * b)
         part = square / (4.0 * a)
         total += weight * part * part
         weight, square = 2.0 * weight, m * part * part
-        if m * part < LEAST_MEAN:
+        if m * part < MIN_MEAN:
             break
     k = 0.5 * math.pi / a
     return k, k * (1.0 - m * (0.5 + m * total)), k * (0.25 - (1.0 - 0.5 * m) * total)

@@ -23,12 +23,12 @@ from magnetosuture_thread.rig.mechanics.rod import (
     factor,
 )
 
-MOST_ITERATIONS = 60
-MOST_FREE = 12  # without a line search
-SHORTEST_SEARCH = 1e-6
+MAX_ITERATIONS = 60
+MAX_FULL_STEPS = 12  # without a line search
+MIN_LINE_SEARCH = 1e-6
 DESCENT = 1e-4  # of the decrease that the slope promises
 ROUNDING = 1e-10  # of the energy, which is a sum of larger terms
-LEAST_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
+MIN_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
 FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere else
 
 
@@ -63,7 +63,7 @@ def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
 
 
 @compiled
-def assemble(
+def assemble_energy(
     q: NDArray[np.float64],
     field: NDArray[np.float64],
     needle: Needle,
@@ -128,12 +128,12 @@ def _minimise(
     trial, size = memory.trial, start.shape[0]
     arm = math.sqrt(needle.tip[0] ** 2 + needle.tip[1] ** 2)
     current = start.copy()
-    first = energy = assemble(start, field, needle, rod, shapes, memory, driven, False)
+    first = energy = assemble_energy(start, field, needle, rod, shapes, memory, driven, False)
     move, force = np.inf, _largest(memory.gradient, arm)
-    for iteration in range(1, (MOST_ITERATIONS if search else MOST_FREE) + 1):
+    for iteration in range(1, (MAX_ITERATIONS if search else MAX_FULL_STEPS) + 1):
         memory.chol[:, :] = memory.band
         if not factor(memory.chol):
-            assemble(current, field, needle, rod, shapes, memory, driven, True)
+            assemble_energy(current, field, needle, rod, shapes, memory, driven, True)
             memory.chol[:, :] = memory.band
             if not factor(memory.chol):
                 return -1, np.inf, force
@@ -152,15 +152,15 @@ def _minimise(
         while True:
             for i in range(size):
                 trial[i] = current[i] + part * memory.step[i]
-            new = assemble(trial, field, needle, rod, shapes, memory, driven, False)
+            new = assemble_energy(trial, field, needle, rod, shapes, memory, driven, False)
             force = _largest(memory.gradient, arm)
             if move <= tolerance:
-                lower = search or new <= first + FALSE_RISE * abs(first) + LEAST_ENERGY
+                lower = search or new <= first + FALSE_RISE * abs(first) + MIN_ENERGY
                 return iteration if lower else -1, move, force
-            if not search or new <= energy + DESCENT * part * slope + ROUNDING * abs(energy) + LEAST_ENERGY:
+            if not search or new <= energy + DESCENT * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
                 break
             part *= 0.5
-            if part < SHORTEST_SEARCH:
+            if part < MIN_LINE_SEARCH:
                 return -1, move, force
         current[:] = trial
         energy = new

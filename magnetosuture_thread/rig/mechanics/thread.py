@@ -9,7 +9,7 @@ from enum import Enum
 from magnetosuture_thread.errors import ConfigurationError
 
 
-class Attachment(str, Enum):
+class NeedleJoint(str, Enum):
     """How the thread is tied to the needle's tail."""
 
     PINNED = "pinned"
@@ -41,7 +41,7 @@ class ThreadProperties:
     stretching_stiffness: float
     drag_across: float
     drag_along: float
-    attachment: Attachment
+    attachment: NeedleJoint
     rest_curvature: float = 0.0
     diameter: float = 0.0
 

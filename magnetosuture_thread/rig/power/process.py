@@ -22,7 +22,7 @@ from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
 
 ASK = b"?"
-PATIENCE = 5.0  # s for the boards to be taken away
+TIMEOUT = 5.0  # s for the boards to be taken away
 AHEAD = -10  # of the processes that boards would not share a processor with, where the user may say so
 
 
@@ -71,7 +71,7 @@ class StageProcess:
             return
         process, self._process = self._process, None
         try:
-            process.communicate(timeout=PATIENCE)  # closes its input, which ends it
+            process.communicate(timeout=TIMEOUT)  # closes its input, which ends it
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()

@@ -12,7 +12,7 @@ RAYS = 180
 SHARE_OF_RAYS = 0.6  # of the rays must meet the fitted circle
 AGREEMENT_PX = 2.0
 GUESS_SIDES = (60, 120)  # the first guess is made in images of about this many rows; the second only if the first fails
-LEAST_CONTRAST = 12.0  # grey levels
+MIN_CONTRAST = 12.0  # grey levels
 CONTRAST = 0.15  # of the floor's brightness, at least, between floor and rim
 SATURATED, SATURATED_SHARE = 253, 0.15  # grey level, and share of a ring on the floor
 BAND = 0.02  # of the radius: beyond the inner edge, the rim is darkest within
@@ -119,7 +119,7 @@ def _edge_points(
     """Return where rays from the centre meet the rim's inner edge, and its darkest ring, both of shape (m, 2)."""
     edges, darkest = np.empty((rays, 2)), np.empty((rays, 2))
     band = max(4.0, BAND * radius)
-    counts = rim_along_rays(gray, (u, v, radius), reach, step, band, LEAST_CONTRAST, CONTRAST, edges, darkest)
+    counts = rim_along_rays(gray, (u, v, radius), reach, step, band, MIN_CONTRAST, CONTRAST, edges, darkest)
     return edges[: counts[0]], darkest[: counts[1]]
 
 

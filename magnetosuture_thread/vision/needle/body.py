@@ -14,17 +14,17 @@ from magnetosuture_thread.vision.needle.strip import TAPER, Strip, body_width, f
 
 SHARPEST_PX = 4.5  # a tail fades within
 LENGTH_SLACK_PX, LENGTH_SLACK = 1.4, 0.007  # that the seen length may differ from the known one, and share of it
-MOST_BLOOM_PX = 0.6  # that an edge may seem to lie outside of where it is
+MAX_BLOOM_PX = 0.6  # that an edge may seem to lie outside of where it is
 OFF_AXIS_PX = 0.4  # that the tip may lie aside of the axis on which lengths are measured
 TURNED = math.radians(2.0)  # that the needle may leave its tail beside that axis
 THREAD_PX = 0.6  # by which a thread under the body widens it at least
 TAIL_ROWS = 2.5  # next to the tail, that the thread pulls aside
-SEEN_WEIGHT = 0.3  # of the seen length beside the known one
+MEASURED_WEIGHT = 0.3  # of the seen length beside the known one
 GLARING = 0.8  # of the slack in length, where the lamp is reflected at an end
 
 
 @dataclass(frozen=True)
-class SeenNeedle:
+class MeasuredNeedle:
     """The needle in the image.
 
     Attributes:
@@ -43,7 +43,7 @@ class SeenNeedle:
     confidence: float = 1.0
     covariance: np.ndarray | None = None
 
-    def shifted(self, offset: tuple[float, float]) -> SeenNeedle:
+    def shifted(self, offset: tuple[float, float]) -> MeasuredNeedle:
         """Return the needle in pixels that begin elsewhere."""
         return replace(self, arc=replace(self.arc, start=self.arc.start + offset))
 
@@ -76,7 +76,7 @@ def measure_body(
     length: float,
     width: float,
     toward: np.ndarray | None = None,
-) -> SeenNeedle | str:
+) -> MeasuredNeedle | str:
     """Measure a dark thing that may be the needle.
 
     Args:
@@ -146,7 +146,9 @@ def measure_body(
     final = arc.moved(float(start), 0.0, 0.0, 0.0)
     mismatch = (seen - length) / (LENGTH_SLACK_PX + LENGTH_SLACK * length)
     confidence = (1.0 - 0.5 * mismatch**2) * min(1.0, strip.depth / 0.6) * max(0.2, 1.0 - 2.0 * covariance[1, 1])
-    return SeenNeedle(final, length + SEEN_WEIGHT * (seen - length), body, strip.depth, float(confidence), covariance)
+    return MeasuredNeedle(
+        final, length + MEASURED_WEIGHT * (seen - length), body, strip.depth, float(confidence), covariance
+    )
 
 
 def _ends(strip: Strip, last: float, body: float, width: float) -> tuple[float, float, float] | None:
@@ -155,7 +157,7 @@ def _ends(strip: Strip, last: float, body: float, width: float) -> tuple[float, 
     if tail is None:
         return None
     # What lets the sides look wider than they are, the lens or the liquid's edge, does so at the tail too.
-    bloom = min(max(0.5 * (body - width), -MOST_BLOOM_PX), MOST_BLOOM_PX)
+    bloom = min(max(0.5 * (body - width), -MAX_BLOOM_PX), MAX_BLOOM_PX)
     return tail[0] + bloom, tip_at(strip, last, body), tail[1]
 
 

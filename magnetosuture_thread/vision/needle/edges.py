@@ -9,7 +9,7 @@ from magnetosuture_thread.compiled import compiled
 EDGE_PX = 0.25  # that an edge may lie off its fit
 REACH_PX = 2.0  # beyond half the width, that belongs to an edge
 HALF_WEIGHT = 4.0  # of the width known before, in edges
-LEAST_EDGES = 6
+MIN_EDGES = 6
 ROUNDS = 6
 
 
@@ -49,7 +49,7 @@ def fit_edges(along, aside, steel, width, span, scale, half, values, inverse):
         for index in range(count):
             kept[index] = even[index] if start == 0 else index % 2 == start - 1
         good = _fit_from(edge, basis, half, kept, guess, own, residual)
-        if good < LEAST_EDGES:
+        if good < MIN_EDGES:
             continue
         missed, total = 0.0, 0.0
         for index in range(count):
@@ -96,7 +96,7 @@ def _fit_from(edge, basis, half, kept, guess, own, residual):
     """Fit to the kept edges, keep those near the fit instead, and so on; return how many are kept."""
     good = int(kept.sum())
     for _ in range(ROUNDS):
-        if good < LEAST_EDGES:
+        if good < MIN_EDGES:
             break
         normal, right = np.zeros((4, 4)), np.zeros(4)
         normal[3, 3], right[3] = HALF_WEIGHT, HALF_WEIGHT * half

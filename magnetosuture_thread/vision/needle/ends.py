@@ -13,7 +13,7 @@ TIP_LEVEL = 0.13  # of the body's width: a point thinner than this isn't seen
 UNSEEN_TIP, UNSEEN_TIP_PX = 1.3, -0.55  # of the blur, and beside it: what of a point is too fine to be seen
 FULL, FADED = 0.85, 0.4  # of the body's width; from one to the other an end fades
 POINTEDNESS = 2.0  # how much longer the tip must take to fade than the tail
-SHORTEST_FADE = 0.25  # of the taper that the tip must take to fade
+MIN_FADE = 0.25  # of the taper that the tip must take to fade
 ACROSS_QUANTILE = 0.35  # of the darkness across a tail
 TOWARD = 0.8  # cosine between a needle and where it must point
 
@@ -26,7 +26,7 @@ def turned_tail_first(strip: Strip, last: float, body: float, toward: np.ndarray
         abs(_falls_below(along, width, FADED * body) - _falls_below(along, width, FULL * body))
         for along, width in halves
     ]
-    if max(fades) < POINTEDNESS * min(fades) or max(fades) < SHORTEST_FADE * TAPER * last:
+    if max(fades) < POINTEDNESS * min(fades) or max(fades) < MIN_FADE * TAPER * last:
         if toward is None:
             return None
         fades = [0.0, float(strip.arc.direction() @ toward)]

@@ -8,18 +8,18 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
-from magnetosuture_thread.vision.needle.body import SeenNeedle, measure_body
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle, measure_body
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
 INSIDE = 0.985  # part of the dish's radius that is looked at, to stay off the rim
 WIDE_PX = 4.0  # a needle at least this wide is searched at half the size
-LEAST_AREA = 0.33  # of the needle's own
+MIN_AREA = 0.33  # of the needle's own
 ON_AXIS = 0.85  # of a needle's dark pixels lie along one arc; more beside it belong to what touches it
 AROUND_PX = 24.0  # around a dark thing, that is measured on
 AXIS_POINTS = 15
-MOST_CANDIDATES = 6  # beyond which the image is no dish with a needle
+MAX_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
 
 def search_factor(width_px: float) -> int:
@@ -29,7 +29,7 @@ def search_factor(width_px: float) -> int:
 
 def find_needles(
     picture: Picture, view: DishView, dish_radius: float, length: float, width: float, toward: np.ndarray | None = None
-) -> tuple[list[SeenNeedle], list[str]]:
+) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find all that may be the needle.
 
     Dark pixels in the dish form components; each of about the right area is measured.
@@ -63,13 +63,13 @@ def _measured(
     toward: np.ndarray | None,
     *,
     tight: bool = False,
-) -> tuple[list[SeenNeedle], list[str]]:
+) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find the needles of a length and a width [px], shapes cut out up to their very outlines if `tight`."""
-    needles: list[SeenNeedle] = []
+    needles: list[MeasuredNeedle] = []
     refused: list[str] = []
     mask = picture.mask
     candidates = _dark_components(picture, view, dish_radius, expected * thickness, tight)
-    if len(candidates) > MOST_CANDIDATES:
+    if len(candidates) > MAX_CANDIDATES:
         return [], [f"{len(candidates)} dark things"]
     for points in candidates:
         guess = _rough_axis(points, thickness)
@@ -90,9 +90,9 @@ def _measured(
             if near:  # A strip along the needle takes its ground from beside it, which a shape may be.
                 gray = mask.without_shapes(gray, picture.floor, low, high, 0.0 if tight else mask.tolerance_px)
         found = measure_body(gray, arc, first, last, expected, thickness, toward)
-        if mask is not None and near and isinstance(found, SeenNeedle) and _is_inside(mask, found, thickness):
+        if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, thickness):
             found = "inside of a shape of the scene"
-        if isinstance(found, SeenNeedle):
+        if isinstance(found, MeasuredNeedle):
             needles.append(found)
         else:
             refused.append(found)
@@ -123,19 +123,19 @@ def _dark_components(
     for outline in outlines:
         # A component is no larger than its box, so most are passed over at once.
         x, y, wide, high = cv2.boundingRect(outline)
-        if wide * high * factor**2 < LEAST_AREA * area:
+        if wide * high * factor**2 < MIN_AREA * area:
             continue
         own = np.zeros((high, wide), np.uint8)
         cv2.drawContours(own, [outline], -1, 255, -1, cv2.LINE_8, offset=(-x, -y))
         rows, columns = np.nonzero(own & dark[y : y + high, x : x + wide])
-        if len(rows) * factor**2 < LEAST_AREA * area:
+        if len(rows) * factor**2 < MIN_AREA * area:
             continue
         at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
         result.append(at * factor + shift)
     return result
 
 
-def _is_inside(mask: SceneMask, needle: SeenNeedle, width: float) -> bool:
+def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
     """Say whether a needle's axis lies in shapes: that of a real one stays half its width off their outlines [px]."""
     depths = mask.depths(needle.arc.at(np.linspace(0.0, needle.length_px, AXIS_POINTS)))
     return middle(depths) > mask.tolerance_px - 0.5 * width

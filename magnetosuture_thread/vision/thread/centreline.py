@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.vision.images import Picture, glare_mask
-from magnetosuture_thread.vision.needle.body import SeenNeedle
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.forks import follow
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
@@ -24,7 +24,7 @@ _WINDOW = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WINDOW_PX, WINDOW_PX))
 
 
 def find_centreline(
-    picture: Picture, needle: SeenNeedle, longest: float, centre: tuple[float, float], reach: float
+    picture: Picture, needle: MeasuredNeedle, longest: float, centre: tuple[float, float], reach: float
 ) -> np.ndarray:
     """Follow the thread from the needle's tail to its end.
 
@@ -87,7 +87,7 @@ def find_centreline(
     return points + np.array([left, top])
 
 
-def _cover(ridge: np.ndarray, hidden: np.ndarray, factor: int, needle: SeenNeedle, origin: tuple[int, int]) -> None:
+def _cover(ridge: np.ndarray, hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
     """Take the needle out of the ridge and mark where it hides the thread."""
     along = np.linspace(BEHIND_TAIL_PX, needle.length_px + COVERED_PX - 1.0, 24)
     axis = needle.arc.at(along) - origin

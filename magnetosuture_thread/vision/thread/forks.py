@@ -9,10 +9,10 @@ import numpy as np
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.vision.thread.walk import START_PX, leave, walk_on
 
-MOST_FORKS = 200
+MAX_FORKS = 200
 ROUNDS = 4
-LEAST_GAIN_PX = 8.0  # that another way must show more of the thread
-ENOUGH = 0.9  # of the longest walk: so much thread seen needs no other way
+MIN_GAIN_PX = 8.0  # that another way must show more of the thread
+SUFFICIENT_SHARE = 0.9  # of the longest walk: so much thread seen needs no other way
 TWICE_PX, TWICE_STEPS = 1.6, 6  # a vertex this near to one that lies so many steps back sees the same thread
 UNSTEADY = 12.0  # px for each 1 / px of change in curvature
 
@@ -65,15 +65,15 @@ def follow(ridge, hidden, factor, noise, faintest, start, dish, longest, path, s
     path[1, 2], path[1, 3] = angle + bend * START_PX, bend
     path[1, 4], path[1, 5] = max(strength, faintest), START_PX
     strong[1] = True
-    forks = np.empty((MOST_FORKS, 3))
+    forks = np.empty((MAX_FORKS, 3))
     count, fork_count = walk_on(ridge, hidden, factor, noise, faintest, dish, longest, path, strong, 2, 9.0, forks)
-    value, enough = worth(path, strong, count), ENOUGH * longest
+    value, enough = worth(path, strong, count), SUFFICIENT_SHARE * longest
     if value > enough or fork_count == 0:
         return count
     other, other_strong, other_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
     best, best_strong, best_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
     for _ in range(ROUNDS):
-        best_value, best_count, best_fork_count = value + LEAST_GAIN_PX, 0, 0
+        best_value, best_count, best_fork_count = value + MIN_GAIN_PX, 0, 0
         for index in range(fork_count):
             at = int(forks[index, 0])
             if at >= count or at < 2:

@@ -16,8 +16,8 @@ WEAK = 0.3  # of the ridge's usual strength: below, there is no thread
 STRONGEST = 1.25  # of the usual strength: a stronger ridge counts no more
 UNKNOWN = 0.45  # of the usual strength, as which a hidden pixel counts
 AHEAD = 9  # steps looked ahead
-NEAR = 5  # of these that count in full; the others by FAR
-FAR = 0.6
+NEAR_POINTS = 5  # of these that count in full; the others by FAR
+FAR_WEIGHT = 0.6
 BENDS = 31  # curvatures tried at each step ...
 SHARPEST = 0.21  # ... up to this [1/px], closer around the present one's
 BEND_COST = 1.1  # of the usual strength, for a change of curvature by 1 / px, along the way looked ahead
@@ -88,7 +88,7 @@ def arc_scores(ridge, hidden, factor, noise, usual, state, bends, scores):
             value = min((sample(ridge, x, y) - noise) / usual, STRONGEST)
             if value < UNKNOWN and is_hidden(hidden, factor, x, y):
                 value = UNKNOWN
-            share = 1.0 if step < NEAR else FAR
+            share = 1.0 if step < NEAR_POINTS else FAR_WEIGHT
             score += share * value
             weight += share
         scores[index] = score / weight - BEND_COST * abs(tried - bend) - 0.15 * abs(tried)

@@ -75,7 +75,7 @@ def test_contacts_of_random_stars(seed: int, vertices: int, hole: bool, reach: f
         else:
             np.testing.assert_allclose(rows, minima(polygon, points[i], reach), atol=1e-12)
     # x - sd n is on the boundary.
-    foot = points[contacts.node] - contacts.distance[:, None] * contacts.outward
+    foot = points[contacts.node] - contacts.distance[:, None] * contacts.normal
     boundary = shapely.Polygon(polygon.outline, polygon.holes).boundary
     assert shapely.distance(boundary, shapely.points(foot)).max(initial=0.0) < 1e-12
 
@@ -86,13 +86,13 @@ def test_outward_is_the_gradient(seed: int, hole: bool):
     polygon = star(seed, 12, hole)
     points = np.random.default_rng(seed).uniform([-0.06, -0.09], [0.08, 0.05], (60, 2))
     contacts = Workspace([polygon], 0.2).near(points)
-    outward = contacts.outward[contacts.nearest]
+    normal = contacts.normal[contacts.nearest]
     step = 1e-7
     slopes = [(signed(polygon, points + e) - signed(polygon, points - e)) / (2.0 * step) for e in step * np.eye(2)]
     slope = np.stack(slopes, axis=1)
     smooth = np.abs(np.linalg.norm(slope, axis=1) - 1.0) < 1e-4  # else on the medial axis
     assert smooth.mean() > 0.9
-    np.testing.assert_allclose(outward[smooth], slope[smooth], atol=1e-3)
+    np.testing.assert_allclose(normal[smooth], slope[smooth], atol=1e-3)
 
 
 def test_a_wall_of_many_edges_is_one_contact():
@@ -108,7 +108,7 @@ def test_a_wall_of_many_edges_is_one_contact():
         assert contacts.node.tolist() == list(range(len(points)))
         assert outside.all() or above == 0.0
         np.testing.assert_allclose(contacts.distance, above, atol=1e-15)
-        np.testing.assert_allclose(contacts.outward, np.tile(turn[:, 1], (len(points), 1)), atol=1e-9)
+        np.testing.assert_allclose(contacts.normal, np.tile(turn[:, 1], (len(points), 1)), atol=1e-9)
 
 
 def test_a_concave_corner_is_two_contacts():
@@ -119,7 +119,7 @@ def test_a_concave_corner_is_two_contacts():
     assert contacts.distance[:2][contacts.nearest[:2]][0] == pytest.approx(0.002)
     # In the corner itself: one row, out of it.
     assert contacts.distance[contacts.node == 2].tolist() == [0.0]
-    np.testing.assert_allclose(contacts.outward[contacts.node == 2], [[np.sqrt(0.5), np.sqrt(0.5)]])
+    np.testing.assert_allclose(contacts.normal[contacts.node == 2], [[np.sqrt(0.5), np.sqrt(0.5)]])
 
 
 @pytest.mark.parametrize("reach", [0.0, 1e-4, 0.004, 1.0])
@@ -137,7 +137,7 @@ def test_on_the_boundary_the_direction_is_the_normal():
     contacts = Workspace([SQUARE], 0.0).near(points)
     assert contacts.node.tolist() == [0, 1, 2]
     assert contacts.distance.tolist() == [0.0, 0.0, 0.0]
-    np.testing.assert_allclose(contacts.outward, [[0.0, -1.0], [np.sqrt(0.5), np.sqrt(0.5)], [1.0, 0.0]])
+    np.testing.assert_allclose(contacts.normal, [[0.0, -1.0], [np.sqrt(0.5), np.sqrt(0.5)], [1.0, 0.0]])
 
 
 def test_a_needle_and_a_notch_keep_their_signs():
@@ -162,9 +162,9 @@ def test_discs_polygons_and_order():
     assert contacts.node.tolist() == [0, 0, 2, 4, 4]
     assert contacts.obstacle.tolist() == [0, 1, 1, 1, 2]
     np.testing.assert_allclose(contacts.distance, [0.0025, 0.0005, -0.002, 0.001, 0.002])
-    np.testing.assert_allclose(contacts.outward, [[1, 0], [-1, 0], [1, 0], [1, 0], [-1, 0]], atol=1e-15)
+    np.testing.assert_allclose(contacts.normal, [[1, 0], [-1, 0], [1, 0], [1, 0], [-1, 0]], atol=1e-15)
     assert contacts.nearest.all()
-    for array in (contacts.node, contacts.obstacle, contacts.distance, contacts.outward, contacts.nearest):
+    for array in (contacts.node, contacts.obstacle, contacts.distance, contacts.normal, contacts.nearest):
         assert not array.flags.writeable
 
 
@@ -192,7 +192,7 @@ def test_the_wall_is_a_contact_of_its_own_before_the_obstacles():
     np.testing.assert_array_equal(contacts.node, [1, 1, 2])
     np.testing.assert_array_equal(contacts.obstacle, [WALL, 0, WALL])
     np.testing.assert_allclose(contacts.distance, [0.005, 0.0, -0.01], atol=1e-15)
-    np.testing.assert_allclose(contacts.outward[[0, 2]], [[-1.0, 0.0], [0.0, 1.0]], atol=1e-15)
+    np.testing.assert_allclose(contacts.normal[[0, 2]], [[-1.0, 0.0], [0.0, 1.0]], atol=1e-15)
     assert contacts.nearest.all()
     centre = Workspace([], 0.1, 3, 0.05).near(np.array([[0.0, 0.0, 0.7]]))
     assert centre.distance.tolist() == [0.05]

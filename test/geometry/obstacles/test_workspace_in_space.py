@@ -71,14 +71,14 @@ def test_a_cube(reach: float, splits: int):
     assert contacts.node.tolist() == np.flatnonzero(true <= max(reach, 1e-12)).tolist()
     np.testing.assert_allclose(contacts.distance, true[contacts.node], atol=1e-15)
     assert contacts.nearest.all()
-    np.testing.assert_allclose(np.linalg.norm(contacts.outward, axis=1), 1.0, atol=1e-12)
-    foot = points[contacts.node] - contacts.distance[:, None] * contacts.outward
+    np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1.0, atol=1e-12)
+    foot = points[contacts.node] - contacts.distance[:, None] * contacts.normal
     np.testing.assert_allclose(cube_distance(foot), 0.0, atol=1e-12)
     off = contacts.distance > 1e-6
     step = 1e-7
     at = points[contacts.node[off]]
     slope = [(cube_distance(at + e) - cube_distance(at - e)) / (2.0 * step) for e in step * np.eye(3)]
-    np.testing.assert_allclose(contacts.outward[off], np.stack(slope, axis=1), atol=1e-3)
+    np.testing.assert_allclose(contacts.normal[off], np.stack(slope, axis=1), atol=1e-3)
 
 
 @pytest.mark.parametrize("reach", [0.001, 0.02])
@@ -94,9 +94,9 @@ def test_a_ball(reach: float):
     np.testing.assert_allclose(contacts.distance, (centre - radius)[contacts.node], atol=flat)
     # The exact ball beside it.
     exact = Workspace([Disc((0.0, 0.0, 0.0), radius)], reach, 3).near(points)
-    distance, outward = Disc((0.0, 0.0, 0.0), radius).signed_distance(points[exact.node])
+    distance, normal = Disc((0.0, 0.0, 0.0), radius).signed_distance(points[exact.node])
     np.testing.assert_allclose(exact.distance, distance, atol=1e-15)
-    np.testing.assert_allclose(exact.outward, outward, atol=1e-12)
+    np.testing.assert_allclose(exact.normal, normal, atol=1e-12)
 
 
 def test_an_inner_corner_is_two_contacts_and_an_inner_edge_none():
@@ -113,7 +113,7 @@ def test_an_inner_corner_is_two_contacts_and_an_inner_edge_none():
     assert contacts.nearest.tolist().count(True) == 3
     # Inside, the inner edge is the nearest, and the way out goes to it.
     np.testing.assert_allclose(contacts.distance[2], -np.sqrt(2.0) * 0.001)
-    np.testing.assert_allclose(contacts.outward[2], [np.sqrt(0.5), np.sqrt(0.5), 0.0], atol=1e-12)
+    np.testing.assert_allclose(contacts.normal[2], [np.sqrt(0.5), np.sqrt(0.5), 0.0], atol=1e-12)
 
 
 def test_a_hollow_is_outside():
@@ -164,7 +164,7 @@ def test_a_body_of_bumps_and_dents_by_definition(reach: float):
                 if winding(mesh, away[None])[0] < 0.5:
                     expected.append(foot)
         rows = contacts.node == i
-        found = points[i] - contacts.distance[rows, None] * contacts.outward[rows]
+        found = points[i] - contacts.distance[rows, None] * contacts.normal[rows]
         assert len(found) == len(expected)
         for foot in expected:
             assert np.linalg.norm(found - foot, axis=1).min() < 1e-12

@@ -12,8 +12,7 @@ from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.model.formulations import StepResult
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
-from magnetosuture_thread.rig.mechanics.dynamics import Attachment as RigAttachment
-from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from test.model.formulations.scenes import DT, TOLERANCE, east, followed, formulated, polyamide, straight
 
@@ -104,7 +103,7 @@ def test_polyamide_along_the_rim_is_where_the_rig_has_it(attachment: Attachment)
             stretching_stiffness=material.elastic_modulus * 0.25 * math.pi * thread.diameter**2,
             drag_across=thread.medium.drag_across,
             drag_along=thread.medium.drag_along,
-            attachment=RigAttachment(attachment.value),
+            attachment=NeedleJoint(attachment.value),
             diameter=thread.diameter,
         ),
         Surface(wall_radius=RADIUS),

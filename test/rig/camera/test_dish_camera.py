@@ -7,14 +7,14 @@ import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene
 
 THREAD = np.array([[0.0, 0.0], [-0.005, 0.001], [-0.01, 0.0]])
 
 
-def render(seed: int, scene: Scene | None = None, tail: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+def render(seed: int, scene: CameraScene | None = None, tail: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
     """Return one frame."""
-    camera = DishCamera(scene or Scene(), DishView((322.0, 238.0), 8e-5), seed=seed)
+    camera = DishCamera(scene or CameraScene(), DishView((322.0, 238.0), 8e-5), seed=seed)
     return camera.render(np.asarray(tail), 0.5, THREAD + tail)
 
 
@@ -34,7 +34,7 @@ def test_frames_have_the_light_of_a_dish_under_a_lamp():
 
 
 def test_the_sensor_has_noise():
-    camera = DishCamera(Scene(), DishView((322.0, 238.0), 8e-5))
+    camera = DishCamera(CameraScene(), DishView((322.0, 238.0), 8e-5))
     first = camera.render(np.array([0.0, 0.0]), 0.5, THREAD).astype(float)
     second = camera.render(np.array([0.0, 0.0]), 0.5, THREAD).astype(float)
     noise = (first - second)[150:200, 250:300].std() / np.sqrt(2.0)

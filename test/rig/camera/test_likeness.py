@@ -11,7 +11,7 @@ import pytest
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 
 SAMPLES = Path(__file__).parents[2] / "vision" / "samples"
@@ -36,7 +36,7 @@ def sample(frame: dict) -> np.ndarray:
 @pytest.fixture(scope="module")
 def camera() -> DishCamera:
     """A camera that looks where that of the samples does."""
-    return DishCamera(Scene(), VIEW, seed=4)
+    return DishCamera(CameraScene(), VIEW, seed=4)
 
 
 @pytest.mark.parametrize("frame", TRUTH["frames"], ids=lambda frame: frame["file"])
@@ -76,7 +76,9 @@ def test_a_picture_for_a_person(camera: DishCamera):
     thread = (
         tail - np.linspace(0.0, 0.013, 60)[:, None] * (1.0, 0.0) - np.linspace(0, 1, 60)[:, None] ** 2 * (0.0, 0.003)
     )
-    curved = DishCamera(Scene(needle_curvature=200.0), VIEW, seed=2, lighting=Lighting(gain=0.75, noise=2.0, slope=3.0))
+    curved = DishCamera(
+        CameraScene(needle_curvature=200.0), VIEW, seed=2, lighting=Lighting(gain=0.75, noise=2.0, slope=3.0)
+    )
     tiles = [titled(curved.render(tail, heading, thread), "curved needle, poor light")]
     for kind in ("glare", "hand", "tool", "overexposed", "needle_out"):
         faults = FaultSchedule([Fault(kind, 0.0, 2.0)], 0.035, 0.007, seed=3)

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.mechanics.dynamics import Attachment, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.mechanics.newton import advance
 
 Vector = NDArray[np.float64]
 NEEDLE = NeedleBody(7e-3, 4e-4, 0.0, 1e6, 1.0)
-POLYAMIDE = ThreadProperties(19e-3, 60, 1.2723e-9, 5.65, 0.974, 0.487, Attachment.PINNED, diameter=60e-6)
-CLAMPED = replace(POLYAMIDE, attachment=Attachment.CLAMPED)
-SLIGHT = ThreadProperties(1e-3, 4, 1e-14, 1e-3, 1e-7, 5e-8, Attachment.PINNED)
+POLYAMIDE = ThreadProperties(19e-3, 60, 1.2723e-9, 5.65, 0.974, 0.487, NeedleJoint.PINNED, diameter=60e-6)
+CLAMPED = replace(POLYAMIDE, attachment=NeedleJoint.CLAMPED)
+SLIGHT = ThreadProperties(1e-3, 4, 1e-14, 1e-3, 1e-7, 5e-8, NeedleJoint.PINNED)
 OPEN = Surface()
 FRAME = 1.0 / 60.0
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -83,12 +83,12 @@ def steered(made: RigDynamics, seconds: float, strength: float = 1.0) -> RigDyna
     return made
 
 
-@pytest.mark.parametrize(("attachment", "root"), [(Attachment.PINNED, 3.926602), (Attachment.CLAMPED, 1.875104)])
-def test_a_bent_thread_relaxes_as_its_slowest_mode(attachment: Attachment, root: float):
+@pytest.mark.parametrize(("attachment", "root"), [(NeedleJoint.PINNED, 3.926602), (NeedleJoint.CLAMPED, 1.875104)])
+def test_a_bent_thread_relaxes_as_its_slowest_mode(attachment: NeedleJoint, root: float):
     # Against a needle that is held: EI k^4 / drag, with tan kL = tanh kL, or cos kL cosh kL = -1.
     thread = replace(POLYAMIDE, attachment=attachment)
     k, s = root / thread.length, np.linspace(0.0, thread.length, 800)
-    if attachment is Attachment.PINNED:
+    if attachment is NeedleJoint.PINNED:
         shape = np.sin(k * s) / math.sin(root) + np.sinh(k * s) / math.sinh(root)
     else:
         ratio = (math.cosh(root) + math.cos(root)) / (math.sinh(root) + math.sin(root))
@@ -154,8 +154,8 @@ def test_a_curved_thread_comes_to_rest_in_its_own_shape():
     assert made.energy < 1e-5 * rig(curved, curvature=30.0).energy
 
 
-@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.CLAMPED])
-def test_without_currents_the_energy_only_falls(attachment: Attachment):
+@pytest.mark.parametrize("attachment", [NeedleJoint.PINNED, NeedleJoint.CLAMPED])
+def test_without_currents_the_energy_only_falls(attachment: NeedleJoint):
     made = rig(
         replace(POLYAMIDE, attachment=attachment), curvature=120.0, surface=Surface((Disc((-5e-3, 1e-3), 1e-3),))
     )
@@ -179,8 +179,8 @@ def test_the_world_can_be_turned():
     assert turned.heading - turn == pytest.approx(plain.heading, abs=1e-7)
 
 
-@pytest.mark.parametrize("attachment", [Attachment.PINNED, Attachment.CLAMPED])
-def test_it_converges_in_space(attachment: Attachment):
+@pytest.mark.parametrize("attachment", [NeedleJoint.PINNED, NeedleJoint.CLAMPED])
+def test_it_converges_in_space(attachment: NeedleJoint):
     def at(segments: int) -> RigDynamics:
         thread = replace(POLYAMIDE, attachment=attachment, segments=segments)
         return steered(rig(thread, curvature=60.0), 1.0, 2.0)

@@ -8,7 +8,7 @@ import pytest
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Lighting, Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_dish, rim_shift
 from magnetosuture_thread.vision.dish.watch import AGREEING, DishWatch
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -17,7 +17,7 @@ from test.vision.scenes import NOWHERE, Pose, finger, render
 
 def gray_of(centre: tuple[float, float], scale: float, seed: int, lighting: Lighting | None = None) -> np.ndarray:
     """Return the measured channel of a frame with a needle."""
-    camera = DishCamera(Scene(), DishView(centre, scale), seed=seed, lighting=lighting)
+    camera = DishCamera(CameraScene(), DishView(centre, scale), seed=seed, lighting=lighting)
     return np.ascontiguousarray(camera.render(np.zeros(2), 0.3, NOWHERE)[:, :, 1])
 
 

@@ -9,16 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Scene
+from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.vision.images import prepare
-from magnetosuture_thread.vision.needle.body import SeenNeedle
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles
 from test.vision.scenes import NOWHERE, VIEW, Pose, render
 
-CAMERAS = {kappa: DishCamera(Scene(needle_curvature=kappa), VIEW, seed=4) for kappa in (-440.0, -120.0, 0.0, 300.0)}
+CAMERAS = {
+    kappa: DishCamera(CameraScene(needle_curvature=kappa), VIEW, seed=4) for kappa in (-440.0, -120.0, 0.0, 300.0)
+}
 
 
-def find(frame: np.ndarray, toward: np.ndarray | None = None) -> tuple[list[SeenNeedle], list[str]]:
+def find(frame: np.ndarray, toward: np.ndarray | None = None) -> tuple[list[MeasuredNeedle], list[str]]:
     """Return the needles in a frame, and why other things are none."""
     picture = prepare(np.ascontiguousarray(frame[:, :, 1]), 2)
     return find_needles(picture, VIEW, 0.0175, 0.007, 0.0004, toward)

@@ -10,13 +10,13 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.vision.images import prepare
 from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.body import SeenNeedle
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
 
-NEEDLE = SeenNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
+NEEDLE = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
 TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 
 

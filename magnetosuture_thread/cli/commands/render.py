@@ -1,13 +1,13 @@
-"""The command `magnetosuture record`."""
+"""The command `magnetosuture render`."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from magnetosuture_thread.cli.arguments import number, whole_number
+from magnetosuture_thread.cli.arguments import number_argument, whole_number
 from magnetosuture_thread.cli.command import DONE, Subparsers, command
-from magnetosuture_thread.cli.terminal import make_console, progress, sayer
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress
 from magnetosuture_thread.errors import ConfigurationError
 
 DESCRIPTION = """\
@@ -20,14 +20,16 @@ poses and seen threads take the place of frames. Everything in the bag is simula
 
 def add(subparsers: Subparsers) -> None:
     """Add the command."""
-    parser = command(subparsers, "record", "write a bag of simulated camera frames, or poses", DESCRIPTION, run)
+    parser = command(subparsers, "render", "write a bag of simulated camera frames, or poses", DESCRIPTION, run)
     parser.add_argument("reference", type=Path, metavar="REFERENCE", help="a reference trajectory (.npz)")
     parser.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
     parser.add_argument("--setup", required=True, metavar="NAME", help="a set-up's name or YAML file")
-    parser.add_argument("--start", type=number(0.0, 1e6), default=0.0, help="time in the trajectory to begin at [s]")
-    parser.add_argument("--duration", type=number(1e-3, 1e6), help="[s] (default: to the trajectory's end)")
     parser.add_argument(
-        "--rate", type=number(1.0, 240.0), default=30.0, help="frames, or poses, a second (default: 30)"
+        "--start", type=number_argument(0.0, 1e6), default=0.0, help="time in the trajectory to begin at [s]"
+    )
+    parser.add_argument("--duration", type=number_argument(1e-3, 1e6), help="[s] (default: to the trajectory's end)")
+    parser.add_argument(
+        "--rate", type=number_argument(1.0, 240.0), default=30.0, help="frames, or poses, a second (default: 30)"
     )
     parser.add_argument(
         "--quality",
@@ -41,7 +43,7 @@ def add(subparsers: Subparsers) -> None:
     parser.add_argument("--poses", action="store_true", help="write poses and seen threads instead of frames")
     parser.add_argument(
         "--noise",
-        type=number(0.0, 1e-2),
+        type=number_argument(0.0, 1e-2),
         default=0.0,
         metavar="METRES",
         help="of these, standard deviation; of the heading, this over the needle's length (default: 0)",
@@ -54,14 +56,14 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigurationError("--noise", options.noise, "none without --poses")
 
     from magnetosuture_thread.evaluation.reference import read_reference
-    from magnetosuture_thread.jobs.record import record
+    from magnetosuture_thread.jobs.render import render_bag
     from magnetosuture_thread.setups import read_setup
 
     console = make_console()
     setup = read_setup(options.setup)
     reference = read_reference(options.reference)
-    with progress(console, "record") as advance:
-        frames = record(
+    with progress(console, "render") as advance:
+        frames = render_bag(
             reference,
             setup,
             options.output,
@@ -74,5 +76,5 @@ def run(options: argparse.Namespace) -> int:
             noise=options.noise,
             progress=advance,
         )
-    sayer(console)(f"{frames} simulated {'poses' if options.poses else 'frames'} in {options.output}")
+    make_log(console)(f"{frames} simulated {'poses' if options.poses else 'frames'} in {options.output}")
     return DONE

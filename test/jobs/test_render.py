@@ -13,7 +13,7 @@ from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.record import record
+from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.images import decode_image
@@ -32,7 +32,7 @@ def test_the_bag_holds_frames_commands_and_truth_and_says_that_it_is_simulated(s
     }
     assert bag.notes["setup"] == "petri_35mm_polyamide"
     assert "straight_pull" in bag.notes["simulated"]
-    messages = {record.topic: record.decode() for record in bag.records(set(bag.topics))}
+    messages = {render_bag.topic: render_bag.decode() for render_bag in bag.records(set(bag.topics))}
     assert decode_image(messages["/camera/image_raw/compressed"].data).shape == (480, 640, 3)
     assert messages["/needle/servo_cv"].twist.linear.x == pytest.approx(0.003, rel=1e-6)
     assert messages["/ground_truth/needle"].pose.position.x == pytest.approx(0.003 + 0.003 * 29 / 30)
@@ -43,7 +43,7 @@ def test_the_bag_holds_frames_commands_and_truth_and_says_that_it_is_simulated(s
 
 
 def test_every_command_is_the_trajectorys_velocity(short_bag: Path):
-    commands = [record.decode() for record in Bag(short_bag).records({"/needle/servo_cv"})]
+    commands = [render_bag.decode() for render_bag in Bag(short_bag).records({"/needle/servo_cv"})]
     assert [command.twist.linear.x for command in commands] == pytest.approx([0.003] * 30, rel=1e-6)
 
 
@@ -51,20 +51,20 @@ def test_what_exists_is_not_touched(tmp_path: Path, straight_pull: ReferenceTraj
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "mine").write_text("precious")
     with pytest.raises(BagError, match="exists already"):
-        record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.2)
+        render_bag(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.2)
     assert (tmp_path / "bag" / "mine").read_text() == "precious"
 
 
 def test_a_setup_that_differs_by_rounding_alone_is_taken(tmp_path: Path, straight_pull: ReferenceTrajectory):
     disc = Disc((0.0077, 0.0039000000000000003), 0.0015)  # as a reference trajectory has it
     other = replace(straight_pull, metadata={"boundary": "pinned", "material": {"L_m": 0.019}}, discs=(disc,))
-    assert record(other, read_setup("petri_35mm_polyamide_post"), tmp_path / "bag", duration=0.1) == 3
+    assert render_bag(other, read_setup("petri_35mm_polyamide_post"), tmp_path / "bag", duration=0.1) == 3
 
 
 @pytest.mark.parametrize("where", [".", "/", "..", ""])
 def test_folders_that_cannot_be_made_are_refused(straight_pull: ReferenceTrajectory, where: str):
     with pytest.raises(BagError, match="exists already"):
-        record(straight_pull, read_setup("petri_35mm_polyamide"), Path(where), duration=0.2)
+        render_bag(straight_pull, read_setup("petri_35mm_polyamide"), Path(where), duration=0.2)
 
 
 def test_two_runs_to_one_output_do_not_harm_each_other(tmp_path: Path):
@@ -91,9 +91,9 @@ def test_the_later_of_two_runs_to_one_output_is_refused(tmp_path: Path):
 
 def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: ReferenceTrajectory):
     setup = read_setup("petri_35mm_polyamide")
-    assert record(straight_pull, setup, tmp_path / "three", start=0.9, duration=0.1) == 3
+    assert render_bag(straight_pull, setup, tmp_path / "three", start=0.9, duration=0.1) == 3
     with pytest.raises(BagError, match="hold no frame"):
-        record(straight_pull, setup, tmp_path / "none", duration=1e-3)
+        render_bag(straight_pull, setup, tmp_path / "none", duration=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_setup_for_another_thread_is_refused(
 ):
     other = replace(straight_pull, metadata=metadata, discs=discs)
     with pytest.raises(ConfigurationError, match=words):
-        record(other, read_setup("petri_35mm_polyamide"), tmp_path / "bag")
+        render_bag(other, read_setup("petri_35mm_polyamide"), tmp_path / "bag")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -118,7 +118,7 @@ def test_times_that_are_not_there_are_refused_and_nothing_is_left(tmp_path: Path
     reference = ReferenceTrajectory("short", times, np.zeros((5, 2)), np.zeros(5), np.zeros((5, 3, 2)), (), {})
     for start, duration in ((0.5, 2.0), (3.0, None), (-1.0, 0.5)):
         with pytest.raises(BagError, match="has the times 0 to 1 s"):
-            record(reference, read_setup("petri_35mm_polyamide"), tmp_path / "bag", start=start, duration=duration)
+            render_bag(reference, read_setup("petri_35mm_polyamide"), tmp_path / "bag", start=start, duration=duration)
     assert not (tmp_path / "bag").exists()
 
 
@@ -128,14 +128,14 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, straight_pull: 
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        record(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.5, progress=stop)
+        render_bag(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.5, progress=stop)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: ReferenceTrajectory):
     setup = read_setup("petri_35mm_polyamide")
     for name, seed in (("one", 3), ("same", 3), ("other", 4)):
-        count = record(straight_pull, setup, tmp_path / name, rate=60.0, poses=True, noise=1e-4, seed=seed)
+        count = render_bag(straight_pull, setup, tmp_path / name, rate=60.0, poses=True, noise=1e-4, seed=seed)
         assert count == 120
     bag = Bag(tmp_path / "one")
     topics = (
@@ -173,7 +173,7 @@ def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: Reference
 @pytest.mark.parametrize("poses", [False, True])
 def test_a_bag_begins_with_the_scene(tmp_path: Path, straight_pull: ReferenceTrajectory, poses: bool):
     setup = read_setup("petri_35mm_polyamide")
-    record(straight_pull, setup, tmp_path / "bag", duration=0.2, poses=poses)
+    render_bag(straight_pull, setup, tmp_path / "bag", duration=0.2, poses=poses)
     bag = Bag(tmp_path / "bag")
     first = next(iter(bag.records(set(bag.topics))))
     assert first.topic == "/scene"

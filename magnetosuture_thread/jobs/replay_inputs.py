@@ -22,11 +22,11 @@ from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import NEEDLE_COMMAND, SCENE, SEEN_THREAD, TRUTH_THREAD
+from magnetosuture_thread.interface import GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_COMMAND, SCENE
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.offline.observations import pixels
 from magnetosuture_thread.offline.predictions import chosen_source
-from magnetosuture_thread.offline.sights import pixels
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -35,7 +35,7 @@ DEFAULT_SETUP = "petri_35mm_polyamide"
 PLAIN_SIZE, PLAIN_SHARE = (480, 640), 0.9  # of the picture of a dish that no camera saw, and the dish's part of it
 PLAIN_FLOOR, PLAIN_OUTSIDE = 225, 170  # its brightness
 
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
@@ -78,7 +78,7 @@ def opened(
     duration: float | None,
     remap: Mapping[str, str],
     frame: str,
-    say: Say,
+    log: Log,
 ) -> Iterator[Given]:
     """Open a bag to replay, and say what is odd about it.
 
@@ -90,28 +90,28 @@ def opened(
         duration: [s]; to the bag's end if None.
         remap: other names for topics of the bag, by the old one.
         frame: the bag's name of the dish frame.
-        say: called with a line for a person.
+        log: called with a line for a person.
 
     Raises:
         BagError: the bag cannot be used, or has no such time.
         ConfigurationError: the set-up cannot be used.
     """
-    say(f"checking {path}")
+    log(f"checking {path}")
     recording = Recording(Bag(path, remap=remap), dish_frame=frame)
     if recording.damage is not None:
-        say(f"the bag is damaged, what is intact is played: {recording.damage}")
+        log(f"the bag is damaged, what is intact is played: {recording.damage}")
     elif recording.unchecked:
-        say(recording.unchecked)
+        log(recording.unchecked)
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
     chosen = chosen_source(recording, source)
-    for channel in (SEEN_THREAD, NEEDLE_COMMAND, TRUTH_THREAD):
+    for channel in (MEASURED_THREAD, NEEDLE_COMMAND, GROUND_TRUTH_THREAD):
         if channel.recorded in recording.unfit:
             raise BagError(path, recording.unfit[channel.recorded])
     left = recording.duration - start
     with TemporaryDirectory() as spare:
         scene = scene_at(recording, start)
-        setup = _setup_of(recording.notes, setup_name, recording.damage is not None, Path(spare), scene, say)
+        setup = _setup_of(recording.notes, setup_name, recording.damage is not None, Path(spare), scene, log)
         yield Given(recording, setup, chosen, start, left if duration is None else min(duration, left))
 
 
@@ -140,7 +140,7 @@ def begin_with_scene(bag: BagWriter, given: Given) -> None:
 
 
 def _setup_of(
-    notes: Mapping[str, str], name: str, is_damaged: bool, spare: Path, scene: Scene | None, say: Say
+    notes: Mapping[str, str], name: str, is_damaged: bool, spare: Path, scene: Scene | None, log: Log
 ) -> Setup:
     """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default.
 
@@ -150,7 +150,7 @@ def _setup_of(
     named, text = notes.get("setup", ""), notes.get(SCENARIO_NOTE, "")
     if name:
         if named and name != named:
-            say(f"the bag names the set-up {named}; taking {name}")
+            log(f"the bag names the set-up {named}; taking {name}")
         return read_setup(name, scene)
     if text:  # which says more than a name: the file may have changed, or be on another machine
         path = spare / f"{named or 'scenario'}.yaml"
@@ -163,7 +163,7 @@ def _setup_of(
             raise ConfigurationError("the bag's own set-up", error.name, expected) from None
     if not named:
         lost = ", or has lost its name" if is_damaged else ""
-        say(f"the bag names no set-up{lost}; taking {DEFAULT_SETUP}, which may not be its own: --setup names another")
+        log(f"the bag names no set-up{lost}; taking {DEFAULT_SETUP}, which may not be its own: --setup names another")
     return read_setup(named or DEFAULT_SETUP, scene)
 
 
@@ -195,7 +195,7 @@ def replay_summary(given: Given, metrics: RunMetrics, **others: Any) -> ReplaySu
     )
 
 
-def write_results(folder: Path, given: Given, metrics: RunMetrics, summary: ReplaySummary, say: Say) -> None:
+def write_results(folder: Path, given: Given, metrics: RunMetrics, summary: ReplaySummary, log: Log) -> None:
     """Write summary.json and summary.png.
 
     Args:
@@ -203,7 +203,7 @@ def write_results(folder: Path, given: Given, metrics: RunMetrics, summary: Repl
         given: what was replayed.
         metrics: of its predictions.
         summary: the figures.
-        say: called with a line for a person.
+        log: called with a line for a person.
     """
     text = json.dumps(summary.to_json(), indent=2, allow_nan=False)
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
@@ -211,7 +211,7 @@ def write_results(folder: Path, given: Given, metrics: RunMetrics, summary: Repl
     assert chosen is not None
     found = _frame_of(given, chosen.stamp) if given.source == "camera" else _plain_dish(given)
     if found is None:
-        say("no picture: the dish is not found in any frame")
+        log("no picture: the dish is not found in any frame")
         return
     frame, view = found
     at = (chosen.stamp - given.recording.start) * 1e-9

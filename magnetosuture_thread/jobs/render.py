@@ -20,29 +20,29 @@ from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.interface import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    GROUND_TRUTH_NEEDLE,
+    GROUND_TRUTH_THREAD,
+    MEASURED_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
     SCENE,
-    SEEN_THREAD,
-    TRUTH_NEEDLE,
-    TRUTH_THREAD,
     Channel,
 )
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.thread import Attachment
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import Scene as CameraScene
+from magnetosuture_thread.rig.camera.scene import CameraScene as CameraScene
 from magnetosuture_thread.setups import Setup
 
 SIZE = (640, 480)
 DISH_SHARE = 0.9115  # of the image's height
 CAMERA_HEIGHT = 0.3  # m above the dish, for the intrinsics in camera_info
-TRUTH_POINTS = 51
-SEEN_POINTS = 64
+GROUND_TRUTH_POINTS = 51
+MEASURED_POINTS = 64
 EPOCH = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "not set" in ROS
 
 
-def record(
+def render_bag(
     reference: ReferenceTrajectory,
     setup: Setup,
     output: Path,
@@ -145,15 +145,15 @@ class _Topics(ABC):
 
     def __init__(self, bag: BagWriter, channels: Sequence[Channel]) -> None:
         self._bag = bag
-        for channel in (*channels, NEEDLE_COMMAND, TRUTH_NEEDLE, TRUTH_THREAD):
+        for channel in (*channels, NEEDLE_COMMAND, GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD):
             bag.add_topic(channel.recorded, channel.type_name)
 
     def write(self, stamp: int, tail: Points, heading: float, thread: Points, velocity: Points) -> None:
         """Write an instant."""
         self._write_seen(stamp, tail, heading, thread)
         self._put(NEEDLE_COMMAND, stamp, MESSAGES.twist_message(stamp, velocity))
-        self._put(TRUTH_NEEDLE, stamp, MESSAGES.placed(stamp, tail, heading))
-        self._put(TRUTH_THREAD, stamp, MESSAGES.path_message(stamp, _along(thread, TRUTH_POINTS)))
+        self._put(GROUND_TRUTH_NEEDLE, stamp, MESSAGES.placed(stamp, tail, heading))
+        self._put(GROUND_TRUTH_THREAD, stamp, MESSAGES.path_message(stamp, _along(thread, GROUND_TRUTH_POINTS)))
 
     @abstractmethod
     def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
@@ -191,7 +191,7 @@ class _PoseTopics(_Topics):
     """Writes what a tracker would say of the frames."""
 
     def __init__(self, bag: BagWriter, setup: Setup, noise: float, seed: int) -> None:
-        super().__init__(bag, (NEEDLE_POSE, SEEN_THREAD))
+        super().__init__(bag, (NEEDLE_POSE, MEASURED_THREAD))
         self._noise = np.array([noise, noise, noise / setup.vision.needle_length])
         self._random = np.random.default_rng(seed)
 
@@ -202,10 +202,10 @@ class _PoseTopics(_Topics):
             stamp, tail + off[:2], np.array([np.cos(angle), np.sin(angle)]), np.diag(self._noise**2)
         )
         self._put(NEEDLE_POSE, stamp, pose)
-        seen = _along(thread, SEEN_POINTS)
+        seen = _along(thread, MEASURED_POINTS)
         seen[1:] += self._noise[:2] * self._random.standard_normal(seen[1:].shape)
         seen[0] = tail + off[:2]  # a seen thread begins at the seen tail
-        self._put(SEEN_THREAD, stamp, MESSAGES.path_message(stamp, seen))
+        self._put(MEASURED_THREAD, stamp, MESSAGES.path_message(stamp, seen))
 
 
 def _along(thread: Points, count: int) -> Points:

@@ -13,8 +13,8 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import SCENE
-from magnetosuture_thread.jobs.judge import opened
 from magnetosuture_thread.jobs.playing import Playing
+from magnetosuture_thread.jobs.replay_inputs import opened
 from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
@@ -49,7 +49,7 @@ def copied(short_bag: Path, tmp_path: Path):
 def given(path: Path, setup_name: str = "", start: float = 0.0):
     """Open a bag."""
     return opened(
-        path, setup_name=setup_name, source="auto", start=start, duration=None, remap={}, frame="dish", say=print
+        path, setup_name=setup_name, source="auto", start=start, duration=None, remap={}, frame="dish", log=print
     )
 
 

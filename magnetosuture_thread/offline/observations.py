@@ -17,10 +17,10 @@ from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
+    GROUND_TRUTH_THREAD,
+    MEASURED_THREAD,
     NEEDLE_POSE,
     SCENE,
-    SEEN_THREAD,
-    TRUTH_THREAD,
     Channel,
 )
 from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
@@ -29,11 +29,11 @@ from magnetosuture_thread.model.session import MAX_WAITING_POSES
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.vision.images import decode_image, unpack_image
-from magnetosuture_thread.vision.session import Seen, TrackerSession
+from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
 from magnetosuture_thread.vision.warm_up import warm_up
 
 MEASURED = 8  # the length of each so many seen threads is looked at
-LONGEST, SHORTEST = 3.0, 0.2  # of the set-up's thread; a seen one beyond is not of this set-up
+MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the set-up's thread; a seen one beyond is not of this set-up
 NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
     "no needle for sure",
     "a broken picture",
@@ -42,11 +42,11 @@ NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
 )
 Progress = Callable[[float], None]
 _CHANGING = {channel.recorded for channel in CHANGING}
-_TRUE, _SEEN = TRUTH_THREAD.recorded, SEEN_THREAD.recorded
+_TRUE, _SEEN = GROUND_TRUTH_THREAD.recorded, MEASURED_THREAD.recorded
 _NOTHING = np.empty((0, 2))
 
 
-class Sights(Iterator[Observation]):
+class ObservationReader(Iterator[Observation]):
     """Goes through a bag; see `sights`. A few sights are held at a time, however long the bag is.
 
     Attributes:
@@ -71,7 +71,7 @@ class Sights(Iterator[Observation]):
         self.source = source
         self.count = self.found = 0
         self.refused: Counter[str] = Counter()
-        self.on_frame: Callable[[int, Seen], None] = lambda stamp, seen: None
+        self.on_frame: Callable[[int, FrameMeasurement], None] = lambda stamp, seen: None
         self.on_record: Callable[[int, RecordedMessage], None] = lambda stamp, record: None
         self._scene = setup.scene
         self._length = setup.model.thread_length
@@ -83,15 +83,15 @@ class Sights(Iterator[Observation]):
         self._recording = recording
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
-        sources = (recording.camera,) if source == "camera" else (NEEDLE_POSE, SEEN_THREAD)
-        given = (TRUTH_THREAD, *CHANGING, *sources)
+        sources = (recording.camera,) if source == "camera" else (NEEDLE_POSE, MEASURED_THREAD)
+        given = (GROUND_TRUTH_THREAD, *CHANGING, *sources)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
         records = recording.records(channels, start=start, duration=duration)
         earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
         self._changes = [record for record in earlier if record.time < begin]
         for record in self._changes:
             self._follow(record)
-        awaited = {TRUTH_THREAD, SEEN_THREAD} & set(channels)
+        awaited = {GROUND_TRUTH_THREAD, MEASURED_THREAD} & set(channels)
         self._going = self._go(_telling(records, begin, whole, progress), awaited)
 
     def __next__(self) -> Observation:
@@ -115,8 +115,8 @@ class Sights(Iterator[Observation]):
         if 2 * self._odd <= self._measured:
             return ""
         return (
-            f"{self._odd} of {self._measured} seen threads that were measured are longer than {LONGEST:g} times or "
-            f"shorter than {SHORTEST:g} times the set-up's {self._length:g} m: is it another thread?"
+            f"{self._odd} of {self._measured} measured threads are longer than {MAX_LENGTH_RATIO:g} times or "
+            f"shorter than {MIN_LENGTH_RATIO:g} times the set-up's {self._length:g} m: is it another thread?"
         )
 
     def _go(self, records: Iterator[RecordedMessage], awaited: set[Channel]) -> Iterator[Observation]:
@@ -171,7 +171,7 @@ class Sights(Iterator[Observation]):
             self._check_place(record.topic, points)
             if self._threads % MEASURED == 0:
                 length = float(arc_lengths(points)[-1]) / self._length
-                self._odd += not SHORTEST <= length <= LONGEST
+                self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
                 self._measured += 1
             self._threads += 1
         known[stamp] = points
