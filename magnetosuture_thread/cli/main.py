@@ -14,6 +14,7 @@ from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 
 FAILED, WRONG_USE = 1, 2
 MOVED = {  # commands of before, and what is written instead
+    "record": "`magnetosuture render`",
     "bench": "`python -m benchmarks solver|bridge|page`, in the source tree",
     "hernia": "`magnetosuture reproduce hernia`",
     "behaviour": "`magnetosuture reproduce thread-behavior`",

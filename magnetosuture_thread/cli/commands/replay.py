@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
             "duration": options.duration,
             "remap": dict(options.remap),
             "frame": options.frame,
-            "say": log,
+            "log": log,
             "progress": advance,
         }
         if options.offline:
