@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from magnetosuture_thread.barrier import Barrier, Gradient
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
     from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
+    from magnetosuture_thread.jobs.calibrate import CalibrationRequest, calibrate_bags
+    from magnetosuture_thread.jobs.replay_offline import replay_offline
     from magnetosuture_thread.model.margins import BarrierMargins, Margins
     from magnetosuture_thread.model.medium import Medium
     from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
@@ -23,6 +25,8 @@ _HOME = {
     "barrier": ("Barrier", "Gradient"),
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
+    "jobs.calibrate": ("CalibrationRequest", "calibrate_bags"),
+    "jobs.replay_offline": ("replay_offline",),
     "model.margins": ("BarrierMargins", "Margins"),
     "model.medium": ("Medium",),
     "model.predictor": ("NeedlePose", "Prediction", "ThreadPredictor"),
@@ -37,6 +41,7 @@ __all__ = [
     "Attachment",
     "Barrier",
     "BarrierMargins",
+    "CalibrationRequest",
     "ConfigurationError",
     "Disc",
     "Dish",
@@ -58,7 +63,9 @@ __all__ = [
     "Thread",
     "ThreadPredictor",
     "Workspace",
+    "calibrate_bags",
     "read_scene",
+    "replay_offline",
 ]
 
 

@@ -14,9 +14,11 @@ LINES = 40  # of an example at most
 LINES_OF_A_BARRIER = 25  # that a user writes
 SAYS = {
     "another_solver": "osqp and banded differ by 0.00 nm",
+    "calibration": "stiffness over drag: 1.3e-09 m^4/s, identified",
     "free_thread": "nearest node to the wall: 4.97 mm",
     "mesh_in_space": "4 nodes lie on the mesh",
     "needle_filter": "in the end: stopped by post, upper_half",
+    "offline_replay": "needle found in 119 of 121 frames",
     "own_barrier": "moving_disc: at least",
     "wrap_around_post": "nodes touch post",
 }

@@ -34,7 +34,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Request:
+class CalibrationRequest:
     """What to calibrate, and how.
 
     Attributes:
@@ -63,7 +63,7 @@ class Request:
 def calibrate_bags(
     bags: Sequence[Path],
     output: Path,
-    request: Request,
+    request: CalibrationRequest,
     *,
     picture: Path | None = None,
     json_file: Path | None = None,
@@ -124,7 +124,7 @@ def _write(
 
 
 def _read(
-    bags: Sequence[Path], request: Request, log: Log, progress: Progress
+    bags: Sequence[Path], request: CalibrationRequest, log: Log, progress: Progress
 ) -> tuple[list[Passage], ThreadModelSettings]:
     """Read all bags, their frames tracked once, and return what the set-up says of the thread."""
     passages: list[Passage] = []
@@ -166,7 +166,7 @@ def _read(
     return passages, settings
 
 
-def settings_of(setup: Setup, request: Request) -> ThreadModelSettings:
+def settings_of(setup: Setup, request: CalibrationRequest) -> ThreadModelSettings:
     """Return what the set-up says of the thread, with material and formulation as asked for.
 
     Another material than the set-up's comes with its own diameter and modulus.

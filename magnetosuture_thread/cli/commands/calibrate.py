@@ -72,11 +72,11 @@ def add(subparsers: Subparsers) -> None:
 def run(options: argparse.Namespace) -> int:
     """Fit the thread's parameters to recorded bags."""
     from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
-    from magnetosuture_thread.jobs.calibrate import Request, calibrate_bags
+    from magnetosuture_thread.jobs.calibrate import CalibrationRequest, calibrate_bags
 
     console = make_console()
     log = make_log(console)
-    request = Request(
+    request = CalibrationRequest(
         setup=options.setup,
         material=options.material,
         formulation=options.formulation,
