@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,14 +13,11 @@ from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv
 from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable_path
 from magnetosuture_thread.jobs.frames import numbered
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.workers import WorkerDiedError, run_all
 from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, WorkerPool
 
 DEPTH = 2  # folders below the one that is given, in which bags are looked for
 MAX_NAME_BYTES = 200  # bytes
-
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -77,16 +74,14 @@ def evaluate_bags(
     rows: dict[int, Row] = {}
     with whole_folder(output) as folder:
         tasks = [Task(bag, name, options, folder / f"{name}.html") for bag, name in zip(bags, names, strict=True)]
-
-        def done(index: int, result: Row | WorkerDiedError) -> None:
-            task = tasks[index]
-            row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
-            if row["problem"]:
-                task.page.unlink(missing_ok=True)
-                log(f"{task.name}: {row['problem']}")
-            rows[index] = row
-
-        run_all(evaluate_one, tasks, workers, done=done, log=log, progress=progress)
+        with WorkerPool(evaluate_one, workers) as pool:
+            for index, result in pool.run(tasks, log, progress):
+                task = tasks[index]
+                row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
+                if row["problem"]:
+                    task.page.unlink(missing_ok=True)
+                    log(f"{task.name}: {row['problem']}")
+                rows[index] = row
         ordered = [rows[index] for index in range(len(tasks))]
         (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
         (folder / "table.json").write_text(table_json(ordered), encoding="utf-8")
