@@ -16,8 +16,8 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.cli.commands.calibrate_camera import calibrate_camera
-from magnetosuture_thread.cli.commands.track import track_table
+from magnetosuture_thread.cli.commands.calibrate import calibrate_camera
+from magnetosuture_thread.cli.commands.evaluate import track_table
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.jobs import frames
