@@ -163,8 +163,8 @@ def test_brackets_in_an_error_are_shown_as_they_are(monkeypatch, capsys, tmp_pat
 
 
 def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path, short_bag: Path):
-    packages = ("magnetosuture_thread.nodes", "magnetosuture_thread.jobs")
-    for name in [name for name in sys.modules if name.startswith(packages)]:
+    with_ros = ("magnetosuture_thread.nodes", "magnetosuture_thread.jobs.replay", "magnetosuture_thread.jobs.simulate")
+    for name in [name for name in sys.modules if name.startswith(with_ros[0]) or name in with_ros]:
         monkeypatch.delitem(sys.modules, name)
     for name in [name for name in sys.modules if name.split(".")[0] == "rclpy"]:
         monkeypatch.setitem(sys.modules, name, None)

@@ -12,9 +12,9 @@ from magnetosuture_thread.bags.bag_files import STORAGE_SUFFIXES, find_bag_files
 from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
 from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv, table_json
 from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag, printable_path
-from magnetosuture_thread.jobs.frames import numbered
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress
+from magnetosuture_thread.jobs.track import numbered
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
 

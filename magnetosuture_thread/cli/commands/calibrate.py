@@ -169,7 +169,7 @@ def calibrate_camera(
     """
     import numpy as np
 
-    from magnetosuture_thread.jobs.frames import FrameSource
+    from magnetosuture_thread.jobs.track import FrameSource
     from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers
 
     source = FrameSource(paths, remap=remap)

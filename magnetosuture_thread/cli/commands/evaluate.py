@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,23 +27,14 @@ from magnetosuture_thread.cli.terminal import make_console, make_log, progress, 
 from magnetosuture_thread.errors import ConfigurationError
 
 MAX_ROWS = 20  # of frames; beyond, only the summary is shown
-BAG_OPTIONS: dict[str, object] = {
-    "output": None,
-    "setup": "",
-    "against": "auto",
-    "source": "auto",
-    "remap": [],
-    "frame": "dish",
-    "start": 0.0,
-    "duration": None,
-    "workers": 1,
-}
-REFERENCE_OPTIONS = {"solver": None, "segments": None, "rig": False, "json": None, "pictures": None}
+BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers")
+REFERENCE_OPTIONS = ("solver", "segments", "rig", "json", "pictures")
 
 
 def add(subparsers: Subparsers) -> None:
     """Add the commands."""
     parser = command(subparsers, "evaluate", run_evaluate)
+    parser.set_defaults(default_of=parser.get_default)
     parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
     # The model's own names, written out: importing the model for them would be slow.
     formulation = "how a step is written (default: a bag's setup's; rod)"
@@ -109,10 +100,10 @@ def run_evaluate(options: argparse.Namespace) -> int:
     return _score_references(options)
 
 
-def _refuse(options: argparse.Namespace, unset: Mapping[str, object], why: str) -> None:
-    for name, value in unset.items():
+def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    for name in names:
         given = getattr(options, name)
-        if given != value:
+        if given != options.default_of(name):
             raise ConfigurationError(f"--{name}", str(given), f"nothing: it is {why}")
 
 
