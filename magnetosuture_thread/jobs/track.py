@@ -31,7 +31,7 @@ from magnetosuture_thread.vision.warm_up import warm_up
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own
-LOWEST_RATE, HIGHEST_RATE = 0.1, 240.0  # frames/s, that video players show
+MIN_RATE, MAX_RATE = 0.1, 240.0  # frames/s, that video players show
 FRAMES_FOR_RATE = 300  # of a bag, from its beginning
 
 
@@ -144,7 +144,7 @@ class FrameSource:
         if not intervals:
             return PICTURE_RATE
         # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
-        return min(HIGHEST_RATE, max(LOWEST_RATE, round(1.0 / float(np.median(intervals)), 2)))
+        return min(MAX_RATE, max(MIN_RATE, round(1.0 / float(np.median(intervals)), 2)))
 
     def _recorded(self, record: RecordedMessage) -> FrameFile:
         """Return a recorded frame; it is broken where message or picture are."""
