@@ -77,7 +77,7 @@ def render_bag(
     if frames < 1:
         raise BagError(reference.name, f"{end - start:g} s at {rate:g} frames a second hold no frame")
     _check_setup(reference, setup)
-    what = "needle poses and measured thread" if poses else "camera frames and needle motion, rendered"
+    what = "needle poses and seen thread" if poses else "camera frames and needle motion, rendered"
     notes = {"setup": setup.name, "simulated": f"{what} from the reference trajectory {reference.name}"}
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
         source = _PoseTopics(setup, noise, seed) if poses else _FrameTopics(setup, reference, quality, seed)
