@@ -16,8 +16,7 @@ from benchmarks import keep_out
 from benchmarks.bridge import command as bridge
 from benchmarks.page import command as page
 from benchmarks.solver import command as solver
-from magnetosuture_thread.cli.arguments import output_file
-from magnetosuture_thread.cli.command import EXIT_CODES
+from magnetosuture_thread.cli.arguments import EXIT_CODES, output_file
 from magnetosuture_thread.cli.main import exit_code
 from magnetosuture_thread.cli.terminal import make_console
 

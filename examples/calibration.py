@@ -6,13 +6,13 @@ The bag holds simulated camera frames and the motion of a needle that draws its 
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from magnetosuture_thread import CalibrationRequest, calibrate_bags
+from magnetosuture_thread import calibrate_bags
 
 BAG = Path(__file__).parent / "post_wrap"
 
 with TemporaryDirectory() as folder:
     parameters = Path(folder) / "thread.yaml"
-    result = calibrate_bags([BAG], parameters, CalibrationRequest(parameters=["elastic_modulus"]), log=print)
+    result = calibrate_bags([BAG], parameters, parameters=["elastic_modulus"], log=print)
     print(parameters.read_text())
 
 for estimate in result.estimates:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.barrier import Barrier, Gradient
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
     from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
-    from magnetosuture_thread.jobs.calibrate import CalibrationRequest, calibrate_bags
+    from magnetosuture_thread.jobs.calibrate import calibrate_bags
     from magnetosuture_thread.jobs.replay_offline import replay_offline
     from magnetosuture_thread.model.margins import BarrierMargins, Margins
     from magnetosuture_thread.model.medium import Medium
@@ -25,7 +25,7 @@ _HOME = {
     "barrier": ("Barrier", "Gradient"),
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
-    "jobs.calibrate": ("CalibrationRequest", "calibrate_bags"),
+    "jobs.calibrate": ("calibrate_bags",),
     "jobs.replay_offline": ("replay_offline",),
     "model.margins": ("BarrierMargins", "Margins"),
     "model.medium": ("Medium",),
@@ -41,7 +41,6 @@ __all__ = [
     "Attachment",
     "Barrier",
     "BarrierMargins",
-    "CalibrationRequest",
     "ConfigurationError",
     "Disc",
     "Dish",

@@ -20,7 +20,7 @@ import yaml
 
 from benchmarks.__main__ import main as benchmark
 from magnetosuture_thread import interface
-from magnetosuture_thread.cli.parser import make_parser
+from magnetosuture_thread.cli.main import make_parser
 from magnetosuture_thread.configuration import ROS_PARAMETERS, configuration_fields
 from magnetosuture_thread.model.thread import MATERIALS
 from magnetosuture_thread.scene import read_scene

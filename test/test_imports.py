@@ -22,6 +22,7 @@ ALLOWED = {
     "parameter_files": {"errors", "configuration", "shared_parameters"},
     "interface": set(),
     "compiled": set(),
+    "workers": set(),
     "barrier": {"errors", "geometry"},
     "geometry": {"errors", "compiled"},
     "scene": {*BASE, "geometry", "interface", "shared_parameters"},
@@ -35,7 +36,7 @@ ALLOWED = {
     "bags": {*BASE, "interface", "messages"},
     "messages": {"errors", "interface", "geometry", "scene", "model", "vision", "coils"},
     "evaluation": {"barrier", "messages", "errors", "geometry", "interface", "model", "scene"},
-    "calibration": {"barrier", "errors", "geometry", "scene", "model", "evaluation"},
+    "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation"},
     "nodes": {
         *BASE,
         *("interface", "messages", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
@@ -49,6 +50,7 @@ ALLOWED = {
     "jobs": {
         *BASE,
         *(
+            "workers",
             "interface",
             "geometry",
             "scene",

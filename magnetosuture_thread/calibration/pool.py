@@ -1,32 +1,21 @@
-"""Replays on several cores: processes that hold the passages and give the same numbers, whoever computes them."""
+"""Replays on several processors, with the same numbers whichever process computes them."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from multiprocessing import connection
+from functools import partial
 
 from magnetosuture_thread.calibration.passage import Passage
 from magnetosuture_thread.calibration.replays import Run, Task, attempt
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.geometry.polyline import Points
-
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # meant for the parent, which ends its workers itself
-
-_passages: tuple[Passage, ...] = ()
+from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
 
 
 @contextmanager
 def pool(passages: Sequence[Passage], workers: int) -> Iterator[Run]:
-    """Give what runs tasks: here, or in processes of its own.
-
-    Ctrl-C is the parent's, and ends the processes at once, whatever they are at.
+    """Give a function that runs tasks, here or in processes of their own; see `WorkerPool`.
 
     Args:
         passages: that tasks name by their index.
@@ -35,50 +24,21 @@ def pool(passages: Sequence[Passage], workers: int) -> Iterator[Run]:
     Raises:
         GraphError: a process died.
     """
-    if workers <= 1:
-        yield lambda tasks: [attempt(passages[index], settings) for index, settings in tasks]
-        return
-    others = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(tuple(passages),)
-    )
+    with WorkerPool(partial(_replay, tuple(passages)), workers) as processes:
 
-    def run(tasks: Sequence[Task]) -> list[Points]:
-        try:
-            # Processes begin with what is blocked here, and keep it.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
-            try:
-                waiting = [executor.submit(_work, task) for task in tasks]
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-            return [future.result() for future in waiting]
-        except BrokenProcessPool:
-            raise GraphError("a process that replayed a bag died; is there enough memory for --workers?") from None
+        def run(tasks: Sequence[Task]) -> list[Points]:
+            results = dict[int, Points]()
+            for index, result in processes.run(tasks):
+                if isinstance(result, WorkerDiedError):
+                    raise GraphError("a process that replayed a bag died; is there enough memory for --workers?")
+                results[index] = result
+            return [results[index] for index in range(len(tasks))]
 
-    try:
         yield run
-    except BaseException:
-        for process in set(multiprocessing.active_children()) - others:
-            process.kill()
-        raise
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin(passages: tuple[Passage, ...]) -> None:
-    """Take the passages, and end whenever the parent does, however it ends."""
-    global _passages
-    _passages = passages
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _work(task: Task) -> Points:
+def _replay(
+    passages: Sequence[Passage], task: Task, log: Callable[[str], None], progress: Callable[[float], None]
+) -> Points:
     index, settings = task
-    return attempt(_passages[index], settings)
+    return attempt(passages[index], settings)

@@ -1,19 +1,51 @@
-"""Types of arguments on the command line: each refuses what it cannot be, in words."""
+"""Commands and their arguments: how a command is added, types that refuse wrong values, options that commands share."""
 
 from __future__ import annotations
 
 import argparse
+import inspect
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from magnetosuture_thread.bags.remap import parse_remap
 from magnetosuture_thread.errors import ConfigurationError
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+DONE, FAILED, WRONG_USE = 0, 1, 2
+EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
+
+
+def command(
+    subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int] | None = None, text: str = ""
+) -> argparse.ArgumentParser:
+    """Add a command and return its parser, which has no arguments yet.
+
+    Args:
+        subparsers: of `magnetosuture`.
+        name: as it is written on the command line.
+        run: the command, called with the options; returns the exit code. Its docstring is the text under --help, and
+            the first line of it is the line in the list of commands.
+        text: the same of a command that only has sub-commands.
+    """
+    description = text if run is None else inspect.getdoc(run) or ""
+    summary = description.partition("\n")[0].rstrip(".")
+    parser = subparsers.add_parser(
+        name,
+        help=summary[:1].lower() + summary[1:],
+        description=description,
+        epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    return parser
 
 
 def number_argument(low: float, high: float) -> Callable[[str], float]:
     """Return an argument type: a number within bounds."""
 
-    def within(text: str) -> float:
+    def parse(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
@@ -22,7 +54,19 @@ def number_argument(low: float, high: float) -> Callable[[str], float]:
             raise argparse.ArgumentTypeError(f"{text!r} is no number from {low:g} to {high:g}")
         return value
 
-    return within
+    return parse
+
+
+def count_argument(things: str, low: int, high: int) -> Callable[[str], int]:
+    """Return an argument type: a number of things within bounds."""
+
+    def parse(text: str) -> int:
+        count = whole_number(text)
+        if not low <= count <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is no number of {things} from {low} to {high}")
+        return count
+
+    return parse
 
 
 def whole_number(text: str) -> int:
@@ -30,14 +74,6 @@ def whole_number(text: str) -> int:
     if not (text.isascii() and text.isdigit()):
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 0")
     return int(text)
-
-
-def segments(text: str) -> int:
-    """Return a number of segments: an argument type."""
-    count = whole_number(text)
-    if not 3 <= count <= 2000:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of segments from 3 to 2000")
-    return count
 
 
 def output_file(text: str) -> Path:
@@ -48,33 +84,47 @@ def output_file(text: str) -> Path:
     return path
 
 
-def add_remap(parser: argparse._ActionsContainer) -> None:
-    """Add the option --remap, which may come again; its value is a list of pairs, old name and new."""
-    parser.add_argument(
-        "--remap",
-        type=remap,
-        action="append",
-        default=[],
-        metavar="FROM:=TO",
-        help="another name for a bag's topic; may come again",
-    )
-
-
-def add_source(parser: argparse._ActionsContainer) -> None:
-    """Add --source, --remap and --frame: what of a bag to go by."""
-    parser.add_argument(
-        "--source",
-        choices=("auto", "camera", "poses"),
-        default="auto",
-        help="what to go by: the camera's frames, or the recorded poses (default: the camera where there are frames)",
-    )
-    add_remap(parser)
-    parser.add_argument("--frame", default="dish", metavar="NAME", help="a bag's name of the dish frame")
-
-
 def remap(text: str) -> tuple[str, str]:
     """Return a topic's name and its new one: an argument type."""
     try:
         return parse_remap(text)
     except ConfigurationError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not {error.expectation}") from None
+
+
+def add_remap(parser: argparse._ActionsContainer) -> None:
+    """Add the option --remap, which may come again; its value is a list of pairs, old name and new."""
+    text = "another name for a bag's topic; may come again"
+    parser.add_argument("--remap", type=remap, action="append", default=[], metavar="FROM:=TO", help=text)
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Add the argument FRAMES, and --remap for those of a bag."""
+    parser.add_argument("frames", type=Path, nargs="+", metavar="FRAMES", help="pictures, a folder of them, or a bag")
+    add_remap(parser)
+
+
+def add_source(parser: argparse._ActionsContainer, bag: str = "the bag") -> None:
+    """Add --setup, --source, --remap and --frame: how a bag is read.
+
+    Args:
+        parser: that gets them.
+        bag: which bag names the setup.
+    """
+    option = parser.add_argument
+    option("--setup", default="", metavar="NAME", help=f"a setup's name or YAML file (default: the one {bag} names)")
+    option(
+        "--source",
+        choices=("auto", "camera", "poses"),
+        default="auto",
+        help="the camera's frames, or the recorded poses (default: the camera where there are frames)",
+    )
+    add_remap(parser)
+    option("--frame", default="dish", metavar="NAME", help="a bag's name of the dish frame")
+
+
+def bag_selection(options: argparse.Namespace) -> dict[str, Any]:
+    """Return how a bag is read, as jobs take it: see `jobs.replay_inputs.BagSelection`."""
+    names = (name for name in ("source", "start", "duration", "frame") if hasattr(options, name))
+    chosen = {name: getattr(options, name) for name in names}
+    return {"setup_name": options.setup, "remap": dict(options.remap), **chosen}

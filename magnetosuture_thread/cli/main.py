@@ -1,7 +1,8 @@
-"""Runs the command and turns errors into exit codes."""
+"""The command `magnetosuture`: its parser, and errors as exit codes."""
 
 from __future__ import annotations
 
+import argparse
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -9,16 +10,37 @@ from contextlib import contextmanager
 
 from rich.console import Console
 
-from magnetosuture_thread.cli.parser import make_parser
+from magnetosuture_thread.cli.arguments import EXIT_CODES, FAILED, WRONG_USE
+from magnetosuture_thread.cli.commands import bag, calibrate, evaluate, run_graph, scene
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 
-FAILED, WRONG_USE = 1, 2
 MOVED = {  # commands of before, and what is written instead
     "record": "`magnetosuture render`",
     "bench": "`python -m benchmarks solver|bridge|page`, in the source tree",
     "hernia": "`magnetosuture reproduce hernia`",
     "behaviour": "`magnetosuture reproduce thread-behavior`",
 }
+COMMANDS = (run_graph, evaluate, calibrate, scene, bag)  # in the order of --help
+
+DESCRIPTION = """\
+Predicts where a suture thread goes behind a magnetically steered needle.
+
+Research software, no medical device. Lengths are in metres and times in seconds throughout.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser; each command sets `run` to what it does."""
+    parser = argparse.ArgumentParser(
+        prog="magnetosuture",
+        description=DESCRIPTION,
+        epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for module in COMMANDS:
+        module.add(subparsers)
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,11 +59,9 @@ def exit_code(run: Callable[[], int]) -> int:
             return run()
     except ConfigurationError as error:
         return _fail(str(error), WRONG_USE)
-    except MagnetosutureError as error:
-        return _fail(str(error), FAILED)
     except ModuleNotFoundError as error:
         return _fail(f"{error}; the live graph needs ROS 2 Jazzy: see the README, or pip install '.[ros]'", FAILED)
-    except OSError as error:
+    except (MagnetosutureError, OSError) as error:
         return _fail(str(error), FAILED)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -57,7 +77,7 @@ def _fail(problem: str, code: int) -> int:
 
 @contextmanager
 def _interrupted_by(*signals: signal.Signals) -> Iterator[None]:
-    """Treat these signals as Ctrl-C, so that whatever ends us, the nodes end too and nothing half-made stays.
+    """Treat these signals as Ctrl-C, so that whatever ends this process, the nodes end too and nothing partial stays.
 
     One that is ignored, as under nohup, stays ignored.
     """
@@ -65,8 +85,8 @@ def _interrupted_by(*signals: signal.Signals) -> Iterator[None]:
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt
 
-    heeded = [which for which in signals if signal.getsignal(which) is not signal.SIG_IGN]
-    before = [(which, signal.signal(which, interrupt)) for which in heeded]
+    handled = [which for which in signals if signal.getsignal(which) is not signal.SIG_IGN]
+    before = [(which, signal.signal(which, interrupt)) for which in handled]
     try:
         yield
     finally:

@@ -16,12 +16,22 @@ TOKEN_BYTES = 18
 
 def is_loopback(address: str) -> bool:
     """Return whether only this machine can reach an address."""
-    if address == "localhost":
-        return True
+    numeric = _numeric(address)
+    return numeric is not None and numeric.is_loopback
+
+
+def is_any(address: str) -> bool:
+    """Return whether an address stands for all of this machine."""
+    numeric = _numeric(address)
+    return numeric is not None and numeric.is_unspecified
+
+
+def _numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """Return the address that a name stands for without a look-up; None if it is another name."""
     try:
-        return ipaddress.ip_address(address).is_loopback
+        return ipaddress.ip_address("127.0.0.1" if name == "localhost" else name)
     except ValueError:
-        return False
+        return None
 
 
 def new_token() -> str:
@@ -38,11 +48,8 @@ def same_token(given: object, token: str) -> bool:
 
 def page_url(address: str, port: int, token: str) -> str:
     """Return the URL of the page; the token is in the fragment, which browsers do not send."""
-    return f"http://{_bracketed(address)}:{port}/#token={quote(token, safe='')}"
-
-
-def _bracketed(address: str) -> str:
-    return f"[{address}]" if ":" in address else address
+    host = f"[{address}]" if ":" in address else address
+    return f"http://{host}:{port}/#token={quote(token, safe='')}"
 
 
 def host_refusal(host: str, address: str, port: int) -> str:
@@ -62,12 +69,8 @@ def host_refusal(host: str, address: str, port: int) -> str:
     name, given = parts
     if given != port:
         return f"Host: got port {given}, expected {port}"
-    accepted = (
-        name == address.lower()
-        or (is_loopback(name) and is_loopback(address))
-        or (is_any(address) and _is_numeric(name))
-    )
-    return "" if accepted else f"Host: got {name[:80]!r}, expected {address}"
+    local, numeric = is_loopback(name) and is_loopback(address), is_any(address) and _numeric(name) is not None
+    return "" if name == address.lower() or local or numeric else f"Host: got {name[:80]!r}, expected {address}"
 
 
 def origin_refusal(origin: str, host: str) -> str:
@@ -91,18 +94,3 @@ def _host_and_port(host: str) -> tuple[str, int] | None:
     if not name or parts.path or parts.query or parts.fragment or parts.username is not None:
         return None
     return name, 80 if port is None else port
-
-
-def is_any(address: str) -> bool:
-    """Return whether an address stands for all of this machine."""
-    return address != "localhost" and _is_numeric(address) and ipaddress.ip_address(address).is_unspecified
-
-
-def _is_numeric(name: str) -> bool:
-    if name == "localhost":
-        return True
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True

@@ -1,39 +1,99 @@
-"""Connection of one page: dispatches its messages, and sends replies, states and camera frames."""
+"""Connection of one page: executes its messages and requests, and sends replies, states and camera frames."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from aiohttp import WSMsgType, web
 
+from magnetosuture_thread.console import client_messages as messages
 from magnetosuture_thread.console.access import same_token
-from magnetosuture_thread.console.client_messages import (
-    Acknowledge,
-    AcquireControl,
-    BridgeAction,
-    ClientMessage,
-    EndJog,
-    Hello,
-    Jog,
-    ReleaseControl,
-    Visibility,
-    parse_client_message,
-)
-from magnetosuture_thread.console.dead_man import DelayEstimator
-from magnetosuture_thread.console.jog_controller import JogController
+from magnetosuture_thread.console.graph import Graph, Host
+from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController
 from magnetosuture_thread.console.outbox import Message, Outbox
-from magnetosuture_thread.console.requests import RequestHandler
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 
 HELLO_TIMEOUT = 5.0  # after the connection [s]
 SEND_TIMEOUT = 2.0  # after which a page that does not receive is disconnected [s]
 MAX_LATE_TIME = 1.0  # after which a page whose messages are all late must reconnect [s]
 MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
 MAX_EXCESS_MESSAGES = 2000  # beyond that rate, in total, after which the connection is closed
-EMERGENCY_STOP = BridgeAction("stop")
+EMERGENCY_STOP = messages.BridgeAction("stop")
+MAX_PENDING_REQUESTS = 4  # of one page, besides emergency stops
+UNLEASED_ACTIONS = ("stop", "disarm")  # allowed for every page with the token, with or without control
+
+Reply = Callable[[str, str], None]
+
+
+class RequestHandler:
+    """Executes requests of pages as asyncio tasks.
+
+    Args:
+        graph: the running graph.
+        host: of the graph.
+        jog: knows which page has control.
+    """
+
+    def __init__(self, graph: Graph, host: Host, jog: JogController) -> None:
+        self._graph, self._host, self._jog = graph, host, jog
+        self._pending: dict[asyncio.Task[None], int] = {}
+
+    def start(self, client: int, message: messages.ClientMessage, reply: Reply) -> None:
+        """Start a request of a page with the token.
+
+        Args:
+            client: its number.
+            message: the request.
+            reply: called with the request's name and the refusal, empty on success.
+
+        Raises:
+            InvalidInputError: the request needs control, or too many are pending.
+        """
+        unleased = isinstance(message, messages.BridgeAction) and message.action in UNLEASED_ACTIONS
+        if not unleased and client != self._jog.holder:
+            raise InvalidInputError(_name(message), "a page without control", "one with control: take control first")
+        if not unleased and list(self._pending.values()).count(client) >= MAX_PENDING_REQUESTS:
+            raise InvalidInputError(
+                _name(message), f"{MAX_PENDING_REQUESTS} pending requests", "a reply to one of them first"
+            )
+        if not isinstance(message, messages.RecordBag) and message != messages.BridgeAction("arm"):
+            self._jog.stop()
+        task = asyncio.create_task(self._execute(message, reply))
+        self._pending[task] = client
+        task.add_done_callback(lambda done: self._pending.pop(done, None))
+
+    async def close(self) -> None:
+        """Cancel pending requests."""
+        tasks = list(self._pending)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _execute(self, message: messages.ClientMessage, reply: Reply) -> None:
+        try:
+            refusal = await self._request(message)
+        except MagnetosutureError as error:
+            refusal = str(error)
+        reply(_name(message), refusal)
+
+    def _request(self, message: messages.ClientMessage) -> Awaitable[str]:
+        if isinstance(message, messages.BridgeAction):
+            return self._graph.execute_action(message.action)
+        if isinstance(message, messages.SelectSetup):
+            return self._host.select_setup(message.setup)
+        if isinstance(message, messages.Pause):
+            return self._host.set_paused(message.paused)
+        if isinstance(message, messages.RecordBag):
+            return self._host.set_recording(message.recording)
+        raise InvalidInputError("message", _name(message), "a request")
+
+
+def _name(message: messages.ClientMessage) -> str:
+    return message.action if isinstance(message, messages.BridgeAction) else message.TYPE
 
 
 class Client:
@@ -60,12 +120,9 @@ class Client:
         requests: RequestHandler,
     ) -> None:
         self.number = number
-        self._socket = socket
-        self._request = request
-        self._settings = settings
-        self._token = token
-        self._jog = jog
-        self._requests = requests
+        self._socket, self._request = socket, request
+        self._settings, self._token = settings, token
+        self._jog, self._requests = jog, requests
         self._outbox = Outbox()
         self._wake = asyncio.Event()
         self._can_command = False
@@ -103,7 +160,7 @@ class Client:
             parsed = self._read(message.type, message.data)
         except (asyncio.TimeoutError, InvalidInputError):
             parsed = None
-        if not isinstance(parsed, Hello):
+        if not isinstance(parsed, messages.Hello):
             await self._socket.close(code=1008, message=b"expected hello first")
             return False
         self._can_command = same_token(parsed.token, self._token)
@@ -118,10 +175,10 @@ class Client:
         )
         return True
 
-    def _read(self, kind: WSMsgType, data: Any) -> ClientMessage:
+    def _read(self, kind: WSMsgType, data: Any) -> messages.ClientMessage:
         if kind is not WSMsgType.TEXT:
             raise InvalidInputError("message", kind.name.lower(), "text")
-        return parse_client_message(data, self._settings.max_speed)
+        return messages.parse_client_message(data, self._settings.max_speed)
 
     async def _on_message(self, kind: WSMsgType, data: Any) -> None:
         now = asyncio.get_running_loop().time()
@@ -131,11 +188,11 @@ class Client:
             parsed = self._read(kind, data)
             if exceeded and parsed != EMERGENCY_STOP:
                 raise InvalidInputError("messages", f"{self._message_count} in a second", f"at most {MAX_MESSAGE_RATE}")
-            if isinstance(parsed, Acknowledge):
+            if isinstance(parsed, messages.Acknowledge):
                 self._outbox.acknowledge(parsed.kind)
                 self._wake.set()
             elif not self._can_command:
-                if not isinstance(parsed, Visibility):
+                if not isinstance(parsed, messages.Visibility):
                     raise InvalidInputError("token", "none", "the one in the console's address: this page only watches")
             else:
                 await self._dispatch(parsed, now)
@@ -145,24 +202,24 @@ class Client:
             if self._excess > MAX_EXCESS_MESSAGES:
                 await self._socket.close(code=1008, message=b"too many messages")
 
-    async def _dispatch(self, message: ClientMessage, now: float) -> None:
-        if isinstance(message, Jog):
+    async def _dispatch(self, message: messages.ClientMessage, now: float) -> None:
+        if isinstance(message, messages.Jog):
             await self._on_jog(message, now)
-        elif isinstance(message, EndJog):
+        elif isinstance(message, messages.EndJog):
             self._jog.end_jog(self.number)
-        elif isinstance(message, AcquireControl):
+        elif isinstance(message, messages.AcquireControl):
             refusal = self._jog.acquire_control(self.number)
             self._reply("result", request=message.TYPE, refusal=refusal)
-        elif isinstance(message, ReleaseControl):
+        elif isinstance(message, messages.ReleaseControl):
             self._jog.release_control(self.number)
-        elif isinstance(message, Visibility):
+        elif isinstance(message, messages.Visibility):
             self._jog.set_visible(self.number, message.visible)
-        elif not isinstance(message, (Hello, Acknowledge)):
+        elif not isinstance(message, (messages.Hello, messages.Acknowledge)):
             self._requests.start(
                 self.number, message, lambda name, refusal: self._reply("result", request=name, refusal=refusal)
             )
 
-    async def _on_jog(self, message: Jog, now: float) -> None:
+    async def _on_jog(self, message: messages.Jog, now: float) -> None:
         delay = self._delay.update(message.sent, now)
         if delay <= self._settings.hold_timeout:
             self._last_in_time = now

@@ -4,16 +4,27 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar, NoReturn
+from dataclasses import dataclass, field
+from dataclasses import fields as dataclass_fields
+from typing import Any, ClassVar, NoReturn, cast
 
-from magnetosuture_thread.console.dead_man import Velocity
+from magnetosuture_thread.console.jog_controller import Velocity
 from magnetosuture_thread.errors import InvalidInputError
 
 MAX_MESSAGE_CHARS = 4096
 MAX_SHOWN_CHARS = 60  # of an invalid value in the error
-ACTIONS = ("arm", "disarm", "stop", "reset")
+
+
+def _text() -> Any:
+    return field(metadata={"valid": lambda value: isinstance(value, str), "expected": "a text"})
+
+
+def _switch() -> Any:
+    return field(metadata={"valid": lambda value: isinstance(value, bool), "expected": "true or false"})
+
+
+def _choice(*choices: str) -> Any:
+    return field(metadata={"valid": lambda value: value in choices, "expected": "one of " + ", ".join(choices)})
 
 
 class ClientMessage:
@@ -25,13 +36,22 @@ class ClientMessage:
 
     TYPE: ClassVar[str]
 
+    @classmethod
+    def parse(cls, fields: dict[str, Any], max_speed: float) -> ClientMessage:
+        """Return the message of these fields; see `parse_client_message`."""
+        values = {own.name: (fields.get(own.name), own.metadata) for own in dataclass_fields(cast(Any, cls))}
+        for name, (value, metadata) in values.items():
+            if not metadata["valid"](value):
+                raise _refusal(name, value, metadata["expected"])
+        return cls(**{name: value for name, (value, _) in values.items()})
+
 
 @dataclass(frozen=True)
 class Hello(ClientMessage):
     """First message of a page, with the token; empty for a page that only watches."""
 
     TYPE = "hello"
-    token: str
+    token: str = _text()
 
 
 @dataclass(frozen=True)
@@ -47,6 +67,11 @@ class Jog(ClientMessage):
     velocity: Velocity
     sent: float
 
+    @classmethod
+    def parse(cls, fields: dict[str, Any], max_speed: float) -> Jog:
+        """Return the message of these fields; see `parse_client_message`."""
+        return cls(_velocity(fields, max_speed), _finite("sent", fields.get("sent")))
+
 
 @dataclass(frozen=True)
 class EndJog(ClientMessage):
@@ -60,7 +85,7 @@ class Acknowledge(ClientMessage):
     """Receipt of a state or a camera frame; the next may be sent."""
 
     TYPE = "acknowledge"
-    kind: str
+    kind: str = _choice("state", "frame")
 
 
 @dataclass(frozen=True)
@@ -68,7 +93,7 @@ class Visibility(ClientMessage):
     """Whether the page is visible or hidden."""
 
     TYPE = "visibility"
-    visible: bool
+    visible: bool = _switch()
 
 
 @dataclass(frozen=True)
@@ -90,7 +115,7 @@ class BridgeAction(ClientMessage):
     """Request to the coil bridge: arm, disarm, stop or reset."""
 
     TYPE = "bridge_action"
-    action: str
+    action: str = _choice("arm", "disarm", "stop", "reset")
 
 
 @dataclass(frozen=True)
@@ -98,7 +123,7 @@ class SelectSetup(ClientMessage):
     """Request to run another setup."""
 
     TYPE = "select_setup"
-    setup: str
+    setup: str = _text()
 
 
 @dataclass(frozen=True)
@@ -106,7 +131,7 @@ class Pause(ClientMessage):
     """Request to pause or resume time."""
 
     TYPE = "pause"
-    paused: bool
+    paused: bool = _switch()
 
 
 @dataclass(frozen=True)
@@ -114,7 +139,7 @@ class RecordBag(ClientMessage):
     """Request to start or end a recording."""
 
     TYPE = "record"
-    recording: bool
+    recording: bool = _switch()
 
 
 def parse_client_message(text: str, max_speed: float) -> ClientMessage:
@@ -131,10 +156,9 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     """
     fields = _object(text)
     kind = fields.pop("type", None)
-    parse = _PARSERS.get(kind) if isinstance(kind, str) else None
-    if parse is None:
-        raise _refusal("type", kind, f"one of {', '.join(_PARSERS)}")
-    return parse(fields, max_speed)
+    if not isinstance(kind, str) or kind not in _TYPES:
+        raise _refusal("type", kind, f"one of {', '.join(_TYPES)}")
+    return _TYPES[kind].parse(fields, max_speed)
 
 
 def _refusal(name: str, value: object, expectation: str) -> InvalidInputError:
@@ -170,12 +194,8 @@ def _finite(name: str, value: object) -> float:
     raise _refusal(name, type(value).__name__ if isinstance(value, int) else value, "a finite number")
 
 
-def _number(fields: dict[str, Any], name: str) -> float:
-    return _finite(name, fields.get(name))
-
-
 def _velocity(fields: dict[str, Any], max_speed: float) -> Velocity:
-    direction, speed = fields.get("direction"), _number(fields, "speed")
+    direction, speed = fields.get("direction"), _finite("speed", fields.get("speed"))
     if not isinstance(direction, list) or len(direction) != 2:
         raise _refusal("direction", direction, "a list of two numbers")
     x, y = _finite("direction", direction[0]), _finite("direction", direction[1])
@@ -187,37 +207,4 @@ def _velocity(fields: dict[str, Any], max_speed: float) -> Velocity:
     return x * factor, y * factor
 
 
-def _text(fields: dict[str, Any], name: str) -> str:
-    value = fields.get(name)
-    if not isinstance(value, str):
-        raise _refusal(name, value, "a text")
-    return value
-
-
-def _choice(fields: dict[str, Any], name: str, choices: tuple[str, ...]) -> str:
-    value = fields.get(name)
-    if not isinstance(value, str) or value not in choices:
-        raise _refusal(name, value, "one of " + ", ".join(choices))
-    return value
-
-
-def _switch(fields: dict[str, Any], name: str) -> bool:
-    value = fields.get(name)
-    if not isinstance(value, bool):
-        raise _refusal(name, value, "true or false")
-    return value
-
-
-_PARSERS: dict[str, Callable[[dict[str, Any], float], ClientMessage]] = {
-    Hello.TYPE: lambda fields, _: Hello(_text(fields, "token")),
-    Jog.TYPE: lambda fields, max_speed: Jog(_velocity(fields, max_speed), _number(fields, "sent")),
-    EndJog.TYPE: lambda *_: EndJog(),
-    Acknowledge.TYPE: lambda fields, _: Acknowledge(_choice(fields, "kind", ("state", "frame"))),
-    Visibility.TYPE: lambda fields, _: Visibility(_switch(fields, "visible")),
-    AcquireControl.TYPE: lambda *_: AcquireControl(),
-    ReleaseControl.TYPE: lambda *_: ReleaseControl(),
-    BridgeAction.TYPE: lambda fields, _: BridgeAction(_choice(fields, "action", ACTIONS)),
-    SelectSetup.TYPE: lambda fields, _: SelectSetup(_text(fields, "setup")),
-    Pause.TYPE: lambda fields, _: Pause(_switch(fields, "paused")),
-    RecordBag.TYPE: lambda fields, _: RecordBag(_switch(fields, "recording")),
-}
+_TYPES: dict[str, type[ClientMessage]] = {kind.TYPE: kind for kind in ClientMessage.__subclasses__()}

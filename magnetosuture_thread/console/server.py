@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import gc
+from importlib.resources import files
 
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
 from magnetosuture_thread.console.access import host_refusal, is_any, new_token, origin_refusal, page_url
-from magnetosuture_thread.console.client import Client
+from magnetosuture_thread.console.client import Client, RequestHandler
 from magnetosuture_thread.console.graph import Graph, Host
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.console.outbox import encode_frame, encode_state
-from magnetosuture_thread.console.pages import HEADERS, page_files
-from magnetosuture_thread.console.requests import RequestHandler
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 
@@ -22,6 +21,18 @@ MAX_CLIENTS = 16
 MAX_MESSAGE_BYTES = 65536  # beyond, the connection is closed before the whole message is read
 FRAME_POLL_PERIOD = 0.005  # of the check for a new camera frame [s]
 HEARTBEAT_PERIOD = 5.0  # a page that does not answer a ping within half of this is disconnected [s]
+CONTENT_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
 
 
 class ConsoleServer:
@@ -103,7 +114,8 @@ class ConsoleServer:
         found = self._files.get(request.path)
         if found is None:
             return web.Response(status=404, text="there is no such file")
-        return web.Response(body=found.body, content_type=found.content_type, charset="utf-8")
+        content_type, body = found
+        return web.Response(body=body, content_type=content_type, charset="utf-8")
 
     async def _connect(self, request: web.Request) -> web.StreamResponse:
         refusal = origin_refusal(request.headers.get("Origin", ""), request.headers.get("Host", ""))
@@ -152,3 +164,14 @@ class ConsoleServer:
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
     response.headers.update(HEADERS)
+
+
+def page_files() -> dict[str, tuple[str, bytes]]:
+    """Return MIME type and content of the page's files by the path of their URL; `/` is the page itself."""
+    result = {}
+    for entry in files("magnetosuture_thread.console").joinpath("page").iterdir():
+        kind = CONTENT_TYPES.get(entry.name[entry.name.rfind(".") :])
+        if kind is not None:
+            result[f"/{entry.name}"] = kind, entry.read_bytes()
+    result["/"] = result.pop("/index.html")
+    return result

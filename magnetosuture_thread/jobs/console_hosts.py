@@ -1,20 +1,26 @@
-"""Hosts of the operator page: on a running graph, or around a simulated rig."""
+"""Hosts of the operator page: on a running graph, or around a simulated rig; both record bags."""
 
 from __future__ import annotations
 
 import asyncio
+import queue
+import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import GraphError, MagnetosutureError
 from magnetosuture_thread.interface import NODES, PROCESSES, SCENE_SERVER
-from magnetosuture_thread.jobs.console_recording import BagRecording, new_name
-from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE, SLOWER_BRIDGE, START_TIMEOUT, Log
+from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log
+from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE, START_TIMEOUT
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console_graph import ConsoleGraph
 from magnetosuture_thread.nodes.console_host import RIG, GraphHost
@@ -26,6 +32,106 @@ from magnetosuture_thread.setups import Setup, read_setup
 # go before the browser and the rig, and behind the bridge.
 PREFERRED, PRIORITY = "perception", 5
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
+
+
+class BagRecording:
+    """Records a bag, in a thread of its own so that a slow disk delays neither jogging nor stopping.
+
+    Args:
+        output: the bag's folder; it is there, whole, once the recording has ended.
+        notes: of the bag.
+        graph: that is recorded.
+        recorded: topics that are recorded.
+    """
+
+    def __init__(
+        self, output: Path, notes: Mapping[str, str], graph: ConsoleGraph, recorded: Sequence[topics.Topic]
+    ) -> None:
+        self.output = output
+        self._notes = notes
+        self._graph = graph
+        self._topics = recorded
+        self._tapping: asyncio.Task[None] | None = None
+        self._waiting: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
+        self._begun: Future[None] = Future()
+        self._ended: Future[None] = Future()
+
+    @property
+    def running(self) -> bool:
+        """Whether it has begun, and nobody has called `end`."""
+        return self._tapping is not None
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has ended, by `end` or because the disk is full."""
+        return self._ended.done()
+
+    async def begin(self) -> None:
+        """Begin to record.
+
+        Raises:
+            BagError: the output exists or cannot be written.
+        """
+        threading.Thread(target=self._run, name="recording").start()
+        await asyncio.wrap_future(self._begun)
+        self._tapping = asyncio.create_task(self._tap())
+
+    async def end(self) -> None:
+        """End, once all messages are written.
+
+        Raises:
+            BagError: the disk is full or fails; what was recorded before is there.
+        """
+        tapping, self._tapping = self._tapping, None
+        if tapping is not None:
+            tapping.cancel()
+            with suppress(asyncio.CancelledError):
+                await tapping
+        self._waiting.put(None)
+        await asyncio.wrap_future(self._ended)
+
+    async def _tap(self) -> None:
+        """Queue all messages for the thread until cancelled."""
+        tap = ConsoleTap(self._graph.node, self._topics, None, self._put)
+        try:
+            await tap.run()
+        finally:
+            tap.close()
+
+    def _put(self, topic: str, arrival: int, data: bytes) -> None:
+        if not self.ended:
+            self._waiting.put((topic, arrival, data))
+
+    def _run(self) -> None:
+        try:
+            self._write()
+        except MagnetosutureError as error:
+            if not self._begun.done():
+                self._begun.set_exception(error)
+            self._ended.set_exception(error)
+        else:
+            self._ended.set_result(None)
+
+    def _write(self) -> None:
+        with (
+            whole_folder(self.output, is_recording=True) as folder,
+            BagWriter(folder, self._notes, name=self.output.name) as bag,
+        ):
+            for topic in self._topics:
+                bag.add_topic(topic.channel.recorded, topic.channel.type_name)
+            self._begun.set_result(None)
+            while (message := self._waiting.get()) is not None:
+                bag.write(*message)
+
+
+def new_name(folder: Path, name: str) -> Path:
+    """Return a folder that does not exist yet for a recording, named by the time and the setup."""
+    stem = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}".rstrip("_")
+    output, count = folder / stem, 1
+    while output.exists():
+        count += 1
+        output = folder / f"{stem}_{count}"
+    return output
 
 
 class RecordingHost(GraphHost):
@@ -45,8 +151,6 @@ class RecordingHost(GraphHost):
         self.log = log
         self._recordings = recordings
         self._recording: BagRecording | None = None
-        self._tap: ConsoleTap | None = None
-        self._tapping: asyncio.Task[None] | None = None
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
@@ -63,7 +167,7 @@ class RecordingHost(GraphHost):
     def notes(self) -> dict[str, str]:
         """Return the notes of a recording."""
         text = self.setup.path.read_text(encoding="utf-8")
-        notes = {"setup": self.setup.name, SCENARIO_NOTE: text}
+        notes = {"setup": self.setup.name, SETUP_NOTE: text}
         if self.graph.is_active(RIG):
             notes["simulated"] = f"the whole rig, jogged by an operator, setup {self.setup.name}"
         return notes
@@ -80,22 +184,19 @@ class RecordingHost(GraphHost):
         if self.busy:
             return self.busy
         raw = self.graph.settings.image_transport == "raw"
-        taken = [topic for topic in RECORDED_TOPICS if topic is not topics.IMAGE or raw]
-        channels = [topic.channel for topic in taken]
-        bag = BagRecording(new_name(self._recordings, self.setup.name), self.notes, channels)
-        self._recording = bag
+        recorded = [topic for topic in RECORDED_TOPICS if topic is not topics.IMAGE or raw]
+        output = new_name(self._recordings, self.setup.name)
+        bag = self._recording = BagRecording(output, self.notes, self.graph, recorded)
         try:
             await bag.begin()
         except MagnetosutureError as error:
             self._recording = None
             return str(error)
-        self._tap = ConsoleTap(self.graph.node, taken, None, bag.add)
-        self._tapping = asyncio.create_task(self._tap.run())
         self.log(f"recording to {bag.output}")
         return ""
 
     async def watch(self) -> None:
-        """Look after what runs; called several times a second.
+        """Check what runs; called several times a second.
 
         Raises:
             GraphError: a node has ended.
@@ -104,19 +205,14 @@ class RecordingHost(GraphHost):
             await self._end_recording()
 
     async def close(self) -> None:
-        """End what was begun."""
+        """End the recording."""
         await self._end_recording()
 
     async def _end_recording(self) -> str:
-        """End the recording, if there is one; return what became of it if it is not as it should be."""
-        recording, tap, tapping = self._recording, self._tap, self._tapping
-        if recording is None or tap is None or tapping is None:
+        """End the recording, if there is one; return the problem if it is not complete."""
+        recording = self._recording
+        if recording is None or not recording.running:
             return ""
-        self._tap = self._tapping = None
-        tapping.cancel()
-        with suppress(asyncio.CancelledError):
-            await tapping
-        tap.close()
         try:
             await recording.end()
         except MagnetosutureError as error:
@@ -166,7 +262,7 @@ class SimulatedHost(RecordingHost):
         return {**super().state(), "setup": self._setup_name, "setups": list(self._setups), "simulated": True}
 
     def start(self) -> None:
-        """Start the nodes; they are busy until each of them has said something of itself."""
+        """Start the nodes; they are busy until each of them has reported its state."""
         arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS]
         # Here and not in another thread: the nodes end with the thread that has started them.
         processes = (SCENE_SERVER, RIG, *PROCESSES)
@@ -233,5 +329,5 @@ class SimulatedHost(RecordingHost):
 
 
 def served_as(settings: ConsoleSettings, other: ConsoleSettings) -> ConsoleSettings:
-    """Return a set-up's settings with address, port and token as they are served."""
+    """Return a setup's settings with address, port and token as they are served."""
     return replace(settings, address=other.address, port=other.port, token=other.token)

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from magnetosuture_thread.bags.bag_files import STORAGE_SUFFIXES, find_bag_files
 from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
 from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv, table_json
-from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable_path
-from magnetosuture_thread.jobs.frames import numbered
+from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag, printable_path
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.workers import WorkerDiedError, run_all
+from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress
+from magnetosuture_thread.jobs.track import numbered
 from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 DEPTH = 2  # folders below the one that is given, in which bags are looked for
 MAX_NAME_BYTES = 200  # bytes
-
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -30,24 +32,30 @@ class Task:
     Attributes:
         path: of the bag.
         name: of its report.
-        options: how.
         page: the file to write.
+        against: what predictions are compared with.
+        formulation: of the model.
+        selection: what of the bag is read.
     """
 
     path: Path
     name: str
-    options: Options
     page: Path
+    against: str
+    formulation: str
+    selection: BagSelection
 
 
 def evaluate_bags(
     paths: Sequence[Path],
     output: Path,
-    options: Options,
     *,
+    against: str = "auto",
+    formulation: str = "",
     workers: int = 1,
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
+    **selection: Unpack[BagSelection],
 ) -> list[Row]:
     """Evaluate bags, each for itself.
 
@@ -58,35 +66,38 @@ def evaluate_bags(
     Args:
         paths: bags, or folders of bags.
         output: folder to make.
-        options: how.
+        against: `truth` or `seen` (measured); `auto`: both where present.
+        formulation: of the model; the setup's if empty.
         workers: processes.
         log: called with a line for a person.
         progress: called with the share done, 0 to 1.
+        selection: what of the bags is read.
 
     Returns:
         The rows of the table, in the order of the bags.
 
     Raises:
         BagError: there are no bags, or the output exists or cannot be written.
-        ConfigurationError: the set-up that was asked for cannot be used.
+        ConfigurationError: the setup that was asked for cannot be used.
     """
-    if options.setup:
-        read_setup(options.setup)  # what is wrong for all is said before anything is done
+    if setup_name := selection.get("setup_name"):
+        read_setup(setup_name)  # refuses what is wrong for all before anything is done
     bags = find_bags(paths)
     names = numbered([_name(bag) for bag in bags], "{}-{}")
     rows: dict[int, Row] = {}
     with whole_folder(output) as folder:
-        tasks = [Task(bag, name, options, folder / f"{name}.html") for bag, name in zip(bags, names, strict=True)]
-
-        def done(index: int, result: Row | WorkerDiedError) -> None:
-            task = tasks[index]
-            row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
-            if row["problem"]:
-                task.page.unlink(missing_ok=True)
-                log(f"{task.name}: {row['problem']}")
-            rows[index] = row
-
-        run_all(evaluate_one, tasks, workers, done=done, log=log, progress=progress)
+        tasks = [
+            Task(bag, name, folder / f"{name}.html", against, formulation, selection)
+            for bag, name in zip(bags, names, strict=True)
+        ]
+        with WorkerPool(evaluate_one, workers) as pool:
+            for index, result in pool.run(tasks, log, progress):
+                task = tasks[index]
+                row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
+                if row["problem"]:
+                    task.page.unlink(missing_ok=True)
+                    log(f"{task.name}: {row['problem']}")
+                rows[index] = row
         ordered = [rows[index] for index in range(len(tasks))]
         (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
         (folder / "table.json").write_text(table_json(ordered), encoding="utf-8")
@@ -96,9 +107,7 @@ def evaluate_bags(
 def evaluate_one(task: Task, log: Log, progress: Progress) -> Row:
     """Return the row of a bag, with the problem in it if there is one: nothing stops the others."""
     try:
-        return evaluate_bag(
-            task.path, task.name, task.options, task.page, lambda text: log(f"{task.name}: {text}"), progress
-        )
+        return evaluate_bag(**vars(task), log=lambda text: log(f"{task.name}: {text}"), progress=progress)
     except MagnetosutureError as error:
         return _failed(task, str(error))
     except Exception as error:  # A mistake of ours, or of a package: this bag's alone.
@@ -147,13 +156,10 @@ def _bags(path: Path, depth: int) -> list[Path]:
     except (OSError, ValueError) as error:
         raise BagError(path, f"cannot be read: {error}") from None
     files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
-    if (path / "metadata.yaml").is_file() or len(files) == 1:
+    if (path / "metadata.yaml").is_file() or len(files) == 1 or (files and _is_one(path)):
         return [path]
-    if files and not _is_one(path):
-        return files + [bag for folder in _folders(inside, depth) for bag in _bags(folder, depth - 1)]
-    if files:
-        return [path]
-    return [bag for folder in _folders(inside, depth) for bag in _bags(folder, depth - 1)]
+    folders = [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
+    return files + [bag for folder in folders for bag in _bags(folder, depth - 1)]
 
 
 def _is_one(path: Path) -> bool:
@@ -165,26 +171,22 @@ def _is_one(path: Path) -> bool:
     return True
 
 
-def _folders(inside: list[Path], depth: int) -> list[Path]:
-    return [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
-
-
-def is_reference(path: Path) -> bool:
-    """Return whether a path is a reference trajectory, or a folder of them, and no bag."""
-    try:
-        return path.suffix == ".npz" if path.is_file() else any(path.glob("*.npz"))
-    except OSError:
-        return False
-
-
 def kind_of(paths: Sequence[Path]) -> str:
     """Return `references` or `bags`.
 
     Raises:
         ConfigurationError: there are both.
     """
-    kinds = {path: is_reference(path) for path in paths}
-    if len(set(kinds.values())) > 1:
-        reference = next(str(path) for path, is_one in kinds.items() if is_one)
-        raise ConfigurationError("PATH", reference, "bags alone, or reference trajectories alone, in one call")
-    return "references" if kinds[paths[0]] else "bags"
+    references = [path for path in paths if _is_reference(path)]
+    if 0 < len(references) < len(paths):
+        expected = "bags alone, or reference trajectories alone, in one call"
+        raise ConfigurationError("PATH", str(references[0]), expected)
+    return "references" if references else "bags"
+
+
+def _is_reference(path: Path) -> bool:
+    """Return whether a path is a reference trajectory, or a folder of them, and no bag."""
+    try:
+        return path.suffix == ".npz" if path.is_file() else any(path.glob("*.npz"))
+    except OSError:
+        return False

@@ -1,31 +1,33 @@
-"""One evaluated bag: predicted without a graph, judged, and written as a page."""
+"""Evaluation of one bag: predictions without a graph, latencies of the recorded graph, and the page."""
 
 from __future__ import annotations
 
 import platform
+from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.recording import CHANNELS
+from magnetosuture_thread.bags.reader import RecordedMessage
+from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.bag_table import Row, row_of
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation
-from magnetosuture_thread.evaluation.metrics import RunMetrics
-from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures
+from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures, LiveFigures
 from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, ReportPicture, draw_worst_frame
 from magnetosuture_thread.evaluation.series import WorstFrame
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import DISH_FRAME, GROUND_TRUTH_THREAD, MEASURED_THREAD, PREDICTED_THREAD
-from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions, live_figures
-from magnetosuture_thread.jobs.replay_inputs import Given, opened
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.interface import CURRENTS, GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD
+from magnetosuture_thread.jobs.replay_inputs import BagInput, BagSelection, Log, Progress, open_bag
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.model.settings import ThreadModelSettings
@@ -33,39 +35,23 @@ from magnetosuture_thread.offline.observations import NOT_FOUND, ObservationRead
 from magnetosuture_thread.offline.predictions import predictions
 from magnetosuture_thread.vision.tracker import VisionTracker
 
-AGAINST = ("auto", "truth", "seen")
 SOFTWARE = ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless")
 
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
+LATENT = dict(zip((NEEDLE_POSE, PREDICTED_THREAD, CURRENTS), STAGES, strict=True))
+MAX_LATENCY = 10.0  # s; a median beyond is of two clocks
+MAX_WAITING = 600  # recorded predictions that may wait for their frame
 
 
-@dataclass(frozen=True)
-class Options:
-    """How bags are evaluated.
-
-    Attributes:
-        setup: name or path of the set-up; the one that each bag names if empty.
-        against: `truth` or `seen`; `auto`: both where present.
-        source: `camera` or `poses`; `auto`: the camera where there are frames.
-        remap: other names for topics of the bags, each as old name and new.
-        frame: the bags' name of the dish frame.
-        formulation: of the model; the set-up's if empty.
-        start: seconds into each bag to begin at.
-        duration: [s]; to each bag's end if None.
-    """
-
-    setup: str = ""
-    against: str = "auto"
-    source: str = "auto"
-    remap: tuple[tuple[str, str], ...] = ()
-    frame: str = DISH_FRAME
-    formulation: str = ""
-    start: float = 0.0
-    duration: float | None = None
-
-
-def evaluate_bag(path: Path, name: str, options: Options, page: Path, log: Log, progress: Progress) -> Row:
+def evaluate_bag(
+    path: Path,
+    name: str,
+    page: Path,
+    against: str,
+    formulation: str,
+    selection: BagSelection,
+    log: Log,
+    progress: Progress,
+) -> Row:
     """Evaluate a bag, write its page and return its row of the table.
 
     Of each frame some numbers are kept, and of a few frames the threads: memory grows by 130 bytes a frame.
@@ -73,32 +59,24 @@ def evaluate_bag(path: Path, name: str, options: Options, page: Path, log: Log, 
     Args:
         path: of the bag.
         name: of the report.
-        options: how.
         page: the file to write.
+        against: `truth` or `seen` (measured); `auto`: both where present.
+        formulation: of the model; the setup's if empty.
+        selection: what of the bag is read.
         log: called with a line for a person.
         progress: called with the share done, 0 to 1.
 
     Raises:
         BagError: the bag cannot be used, or nothing in it was predicted.
-        ConfigurationError: the set-up cannot be used.
+        ConfigurationError: the setup cannot be used.
     """
-    with opened(
-        path,
-        setup_name=options.setup,
-        source=options.source,
-        start=options.start,
-        duration=options.duration,
-        remap=dict(options.remap),
-        frame=options.frame,
-        log=log,
-    ) as given:
+    with open_bag(path, log, **selection) as given:
         model = given.setup.model
-        if options.formulation:
-            model = replace(model, formulation=options.formulation)
+        model = replace(model, formulation=formulation or model.formulation)
         recorded = bool(given.recording.counts.get(PREDICTED_THREAD.recorded))
-        targets = _targets(given, options.against)
+        targets = _targets(given, against)
         metrics = RunMetrics(model.thread_length, given.recording.start, targets, recorded=recorded)
-        seen = _Looked(given, metrics, lambda share: progress(0.95 * share))
+        seen = _MeteredReader(given, metrics, lambda share: progress(0.95 * share))
         refused = _predict(given, model, metrics, seen)
         figures = BagFigures.of(metrics, live_figures(given.recording, given.start, given.duration))
         about = _about(given, name, model, refused, seen.thread_problem())
@@ -112,25 +90,25 @@ def evaluate_bag(path: Path, name: str, options: Options, page: Path, log: Log, 
     return row_of(about, figures)
 
 
-class _Looked(ObservationReader):
-    """A bag's sights, each of which the metrics take as it goes by; what else the bag says goes to the model."""
+class _MeteredReader(ObservationReader):
+    """Observations of a bag, each of which is added to the metrics."""
 
-    def __init__(self, given: Given, metrics: RunMetrics, progress: Progress) -> None:
+    def __init__(self, given: BagInput, metrics: RunMetrics, progress: Progress) -> None:
         super().__init__(given.recording, given.setup, given.source, given.start, given.duration, progress)
         self._metrics = metrics
 
     def __next__(self) -> Observation:
-        """Return the next sight."""
-        sight = super().__next__()
-        self._metrics.observe(sight)
-        return sight
+        """Return the next observation."""
+        observation = super().__next__()
+        self._metrics.observe(observation)
+        return observation
 
 
-def _targets(given: Given, against: str) -> list[str]:
-    """Return what the predictions are held against.
+def _targets(given: BagInput, against: str) -> list[str]:
+    """Return what the predictions are compared with.
 
     Raises:
-        BagError: the bag does not hold what was asked for.
+        BagError: the bag does not hold it.
     """
     counts = given.recording.counts
     there = {
@@ -143,7 +121,7 @@ def _targets(given: Given, against: str) -> list[str]:
     return [target for target, is_there in there.items() if is_there and against in ("auto", target)]
 
 
-def _predict(given: Given, model: ThreadModelSettings, metrics: RunMetrics, seen: ObservationReader) -> Counter[str]:
+def _predict(given: BagInput, model: ThreadModelSettings, metrics: RunMetrics, seen: ObservationReader) -> Counter[str]:
     """Go through a bag once; return what was refused, by why."""
     recorded = RecordedPredictions(given.recording, given.start, given.duration)
     refused = Counter[str]()
@@ -170,7 +148,7 @@ def _kind(problem: Exception) -> str:
     return "the model: a program that was not solved"
 
 
-def _pictures(given: Given, model: ThreadModelSettings, metrics: RunMetrics) -> list[ReportPicture]:
+def _pictures(given: BagInput, model: ThreadModelSettings, metrics: RunMetrics) -> list[ReportPicture]:
     worst = metrics.worst_frames()
     photos = _photos(given, worst)
     return [
@@ -186,7 +164,7 @@ def _pictures(given: Given, model: ThreadModelSettings, metrics: RunMetrics) -> 
     ]
 
 
-def _photos(given: Given, worst: list[WorstFrame]) -> dict[int, Photo]:
+def _photos(given: BagInput, worst: list[WorstFrame]) -> dict[int, Photo]:
     """Return the camera images of the worst frames, by stamp; of a frame without a dish the view is that of another."""
     wanted = {each.frame.stamp for each in worst}
     camera = given.recording.camera
@@ -212,7 +190,7 @@ def _photos(given: Given, worst: list[WorstFrame]) -> dict[int, Photo]:
     return {stamp: Photo(image, views.get(stamp, spare)) for stamp, image in images.items()}
 
 
-def _about(given: Given, name: str, model: ThreadModelSettings, refused: Counter[str], problem: str) -> BagDetails:
+def _about(given: BagInput, name: str, model: ThreadModelSettings, refused: Counter[str], problem: str) -> BagDetails:
     recording, setup = given.recording, given.setup
     return BagDetails(
         name=name,
@@ -259,3 +237,86 @@ def printable_path(text: str) -> str:
     """Return a text of one line that can be written as UTF-8 and shown, whatever bytes a file's name is made of."""
     decoded = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in decoded)
+
+
+def live_figures(recording: Recording, start: float, duration: float | None) -> LiveFigures:
+    """Return the latencies of a recorded graph: from a stamp to when the first message about it was recorded.
+
+    Args:
+        recording: the bag.
+        start: seconds into the bag to begin at.
+        duration: [s]; to the bag's end if None.
+
+    Raises:
+        BagError: the bag has changed since it was opened.
+    """
+    there = [channel for channel in LATENT if recording.counts.get(channel.recorded)]
+    if not there:
+        return LiveFigures()
+    if "replayed" in recording.notes:
+        return LiveFigures(remark="not measured: the bag was replayed")
+    latencies = {channel.recorded: array("d") for channel in there}
+    latest: dict[str, int] = {}
+    for record in recording.records(there, start=start, duration=duration):
+        stamp = _stamp(record)
+        if stamp > latest.get(record.topic, 0):  # the first about each
+            latest[record.topic] = stamp
+            latencies[record.topic].append((record.time - stamp) * 1e-9)
+    percentiles = {LATENT[channel]: Percentiles.of(latencies[channel.recorded]) for channel in there}
+    found = {stage: each for stage, each in percentiles.items() if each is not None}
+    if any(not 0.0 <= each.median <= MAX_LATENCY for each in found.values()):
+        return LiveFigures(remark="not measured: stamps and times of recording are of two clocks")
+    if all(each.maximum == 0.0 for each in found.values()):
+        return LiveFigures(remark="not measured: the bag was made offline")
+    return LiveFigures(found)
+
+
+def _stamp(record: RecordedMessage) -> int:
+    """Return the stamp of what a message answers [ns]; 0 for currents that answer no command or are broken."""
+    if record.topic != CURRENTS.recorded:
+        return stamp_of(record)
+    try:
+        message = record.decode()
+    except BagError:
+        return 0
+    return 0 if message.stop else int(message.command.sec * 1_000_000_000 + message.command.nanosec)
+
+
+class RecordedPredictions:
+    """Gives the predictions that a bag holds, one by one, beside those made now; few are held at a time.
+
+    Args:
+        recording: the bag.
+        start: seconds into the bag to begin at.
+        duration: [s]; to the bag's end if None.
+    """
+
+    def __init__(self, recording: Recording, start: float, duration: float | None) -> None:
+        there = bool(recording.counts.get(PREDICTED_THREAD.recorded))
+        channels = [PREDICTED_THREAD] if there else []
+        self._records: Iterator[RecordedMessage] = recording.records(channels, start=start, duration=duration)
+        self._held: dict[int, RecordedMessage] = {}
+        self._latest = -1
+
+    def of(self, stamp: int) -> Points | None:
+        """Return the recorded prediction of a frame, shape (n + 1, 2) [m]; None if there is none.
+
+        Args:
+            stamp: of the frame [ns], not before those asked for until now.
+        """
+        while self._latest < stamp and len(self._held) < MAX_WAITING:
+            record = next(self._records, None)
+            if record is None:
+                break
+            self._latest = max(self._latest, at := stamp_of(record))
+            if at >= stamp:  # those before were of frames that nobody asked for
+                self._held[at] = record
+        found = self._held.pop(stamp, None)
+        self._held = {at: record for at, record in self._held.items() if at > stamp}
+        if found is None:
+            return None
+        try:
+            vertices = np.array([[point.x, point.y] for point in found.decode().positions])
+        except BagError:
+            return None
+        return vertices if vertices.shape[0] > 1 and np.isfinite(vertices).all() else None

@@ -1,15 +1,15 @@
-"""The job `magnetosuture record`: a bag of simulated camera frames, or of poses, from a reference trajectory."""
+"""The job `magnetosuture render`: a bag of simulated camera frames, or of poses, from a reference trajectory."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread import interface
 from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
@@ -17,21 +17,10 @@ from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.interface import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    GROUND_TRUTH_NEEDLE,
-    GROUND_TRUTH_THREAD,
-    MEASURED_THREAD,
-    NEEDLE_COMMAND,
-    NEEDLE_POSE,
-    SCENE,
-    Channel,
-)
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.model.thread import Attachment
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import CameraScene as CameraScene
+from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.setups import Setup
 
 SIZE = (640, 480)
@@ -58,8 +47,8 @@ def render_bag(
 ) -> int:
     """Write a trajectory as a bag; return the number of frames, or of poses.
 
-    The bag begins with the scene. It holds JPEG frames and camera_info, or in their place needle poses and seen
-    threads; besides, the needle velocity command that the trajectory amounts to, and the truth on topics of its own.
+    The bag begins with the scene. It holds JPEG frames and camera_info, or in their place needle poses and measured
+    threads; besides, the needle velocity command that the trajectory amounts to, and ground truth on topics of its own.
     All of it is simulated, and the bag's notes say so.
 
     Args:
@@ -71,14 +60,14 @@ def render_bag(
         rate: frames, or poses, a second.
         quality: of the JPEG frames, 1 to 100.
         seed: of dust and noise.
-        poses: whether poses and seen threads take the place of frames.
-        noise: of these, standard deviation of tail and seen thread [m]; of the heading, the same over the needle's
+        poses: whether poses and measured threads take the place of frames.
+        noise: of these, standard deviation of tail and measured thread [m]; of the heading, the same over the needle's
             length.
         progress: called with the share done, 0 to 1.
 
     Raises:
         BagError: the output exists or cannot be written, or the trajectory has no such time.
-        ConfigurationError: the set-up is for another thread or another obstacle than the trajectory's.
+        ConfigurationError: the setup is for another thread or another obstacle than the trajectory's.
     """
     first, last = float(reference.times[0]), float(reference.times[-1])
     end = last if duration is None else start + duration
@@ -91,21 +80,32 @@ def render_bag(
     what = "needle poses and seen thread" if poses else "camera frames and needle motion, rendered"
     notes = {"setup": setup.name, "simulated": f"{what} from the reference trajectory {reference.name}"}
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
-        bag.add_topic(SCENE.recorded, SCENE.type_name)
+        source = _PoseTopics(setup, noise, seed) if poses else _FrameTopics(setup, reference, quality, seed)
+        motion = (interface.NEEDLE_COMMAND, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD)
+        channels = (*source.channels, *motion)
+        for channel in (interface.SCENE, *channels):
+            bag.add_topic(channel.recorded, channel.type_name)
         begin = round((start + EPOCH) * 1e9)
-        bag.write_message(SCENE.recorded, begin, MESSAGES.scene_message(begin, setup.scene))
-        topics = _PoseTopics(bag, setup, noise, seed) if poses else _FrameTopics(bag, setup, reference, quality, seed)
+        bag.write_message(interface.SCENE.recorded, begin, MESSAGES.scene_message(begin, setup.scene))
         for index in range(frames):
             time = start + index / rate
             before, after = max(first, time - 0.5 / rate), min(last, time + 0.5 / rate)
             velocity = (reference.at(after)[0] - reference.at(before)[0]) / (after - before)
-            topics.write(round((time + EPOCH) * 1e9), *reference.at(time), velocity)
+            stamp, (tail, heading, thread) = round((time + EPOCH) * 1e9), reference.at(time)
+            instant = (
+                *source.messages(stamp, tail, heading, thread),
+                MESSAGES.twist_message(stamp, velocity),
+                MESSAGES.placed(stamp, tail, heading),
+                MESSAGES.path_message(stamp, _resampled(thread, GROUND_TRUTH_POINTS)),
+            )
+            for channel, message in zip(channels, instant, strict=True):
+                bag.write_message(channel.recorded, stamp, message)
             progress((index + 1) / frames)
     return frames
 
 
 def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
-    """Refuse a set-up that says another thread, attachment or obstacle than the trajectory has."""
+    """Refuse a setup that says another thread, attachment or obstacle than the trajectory has."""
     metadata = reference.metadata
     attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}.get(str(metadata.get("boundary")))
     length = metadata.get("material", {}).get("L_m")
@@ -135,39 +135,12 @@ def _numbers(value: Any) -> NDArray[np.float64]:
     return np.asarray(value, dtype=np.float64)
 
 
-class _Topics(ABC):
-    """Writes what every bag holds of one instant: the command and the truth.
-
-    Args:
-        bag: to write to.
-        channels: besides those.
-    """
-
-    def __init__(self, bag: BagWriter, channels: Sequence[Channel]) -> None:
-        self._bag = bag
-        for channel in (*channels, NEEDLE_COMMAND, GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD):
-            bag.add_topic(channel.recorded, channel.type_name)
-
-    def write(self, stamp: int, tail: Points, heading: float, thread: Points, velocity: Points) -> None:
-        """Write an instant."""
-        self._write_seen(stamp, tail, heading, thread)
-        self._put(NEEDLE_COMMAND, stamp, MESSAGES.twist_message(stamp, velocity))
-        self._put(GROUND_TRUTH_NEEDLE, stamp, MESSAGES.placed(stamp, tail, heading))
-        self._put(GROUND_TRUTH_THREAD, stamp, MESSAGES.path_message(stamp, _along(thread, GROUND_TRUTH_POINTS)))
-
-    @abstractmethod
-    def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
-        """Write how the needle and the thread are seen."""
-
-    def _put(self, channel: Channel, stamp: int, message: Any) -> None:
-        self._bag.write_message(channel.recorded, stamp, message)
-
-
-class _FrameTopics(_Topics):
+class _FrameTopics:
     """Writes camera frames."""
 
-    def __init__(self, bag: BagWriter, setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> None:
-        super().__init__(bag, (COMPRESSED_IMAGE, CAMERA_INFO))
+    channels = (interface.COMPRESSED_IMAGE, interface.CAMERA_INFO)
+
+    def __init__(self, setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> None:
         view = DishView((322.0, 238.0), setup.scene.dish.diameter / (DISH_SHARE * SIZE[1]))
         scene = CameraScene(
             dish_diameter=setup.scene.dish.diameter,
@@ -179,35 +152,35 @@ class _FrameTopics(_Topics):
         self._camera = DishCamera(scene, view, SIZE, seed)
         self._quality = quality
 
-    def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
-        data = encode_jpeg(self._camera.render(tail, heading, thread), self._quality)
-        self._put(COMPRESSED_IMAGE, stamp, MESSAGES.compressed_image(stamp, data))
+    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[Any, Any]:
+        """Return a message for each channel."""
         camera = self._camera
+        data = encode_jpeg(camera.render(tail, heading, thread), self._quality)
         information = MESSAGES.camera_info(stamp, camera.size, camera.view, CAMERA_HEIGHT)
-        self._put(CAMERA_INFO, stamp, information)
+        return MESSAGES.compressed_image(stamp, data), information
 
 
-class _PoseTopics(_Topics):
-    """Writes what a tracker would say of the frames."""
+class _PoseTopics:
+    """Writes poses and measured threads, as a tracker would measure them in the frames."""
 
-    def __init__(self, bag: BagWriter, setup: Setup, noise: float, seed: int) -> None:
-        super().__init__(bag, (NEEDLE_POSE, MEASURED_THREAD))
+    channels = (interface.NEEDLE_POSE, interface.MEASURED_THREAD)
+
+    def __init__(self, setup: Setup, noise: float, seed: int) -> None:
         self._noise = np.array([noise, noise, noise / setup.vision.needle_length])
         self._random = np.random.default_rng(seed)
 
-    def _write_seen(self, stamp: int, tail: Points, heading: float, thread: Points) -> None:
-        off = self._noise * self._random.standard_normal(3)
-        angle = heading + off[2]
-        pose = MESSAGES.pose_message(
-            stamp, tail + off[:2], np.array([np.cos(angle), np.sin(angle)]), np.diag(self._noise**2)
-        )
-        self._put(NEEDLE_POSE, stamp, pose)
-        seen = _along(thread, MEASURED_POINTS)
-        seen[1:] += self._noise[:2] * self._random.standard_normal(seen[1:].shape)
-        seen[0] = tail + off[:2]  # a seen thread begins at the seen tail
-        self._put(MEASURED_THREAD, stamp, MESSAGES.path_message(stamp, seen))
+    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[Any, Any]:
+        """Return a message for each channel."""
+        offset = self._noise * self._random.standard_normal(3)
+        angle = heading + offset[2]
+        direction = np.array([np.cos(angle), np.sin(angle)])
+        pose = MESSAGES.pose_message(stamp, tail + offset[:2], direction, np.diag(self._noise**2))
+        measured = _resampled(thread, MEASURED_POINTS)
+        measured[1:] += self._noise[:2] * self._random.standard_normal(measured[1:].shape)
+        measured[0] = tail + offset[:2]  # a measured thread begins at the measured tail
+        return pose, MESSAGES.path_message(stamp, measured)
 
 
-def _along(thread: Points, count: int) -> Points:
+def _resampled(thread: Points, count: int) -> Points:
     """Return equally spaced points of a thread."""
     return points_at(thread, np.linspace(0.0, np.linalg.norm(np.diff(thread, axis=0), axis=1).sum(), count))

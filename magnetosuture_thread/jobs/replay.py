@@ -1,131 +1,201 @@
-"""The job `magnetosuture replay`: a recorded bag through the live graph."""
+"""The job `magnetosuture replay`: a recorded bag through the live graph. It needs ROS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from magnetosuture_thread.bags.reader import Bag
+import yaml
+
+from magnetosuture_thread.bags.message_types import MESSAGES, typestore
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError, GraphError
-from magnetosuture_thread.evaluation.graph_outputs import (
-    CurrentSeries,
-    GraphCollector,
-    ReplaySummary,
-    stage_latencies,
-)
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary, stage_latencies
 from magnetosuture_thread.interface import (
+    CAMERA,
+    CAMERA_INFO,
     CURRENTS,
     GROUND_TRUTH_THREAD,
+    MEASURED_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
+    NODES,
     PAUSE_REPLAY,
+    PROCESSES,
+    SCENE,
+    Channel,
 )
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.playing import MIN_LOOP_DURATION, Playing
-from magnetosuture_thread.jobs.replay_inputs import Given, opened, replay_summary, write_results
+from magnetosuture_thread.jobs.replay_inputs import (
+    BagInput,
+    BagSelection,
+    Log,
+    Progress,
+    open_bag,
+    replay_summary,
+    write_results,
+)
+from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.interruption import Interruption
+from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.nodes.replay import DEPTH, LiveReplay
+from magnetosuture_thread.nodes.replay_time import Timeline
+from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.predictions import read_observations
+from magnetosuture_thread.scene import write_scene
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.nodes.interruption import Interruption
-    from magnetosuture_thread.nodes.replay import LiveReplay
+    from typing_extensions import Unpack
 
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
+# A replayed bag never moves a needle, so its bridge may arm itself.
+NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE)
+
+
+@dataclass(frozen=True)
+class GraphInput:
+    """Messages of a bag to play into running nodes, and how these nodes are started.
+
+    Attributes:
+        given: the bag and its setup.
+    """
+
+    given: BagInput
+
+    @property
+    def channels(self) -> list[Channel]:
+        """Channels that are played."""
+        recording = self.given.recording
+        source = (recording.camera, CAMERA_INFO) if self.transport else (NEEDLE_POSE, MEASURED_THREAD)
+        changing = (channel for channel in CHANGING if channel != SCENE)
+        possible = (*source, NEEDLE_COMMAND, *changing)
+        return [SCENE, *(channel for channel in possible if channel and recording.counts.get(channel.recorded))]
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the graph's nodes; poses are played without a tracker."""
+        return NODES if self.transport else tuple(name for name in NODES if name != "vision_tracker")
+
+    @property
+    def processes(self) -> tuple[str, ...]:
+        """Programs that these nodes run as."""
+        return PROCESSES if self.transport else self.nodes
+
+    @property
+    def transport(self) -> str:
+        """How the bag has its camera frames, raw or compressed; empty where poses are played."""
+        camera = self.given.recording.camera if self.given.source == "camera" else None
+        return next((transport for transport, channel in CAMERA.items() if channel == camera), "")
+
+    def topics(self) -> list[topics.Topic]:
+        """Return the topics that are played."""
+        known = (*topics.INPUTS, *topics.SETTINGS, *topics.OUTPUTS)
+        return [topic for topic in known if topic.channel in self.channels]
+
+    def arguments(self, qos: Path) -> list[str]:
+        """Return the nodes' arguments.
+
+        Args:
+            qos: a file that this writes: parameters under which no message is lost; `scene.yaml` is written beside it.
+        """
+        qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
+        files = [part for path in (self.given.setup.path, qos) for part in ("--params-file", str(path.resolve()))]
+        # Nodes begin in the scene that is played, also where the setup's file names one of another machine.
+        scene = qos.with_name("scene.yaml")
+        write_scene(self.given.setup.scene, scene)
+        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *NOTHING_MOVES]
+        if self.transport:
+            arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
+        return arguments
+
+    def records(self) -> Iterator[RecordedMessage]:
+        """Give the messages to play, by time."""
+        given = self.given
+        # The scene comes first: the one that is in force in the bag, or else the setup's.
+        message = MESSAGES.scene_message(given.begin, given.setup.scene)
+        data = bytes(typestore().serialize_cdr(message, SCENE.type_name))
+        yield RecordedMessage(SCENE.recorded, SCENE.type_name, given.begin, data)
+        if given.start > 0.0:  # what came before about the thread is in force
+            earlier = [channel for channel in CHANGING if channel != SCENE]
+            for record in given.recording.records(earlier, duration=given.start):
+                yield replace(record, time=given.begin)
+        version = given.setup.scene.version
+        for record in given.recording.records(self.channels, start=given.start, duration=given.duration):
+            if record.topic == SCENE.recorded:
+                before, version = version, str(record.decode().version)
+                if version == before:
+                    continue
+            yield record
 
 
 def replay_live(
     bag_path: Path,
     output: Path,
     *,
-    setup_name: str = "",
     rate: float = 1.0,
-    source: str = "auto",
-    start: float = 0.0,
-    duration: float | None = None,
     loop: bool = False,
-    remap: Mapping[str, str] | None = None,
-    frame: str = "dish",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
+    **selection: Unpack[BagSelection],
 ) -> ReplaySummary:
-    """Play a bag through the nodes as processes of their own, and judge what they made of it.
+    """Play a bag through the nodes as processes of their own, and evaluate their outputs.
 
     `output` is made at the end, whole or not at all: `bag/` with all outputs, `summary.json`,
-    `summary.png` and the nodes' `logs/`. The coil bridge gets the recording driver, whatever the set-up
+    `summary.png` and the nodes' `logs/`. The coil bridge gets the recording driver, whatever the setup
     says: a replayed bag never moves a needle. By its poses a bag is played without a tracker.
 
     Args:
         bag_path: a bag.
         output: folder to make.
-        setup_name: name or path of the set-up; the one the bag names if empty.
         rate: how much faster than recorded.
-        source: `camera`, `poses`, or `auto`: the camera where there are frames.
-        start: seconds into the bag to begin at; the thread starts as it is first seen from then on.
-        duration: [s]; to the bag's end if None.
-        loop: whether it is played over and over until it is interrupted; the first pass is recorded and judged.
-        remap: other names for topics of the bag, by the old one.
-        frame: the bag's name of the dish frame.
+        loop: whether it is played over and over until it is interrupted; the first pass is recorded and evaluated.
         log: called with a line for a person at each stage.
         progress: called with the share played, 0 to 1.
+        selection: what of the bag is played; the thread starts as it is first measured from then on.
 
     Raises:
         BagError: the bag cannot be used, or the output exists or cannot be written.
-        ConfigurationError: the set-up cannot be used.
+        ConfigurationError: the setup cannot be used.
         GraphError: a node ended or did not come, or nothing was predicted.
         KeyboardInterrupt: interrupted before the first pass was done.
     """
-    with ExitStack() as stack:
-        given = stack.enter_context(
-            opened(
-                bag_path,
-                setup_name=setup_name,
-                source=source,
-                start=start,
-                duration=duration,
-                remap=remap or {},
-                frame=frame,
-                log=log,
-            )
-        )
-        if loop and given.duration < MIN_LOOP_DURATION:
-            raise BagError(
-                bag_path,
-                f"gives {given.duration:.2f} s to play over and over; expected {MIN_LOOP_DURATION:g} s or more",
-            )
-        remark, refused = _look_through(given, log)
+    with open_bag(bag_path, log, **selection) as given:
+        if loop:
+            given.check_loop()
+        remark, refused = _check_poses(given, log)
         if rate < 1.0:
             log("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
         if rate > 1.0:
             log("played faster than recorded: latencies count what waits in the queues")
-        folder = stack.enter_context(whole_folder(output))
-        job = _Replay(given, folder, rate, remark, refused, log, progress)
-        summary, problem = job.run(loop)
+        with whole_folder(output) as folder:
+            summary, problem = _Replay(given, folder, rate, remark, refused, log, progress).run(loop)
     if problem:
         raise GraphError(f"{problem}; the first pass is in {output}")
     return summary
 
 
-def _look_through(given: Given, log: Log) -> tuple[str, dict[str, int]]:
-    """Check recorded poses and threads before any node starts; return what is odd, and what cannot be used."""
+def _check_poses(given: BagInput, log: Log) -> tuple[str, dict[str, int]]:
+    """Check recorded poses and threads before any node starts; return a remark, and what cannot be used."""
     if given.source == "camera":
         return "", {}
-    looked = read_observations(given.recording, given.setup, source="poses", start=given.start, duration=given.duration)
-    for _ in looked:
+    checked = read_observations(
+        given.recording, given.setup, source="poses", start=given.start, duration=given.duration
+    )
+    for _ in checked:
         pass
-    if remark := looked.thread_problem():
+    if remark := checked.thread_problem():
         log(remark)
-    return remark, dict(looked.refused)
+    return remark, dict(checked.refused)
 
 
 @dataclass
 class _Replay:
-    """One replay; see `replay`."""
+    """One replay; see `replay_live`."""
 
-    given: Given
+    given: BagInput
     folder: Path
     rate: float
     remark: str
@@ -134,28 +204,15 @@ class _Replay:
     progress: Progress
 
     def run(self, loop: bool) -> tuple[ReplaySummary, str]:
-        """Play the bag into the graph, record and judge its outputs; return what went wrong later, as well."""
-        # Only here, where it is needed: without ROS the other commands still work.
-        from magnetosuture_thread.nodes import topics
-        from magnetosuture_thread.nodes.interruption import Interruption
-        from magnetosuture_thread.nodes.processes import (
-            NodeProcesses,
-            environment_of,
-            graph_environment,
-            reserved_domain,
-        )
-        from magnetosuture_thread.nodes.replay import LiveReplay
-        from magnetosuture_thread.nodes.replay_time import Timeline
-
+        """Play the bag into the graph and evaluate its outputs; return also what failed after the first pass."""
         qos = self.folder / "lossless.yaml"
-        playing, interruption = Playing(self.given), Interruption()
-        problem = ""
+        source, interruption, problem = GraphInput(self.given), Interruption(), ""
         with reserved_domain() as domain:
             environment = graph_environment(domain)
-            self.log(f"starting {', '.join(playing.nodes)} (ROS domain {domain}, this machine only)")
+            self.log(f"starting {', '.join(source.nodes)} (ROS domain {domain}, this machine only)")
             with (
                 environment_of(environment),
-                NodeProcesses(playing.processes, playing.arguments(qos), environment, self.folder / "logs") as nodes,
+                NodeProcesses(source.processes, source.arguments(qos), environment, self.folder / "logs") as nodes,
             ):
                 outputs = BagWriter(self.folder / "bag", self.given.notes)
                 for topic in (topics.SCENE, *topics.OUTPUTS):
@@ -165,59 +222,46 @@ class _Replay:
                     interruption.check()
                     nodes.check()
 
-                live = LiveReplay(
-                    domain,
-                    Timeline(self.given.begin, self.rate),
-                    played=playing.topics(),
-                    nodes=len(playing.nodes),
-                    receive=outputs.write,
-                    watch=watch,
-                    log=self.log,
-                )
+                live = live_replay(source, domain, self.rate, outputs.write, watch, self.log)
                 try:
                     with outputs, interruption:
-                        self._play(live, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE_REPLAY}")
+                        self._play(live, source, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE_REPLAY}")
                     self.log("judging what came out")
-                    summary = self._judge(live)
+                    summary = self._evaluate(live)
                     if loop:
-                        problem = self._play_on(live, interruption)
+                        self.log("the first pass is recorded and judged; playing on until Ctrl-C")
+                        try:
+                            with interruption:
+                                live.play_on(source.records)
+                        except KeyboardInterrupt:
+                            self.log("ended")
+                        except GraphError as error:
+                            problem = str(error)
                 finally:
                     live.close()
         qos.unlink()
         qos.with_name("scene.yaml").unlink()
         return summary, problem
 
-    def _play(self, live: LiveReplay, pause: str) -> None:
+    def _play(self, live: LiveReplay, source: GraphInput, pause: str) -> None:
         live.wait_for_graph()
         at = f" at {self.rate:g} times the speed" if self.rate != 1.0 else ""
         self.log(f"playing {self.given.duration:.1f} s{at}")
         self.log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
         length = max(self.given.duration, 1e-9)
-        live.play(Playing(self.given).records(), lambda time: self.progress(min(1.0, time / length)))
+        live.play(source.records(), lambda time: self.progress(min(1.0, time / length)))
 
-    def _play_on(self, live: LiveReplay, interruption: Interruption) -> str:
-        """Play on for who watches; return what ended it, if it was not a person."""
-        self.log("the first pass is recorded and judged; playing on until Ctrl-C")
-        try:
-            with interruption:
-                live.play_on(Playing(self.given).records)
-        except KeyboardInterrupt:
-            self.log("ended")
-        except GraphError as error:
-            return str(error)
-        return ""
-
-    def _judge(self, live: LiveReplay) -> ReplaySummary:
-        """Put the outputs side by side; write summary.json and summary.png."""
+    def _evaluate(self, live: LiveReplay) -> ReplaySummary:
+        """Compare the outputs; write summary.json and summary.png."""
         given = self.given
         collector = GraphCollector(given.setup.model.thread_length)
         recorded, replayed = CurrentSeries(), CurrentSeries()
-        truth = [c for c in (GROUND_TRUTH_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
-        for record in given.recording.records(truth, start=given.start, duration=given.duration):
-            message = record.decode()
-            collector.add(record.topic, message) if record.topic == GROUND_TRUTH_THREAD.recorded else recorded.add(
-                message
-            )
+        expected = [c for c in (GROUND_TRUTH_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
+        for record in given.recording.records(expected, start=given.start, duration=given.duration):
+            if record.topic == CURRENTS.recorded:
+                recorded.add(record.decode())
+            else:
+                collector.add(record.topic, record.decode())
         made = Bag(self.folder / "bag")
         for record in made.records(set(made.topics)):
             message = record.decode()
@@ -225,12 +269,11 @@ class _Replay:
             if record.topic == CURRENTS.recorded:
                 replayed.add(message)
         metrics, losses = collector.metrics(given.recording.start), live.losses
-        source = NEEDLE_POSE.name if given.source == "poses" else ""
-        frames = losses.played[source] if source else losses.frames_played
+        frames = losses.played[NEEDLE_POSE.name] if given.source == "poses" else losses.frames_played
         if not len(metrics.series):
-            said = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
-            things = "poses" if source else "frames"
-            raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {said}")
+            health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
+            things = "poses" if given.source == "poses" else "frames"
+            raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {health}")
         commands = live.published.get(NEEDLE_COMMAND.name, {})
         summary = replay_summary(
             given,
@@ -247,3 +290,23 @@ class _Replay:
         )
         write_results(self.folder, given, metrics, summary, self.log)
         return summary
+
+
+def live_replay(
+    source: GraphInput,
+    domain: int,
+    rate: float,
+    receive: Callable[[str, int, bytes], None],
+    watch: Callable[[], None],
+    log: Log,
+) -> LiveReplay:
+    """Return the node that plays a bag; see `LiveReplay`."""
+    return LiveReplay(
+        domain,
+        Timeline(source.given.begin, rate),
+        played=source.topics(),
+        nodes=len(source.nodes),
+        receive=receive,
+        watch=watch,
+        log=log,
+    )

@@ -1,4 +1,4 @@
-"""What live and offline replay have in common: the bag and its set-up at the start, figures and picture at the end."""
+"""What live and offline replay share: the bag and its setup at the start, figures and picture at the end."""
 
 from __future__ import annotations
 
@@ -8,22 +8,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_COMMAND, SCENE
-from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
+from magnetosuture_thread.interface import DISH_FRAME, GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_COMMAND, SCENE
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.offline.observations import pixels
 from magnetosuture_thread.offline.predictions import chosen_source
@@ -31,7 +28,12 @@ from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.tracker import VisionTracker
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 DEFAULT_SETUP = "petri_35mm_polyamide"
+SETUP_NOTE = "scenario"  # of a bag, which holds the setup's text
+MIN_LOOP_DURATION = 1.5  # s; nodes take a jump back of a second and less for messages that come late
 PLAIN_SIZE, PLAIN_SHARE = (480, 640), 0.9  # of the picture of a dish that no camera saw, and the dish's part of it
 PLAIN_FLOOR, PLAIN_OUTSIDE = 225, 170  # its brightness
 
@@ -39,9 +41,29 @@ Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
+class BagSelection(TypedDict, total=False):
+    """What of a bag is read, and with which setup.
+
+    Attributes:
+        setup_name: name or path of the setup; the one that the bag names if empty.
+        source: `camera`, `poses`, or `auto`: the camera where there are frames.
+        start: seconds into the bag to begin at.
+        duration: [s]; to the bag's end if None.
+        remap: other names for topics of the bag, by the old one.
+        frame: the bag's name of the dish frame.
+    """
+
+    setup_name: str
+    source: str
+    start: float
+    duration: float | None
+    remap: Mapping[str, str]
+    frame: str
+
+
 @dataclass(frozen=True)
-class Given:
-    """A bag to replay, with what else is needed.
+class BagInput:
+    """A bag to replay, with its setup.
 
     Attributes:
         recording: the bag.
@@ -67,52 +89,44 @@ class Given:
         """Return the notes of a bag made from this one."""
         return {**self.recording.notes, "setup": self.setup.name, "replayed": str(self.recording.path)}
 
+    def check_loop(self) -> None:
+        """Raise `BagError` if the bag is too short to be played in a loop."""
+        if self.duration < MIN_LOOP_DURATION:
+            problem = f"gives {self.duration:.2f} s to play over and over; expected {MIN_LOOP_DURATION:g} s or more"
+            raise BagError(self.recording.path, problem)
+
 
 @contextmanager
-def opened(
-    path: Path,
-    *,
-    setup_name: str,
-    source: str,
-    start: float,
-    duration: float | None,
-    remap: Mapping[str, str],
-    frame: str,
-    log: Log,
-) -> Iterator[Given]:
-    """Open a bag to replay, and say what is odd about it.
+def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterator[BagInput]:
+    """Open a bag to replay, and log what is unusual about it.
 
     Args:
         path: of the bag.
-        setup_name: name or path of the set-up; the one the bag names if empty.
-        source: `auto`, `camera` or `poses`.
-        start: seconds into the bag to begin at.
-        duration: [s]; to the bag's end if None.
-        remap: other names for topics of the bag, by the old one.
-        frame: the bag's name of the dish frame.
         log: called with a line for a person.
+        selection: what of the bag is read; see `BagSelection`.
 
     Raises:
         BagError: the bag cannot be used, or has no such time.
-        ConfigurationError: the set-up cannot be used.
+        ConfigurationError: the setup cannot be used.
     """
     log(f"checking {path}")
-    recording = Recording(Bag(path, remap=remap), dish_frame=frame)
+    start, duration = selection.get("start", 0.0), selection.get("duration")
+    recording = Recording(Bag(path, remap=selection.get("remap")), dish_frame=selection.get("frame", DISH_FRAME))
     if recording.damage is not None:
         log(f"the bag is damaged, what is intact is played: {recording.damage}")
     elif recording.unchecked:
         log(recording.unchecked)
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
-    chosen = chosen_source(recording, source)
+    source = chosen_source(recording, selection.get("source", "auto"))
     for channel in (MEASURED_THREAD, NEEDLE_COMMAND, GROUND_TRUTH_THREAD):
         if channel.recorded in recording.unfit:
             raise BagError(path, recording.unfit[channel.recorded])
     left = recording.duration - start
     with TemporaryDirectory() as spare:
         scene = scene_at(recording, start)
-        setup = _setup_of(recording.notes, setup_name, recording.damage is not None, Path(spare), scene, log)
-        yield Given(recording, setup, chosen, start, left if duration is None else min(duration, left))
+        setup = _setup_of(recording, selection.get("setup_name", ""), Path(spare), scene, log)
+        yield BagInput(recording, setup, source, start, left if duration is None else min(duration, left))
 
 
 def scene_at(recording: Recording, start: float) -> Scene | None:
@@ -133,41 +147,54 @@ def scene_at(recording: Recording, start: float) -> Scene | None:
     return found
 
 
-def begin_with_scene(bag: BagWriter, given: Given) -> None:
-    """Write the scene at the beginning of a bag made from another."""
-    bag.add_topic(SCENE.recorded, SCENE.type_name)
-    bag.write_message(SCENE.recorded, given.begin, MESSAGES.scene_message(given.begin, given.setup.scene))
-
-
-def _setup_of(
-    notes: Mapping[str, str], name: str, is_damaged: bool, spare: Path, scene: Scene | None, log: Log
-) -> Setup:
-    """Return the set-up to replay a bag with: the one asked for, or the bag's own, or the default.
+def _setup_of(recording: Recording, name: str, folder: Path, scene: Scene | None, log: Log) -> Setup:
+    """Return the setup to replay a bag with: the named one, or the bag's own, or the default.
 
     Raises:
         ConfigurationError: it cannot be used; of the bag's own, the message says to name another.
     """
-    named, text = notes.get("setup", ""), notes.get(SCENARIO_NOTE, "")
+    notes = recording.notes
+    named = notes.get("setup", "")
     if name:
         if named and name != named:
-            log(f"the bag names the set-up {named}; taking {name}")
+            log(f"the bag names the setup {named}; taking {name}")
         return read_setup(name, scene)
-    if text:  # which says more than a name: the file may have changed, or be on another machine
-        path = spare / f"{named or 'scenario'}.yaml"
-        path.write_text(text, encoding="utf-8")
+    if notes.get(SETUP_NOTE) or named:
         try:
-            return read_setup(str(path), scene)
+            return setup_of_notes(notes, folder, scene)
         except ConfigurationError as error:
+            if not notes.get(SETUP_NOTE):
+                raise
             # Its lines may be of another version of this package, which had dish and obstacles in every section.
-            expected = "what this version knows; name a set-up by --setup"
-            raise ConfigurationError("the bag's own set-up", error.name, expected) from None
-    if not named:
-        lost = ", or has lost its name" if is_damaged else ""
-        log(f"the bag names no set-up{lost}; taking {DEFAULT_SETUP}, which may not be its own: --setup names another")
-    return read_setup(named or DEFAULT_SETUP, scene)
+            expected = "what this version knows; name a setup by --setup"
+            raise ConfigurationError("the bag's own setup", error.name, expected) from None
+    lost = ", or has lost its name" if recording.damage is not None else ""
+    log(f"the bag names no setup{lost}; taking {DEFAULT_SETUP}, which may not be its own: --setup names another")
+    return read_setup(DEFAULT_SETUP, scene)
 
 
-def replay_summary(given: Given, metrics: RunMetrics, **others: Any) -> ReplaySummary:
+def setup_of_notes(notes: Mapping[str, str], folder: Path, scene: Scene | None = None) -> Setup:
+    """Return the setup that a bag was recorded with.
+
+    Its text counts more than its name: the file may have changed, or be on another machine.
+
+    Args:
+        notes: of the bag, with one of the two.
+        folder: that gets the text as a file, which the setup names.
+        scene: in place of the setup's.
+
+    Raises:
+        ConfigurationError: it cannot be used.
+    """
+    named = notes.get("setup", "")
+    if not (text := notes.get(SETUP_NOTE, "")):
+        return read_setup(named, scene)
+    path = folder / f"{named or 'scenario'}.yaml"
+    path.write_text(text, encoding="utf-8")
+    return read_setup(str(path), scene)
+
+
+def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> ReplaySummary:
     """Return the figures of a replay.
 
     Args:
@@ -195,7 +222,7 @@ def replay_summary(given: Given, metrics: RunMetrics, **others: Any) -> ReplaySu
     )
 
 
-def write_results(folder: Path, given: Given, metrics: RunMetrics, summary: ReplaySummary, log: Log) -> None:
+def write_results(folder: Path, given: BagInput, metrics: RunMetrics, summary: ReplaySummary, log: Log) -> None:
     """Write summary.json and summary.png.
 
     Args:
@@ -219,7 +246,7 @@ def write_results(folder: Path, given: Given, metrics: RunMetrics, summary: Repl
     draw_summary(folder / "summary.png", frame, view, chosen, at, metrics.series, obstacles, summary)
 
 
-def _frame_of(given: Given, stamp: int) -> tuple[NDArray[np.uint8], DishView] | None:
+def _frame_of(given: BagInput, stamp: int) -> tuple[NDArray[np.uint8], DishView] | None:
     """Return the camera frame of a stamp, and where the dish is, by the first frame in which it is found."""
     view, frame = None, None
     tracker = VisionTracker(given.setup.vision, given.setup.scene)
@@ -241,7 +268,7 @@ def _frame_of(given: Given, stamp: int) -> tuple[NDArray[np.uint8], DishView] | 
     return None
 
 
-def _plain_dish(given: Given) -> tuple[NDArray[np.uint8], DishView]:
+def _plain_dish(given: BagInput) -> tuple[NDArray[np.uint8], DishView]:
     """Return a drawn dish, where no camera saw the real one."""
     rows, columns = PLAIN_SIZE
     diameter = given.setup.scene.dish.diameter

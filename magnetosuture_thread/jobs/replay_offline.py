@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import RecordedMessage
@@ -16,7 +16,15 @@ from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.interface import MARGINS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, SCENE, TRACKER_STATE
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.replay_inputs import Given, begin_with_scene, opened, replay_summary, write_results
+from magnetosuture_thread.jobs.replay_inputs import (
+    BagInput,
+    BagSelection,
+    Log,
+    Progress,
+    open_bag,
+    replay_summary,
+    write_results,
+)
 from magnetosuture_thread.messages.cdr import time_of
 from magnetosuture_thread.messages.packing import packed_margins, packed_path, packed_pose, packed_prediction
 from magnetosuture_thread.model.session import WAITING
@@ -24,59 +32,37 @@ from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationRead
 from magnetosuture_thread.offline.predictions import Step, predictions, read_observations
 from magnetosuture_thread.vision.session import FrameMeasurement
 
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 def replay_offline(
     bag_path: Path,
     output: Path,
     *,
-    setup_name: str = "",
-    source: str = "auto",
-    start: float = 0.0,
-    duration: float | None = None,
-    remap: Mapping[str, str] | None = None,
-    frame: str = "dish",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
+    **selection: Unpack[BagSelection],
 ) -> ReplaySummary:
-    """Put a bag through tracker and model without a graph, and judge what they made of it.
+    """Put a bag through tracker and model without a graph, and evaluate the predictions.
 
     `output` is made at the end, whole or not at all: `bag/`, `summary.json` and `summary.png`. The bag holds pose
-    and seen thread, prediction and margins, each logged at its own stamp, with the numbers that the live graph
+    and measured thread, prediction and margins, each logged at its own stamp, with the numbers that the live graph
     gives. Two runs write it alike to the last bit: times that steps took are in the summary alone. The coil bridge
     has no part in it: what it does depends on real time.
 
     Args:
         bag_path: a bag.
         output: folder to make.
-        setup_name: name or path of the set-up; the one the bag names if empty.
-        source: `camera`, `poses`, or `auto`: the camera where there are frames.
-        start: seconds into the bag to begin at.
-        duration: [s]; to the bag's end if None.
-        remap: other names for topics of the bag, by the old one.
-        frame: the bag's name of the dish frame.
         log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
+        selection: what of the bag is replayed.
 
     Raises:
         BagError: the bag cannot be used, nothing in it was predicted, or the output exists or cannot be written.
-        ConfigurationError: the set-up cannot be used.
+        ConfigurationError: the setup cannot be used.
     """
-    with (
-        opened(
-            bag_path,
-            setup_name=setup_name,
-            source=source,
-            start=start,
-            duration=duration,
-            remap=remap or {},
-            frame=frame,
-            log=log,
-        ) as given,
-        whole_folder(output) as folder,
-    ):
+    with open_bag(bag_path, log, **selection) as given, whole_folder(output) as folder:
         what = "camera frames" if given.source == "camera" else "recorded poses"
         log(f"predicting by the {what} of {given.duration:.1f} s")
         seen = read_observations(
@@ -90,11 +76,8 @@ def replay_offline(
         metrics = RunMetrics(given.setup.model.thread_length, given.recording.start)
         refused = Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
-            begin_with_scene(bag, given)
-            steps, made = (
-                predictions(seen, given.setup.model, given.setup.scene),
-                _Output(bag, seen, given.setup.scene.version),
-            )
+            made = _Output(bag, seen, given)
+            steps = predictions(seen, given.setup.model, given.setup.scene)
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)
@@ -103,11 +86,11 @@ def replay_offline(
                     metrics.add(FrameResult.of(step.sight, predicted, step.margins, step.step_time))
                 elif step.outcome.problem is not None:
                     refused[_kind(step.outcome.problem)] += 1
-            taken = time.perf_counter() - began
-        log(f"{given.duration / taken:.3g} times as fast as it was recorded; judging what came out")
-        summary, remark = _summary(given, seen, metrics, refused, given.duration / taken), seen.thread_problem()
-        if remark:
-            log(remark)
+            speed = given.duration / (time.perf_counter() - began)
+        log(f"{speed:.3g} times as fast as it was recorded; judging what came out")
+        summary = _summary(given, seen, metrics, refused, speed)
+        if summary.remark:
+            log(summary.remark)
         write_results(folder, given, metrics, summary, log)
         return summary
 
@@ -120,7 +103,7 @@ def _kind(problem: Exception) -> str:
 
 
 def _summary(
-    given: Given, seen: ObservationReader, metrics: RunMetrics, refused: Counter[str], speed: float
+    given: BagInput, seen: ObservationReader, metrics: RunMetrics, refused: Counter[str], speed: float
 ) -> ReplaySummary:
     """Return the figures.
 
@@ -152,21 +135,23 @@ class _Output:
     """Writes what the nodes would have published.
 
     Args:
-        bag: to write to.
+        bag: to write to; it begins with the scene.
         seen: whose frames and records it gets as they go by.
-        version: of the scene that the bag begins with.
+        given: the bag that is replayed.
     """
 
-    def __init__(self, bag: BagWriter, seen: ObservationReader, version: str) -> None:
+    def __init__(self, bag: BagWriter, seen: ObservationReader, given: BagInput) -> None:
         self._bag = bag
+        bag.add_topic(SCENE.recorded, SCENE.type_name)
+        bag.write_message(SCENE.recorded, given.begin, MESSAGES.scene_message(given.begin, given.setup.scene))
         states = [TRACKER_STATE] if seen.source == "camera" else []
         for channel in (NEEDLE_POSE, *states, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
             bag.add_topic(channel.recorded, channel.type_name)
-        self._version = version
+        self._version = given.setup.scene.version
         seen.on_frame, seen.on_record = self._frame, self._record
 
     def write(self, step: Step) -> None:
-        """Write what came of a sight."""
+        """Write the prediction of an observation."""
         stamp, outcome, prediction = step.outcome.stamp, step.outcome, step.outcome.prediction
         if prediction is not None:
             packed = packed_prediction(time_of(stamp), prediction, step.settings.material)

@@ -1,4 +1,4 @@
-"""The job `magnetosuture simulate`: the whole graph around a simulated rig, in a closed loop."""
+"""The job `magnetosuture simulate`: the whole graph around a simulated rig, in a closed loop. It needs ROS."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,23 +17,32 @@ from magnetosuture_thread.evaluation.closed_loop import LoopCollector, LoopSumma
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.interface import CAMERA, NODES, PROCESSES, SCENE, SCENE_MARKERS, SCENE_SERVER, TIP_SETPOINT
 from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.coil_client import CoilClient
+from magnetosuture_thread.nodes.interruption import Interruption
+from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.nodes.recorder import Recorder
 from magnetosuture_thread.setups import Setup, read_setup
 
-if TYPE_CHECKING:
-    from magnetosuture_thread.nodes.coil_client import CoilClient
-    from magnetosuture_thread.nodes.recorder import Recorder
-
-SCENARIO_NOTE = "scenario"  # of the bag, which holds the set-up's text
-ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # what is told while nodes start, for the bag's beginning
+ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # published while nodes start, for the bag's beginning
+# Topics on which nothing may come before the run begins.
+OPTIONAL = (
+    topics.NEEDLE_COMMAND,
+    topics.OPERATOR_COMMAND,
+    topics.TIP_SETPOINT,
+    topics.FAULT_REQUEST,
+    topics.MATERIAL,
+)
 INTERRUPTED = "interrupted"
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
-SETTLE = 1.0  # s for all nodes to have found each other
-AFTERWARDS = 0.5  # s that go on once the path is done
-TIMEOUT = 3.0  # times the path's own duration, and ...
-SPARE = 20.0  # s of simulated time besides: then a run that never ends is ended
-PATIENT = 15.0  # s for simulated boards to be ready
+SETTLING_TIME = 1.0  # s for all nodes to have found each other
+FINAL_TIME = 0.5  # s that go on once the path is done
+TIMEOUT_FACTOR = 3.0  # times the path's own duration, and ...
+EXTRA_TIME = 20.0  # s of simulated time besides: then a run that never ends is ended
+BOARDS_TIMEOUT = 15.0  # s for simulated boards to be ready
 FAULT = "fault: "  # what a bridge says of itself that needs a reset
-LOOK = 0.02  # s between two looks at the nodes
+POLL_PERIOD = 0.02  # s between two looks at the nodes
 
 # Where two cores carry the whole graph and a recording besides, the bridge leaves them more of it.
 SLOWER_BRIDGE = ("-p", "coil_bridge:rate:=100.0")
@@ -44,14 +52,11 @@ SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:aut
 
 # Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
 # for 75 ms, as happens with two busy cores, would be taken for dead.
-PATIENT_DRIVER = {"roboclaw_answer_timeout": 0.2, "driver_timeout": 0.5}
-
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
+SLOW_BOARD_TIMEOUTS = {"roboclaw_answer_timeout": 0.2, "driver_timeout": 0.5}
 
 
 def simulate(
-    scenario: str,
+    setup_name: str,
     output: Path,
     *,
     duration: float | None = None,
@@ -60,37 +65,35 @@ def simulate(
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> LoopSummary:
-    """Run rig, tracker, model, bridge and path follower as processes of their own, and judge the loop.
+    """Run rig, tracker, model, bridge and path follower as processes of their own, and evaluate the loop.
 
-    `output` becomes a bag of all that was said, the truth included, with the nodes' `logs/` beside it; its
-    notes hold the scenario and say that it is simulated, and `replay` takes it. It is made at the end, also
+    `output` becomes a bag of every topic, including ground truth, with the nodes' `logs/` beside it; its
+    notes hold the setup and say that it is simulated, and `replay` takes it. It is made at the end, also
     of a run that was interrupted, or for which the disk was too small; of one that never began nothing is left.
 
     Args:
-        scenario: name or path of a set-up with a path for the needle.
+        setup_name: name or path of a setup with a path for the needle.
         output: the bag's folder.
-        duration: the run ends after this many seconds of the scenario's time, wherever the needle is then;
+        duration: the run ends after this many seconds of the setup's time, wherever the needle is then;
             when the path is done if None.
         rate: how much faster than real time, with a simulated clock; in real time if None.
         boards: whether the bridge drives the rig through simulated RoboClaw boards on pseudo-terminals, by the
-            driver for real ones; they keep real time, so not with `pace`.
+            driver for real ones; they keep real time, so not with `rate`.
         log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
         BagError: the output exists or cannot be written; where the disk was full, what was recorded is there.
-        ConfigurationError: the scenario cannot be used.
+        ConfigurationError: the setup cannot be used.
         GraphError: a node ended or did not come, or the needle never got to the end of its path.
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
-    setup = read_setup(scenario)
+    setup = read_setup(setup_name)
     if not setup.follower.waypoints:
         raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
     if setup.vision.image_transport != "compressed":
-        expectation = "compressed: the bag must hold what the tracker saw"
-        raise ConfigurationError(
-            "vision_tracker.image_transport", setup.vision.image_transport, expectation, str(setup.path)
-        )
+        name, expectation = "vision_tracker.image_transport", "compressed: the bag must hold what the tracker saw"
+        raise ConfigurationError(name, setup.vision.image_transport, expectation, str(setup.path))
     with whole_folder(output, is_recording=True) as folder:
         problem = _run(setup, folder, output.name, duration, rate, boards, log, progress)
     if problem == INTERRUPTED:
@@ -102,7 +105,7 @@ def simulate(
 
 
 def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
-    """Return all that a simulated run's bag says, put side by side."""
+    """Return what a simulated run's bag holds, compared by stamp."""
     collector = LoopCollector(
         setup.model.thread_length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
     )
@@ -123,36 +126,20 @@ def _run(
     progress: Progress,
 ) -> str:
     """Run the graph and record it; return what went wrong, so that the bag stays."""
-    # Only here, where it is needed: without ROS the other commands still work.
-    from magnetosuture_thread.nodes import topics
-    from magnetosuture_thread.nodes.coil_client import CoilClient
-    from magnetosuture_thread.nodes.interruption import Interruption
-    from magnetosuture_thread.nodes.processes import (
-        NodeProcesses,
-        environment_of,
-        graph_environment,
-        reserved_domain,
-    )
-    from magnetosuture_thread.nodes.recorder import Recorder
-
     arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE]
     if rate is not None:
         arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(rate)}"]
     notes = {
         "setup": setup.name,
-        SCENARIO_NOTE: setup.path.read_text(encoding="utf-8"),
-        "simulated": f"the whole rig, closed loop, scenario {setup.name}",
+        SETUP_NOTE: setup.path.read_text(encoding="utf-8"),
+        "simulated": f"the whole rig, closed loop, setup {setup.name}",
     }
-    said = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS)
-    taken = [topic for topic in said if topic is not topics.IMAGE]
-    with (
-        reserved_domain() as domain,
-        BagWriter(folder, notes, name=name) as bag,
-        TemporaryDirectory() as ports,
-    ):
+    every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS)
+    recorded = [topic for topic in every if topic is not topics.IMAGE]
+    with reserved_domain() as domain, BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
         environment = graph_environment(domain)
         arguments += _wired(ports, len(setup.coils.coil_angles)) if boards else SIMULATED_COILS
-        for topic in taken:
+        for topic in recorded:
             bag.add_topic(topic.channel.recorded, topic.channel.type_name)
         log(f"starting {SCENE_SERVER}, rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
         with (
@@ -167,14 +154,15 @@ def _run(
 
             def receive(topic: str, arrival: int, data: bytes) -> None:
                 nonlocal begin
-                # While nodes start, only what is said once and for all is worth keeping: for the bag's start.
+                # While nodes start, only what is published once is kept, for the bag's start.
                 if not running:
-                    early.update({topic: data} if topic in ONCE else {})
+                    if topic in ONCE:
+                        early[topic] = data
                     return
                 if begin is None:
                     begin = arrival
-                    for name, said_early in early.items():
-                        bag.write(name, begin, said_early)
+                    for name, content in early.items():
+                        bag.write(name, begin, content)
                 # What waited elsewhere may have arrived before: the scene is the bag's first message all the same.
                 bag.write(topic, max(arrival, begin + 1), data)
 
@@ -182,19 +170,12 @@ def _run(
                 interruption.check()
                 nodes.check()
 
-            recorder = Recorder(domain, taken, simulated_clock=rate is not None, receive=receive)
+            recorder = Recorder(domain, recorded, simulated_clock=rate is not None, receive=receive)
             try:
-                perhaps = (
-                    topics.NEEDLE_COMMAND,
-                    topics.OPERATOR_COMMAND,
-                    topics.TIP_SETPOINT,
-                    topics.FAULT_REQUEST,
-                    topics.MATERIAL,
-                )
                 with interruption:
-                    _wait(recorder, check, {topic.name for topic in perhaps})
+                    _wait(recorder, check)
                 if boards:
-                    _arm(CoilClient)
+                    _arm()
                 log("running" if rate is None else f"running at {rate:g} times the speed")
                 running = True
                 nodes.start("path_follower", arguments=BRIDGE_AND_RECORDER)
@@ -208,12 +189,12 @@ def _run(
                 recorder.close()
 
 
-def _arm(make: type[CoilClient]) -> None:
+def _arm() -> None:
     """Arm the bridge as soon as its boards are ready."""
-    deadline = time.monotonic() + PATIENT
+    deadline = time.monotonic() + BOARDS_TIMEOUT
     while True:
         try:
-            with make() as client:
+            with CoilClient() as client:
                 return client.execute("arm")
         except GraphError as error:
             if time.monotonic() > deadline:
@@ -223,23 +204,24 @@ def _arm(make: type[CoilClient]) -> None:
 def _wired(folder: str, coils: int) -> list[str]:
     """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
     ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
-    both: dict[str, dict[str, object]] = {
-        "coil_bridge": {"driver": "roboclaw", "autostart": "active", "roboclaw_ports": ports, **PATIENT_DRIVER},
+    parameters: dict[str, dict[str, object]] = {
+        "coil_bridge": {"driver": "roboclaw", "autostart": "active", "roboclaw_ports": ports, **SLOW_BOARD_TIMEOUTS},
         "rig_simulator": {"power_stage": "roboclaw", "power_stage_ports": ports},
     }
-    given = [f"{node}:{name}:={value}" for node, values in both.items() for name, value in values.items()]
+    given = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
     return [part for each in given for part in ("-p", each)]
 
 
-def _wait(recorder: Recorder, check: Callable[[], None], later: set[str]) -> None:
-    """Wait until somebody publishes every topic, but those that come later."""
+def _wait(recorder: Recorder, check: Callable[[], None]) -> None:
+    """Wait until every topic has a publisher, except those in `OPTIONAL`."""
+    optional = {topic.name for topic in OPTIONAL}
     deadline = time.monotonic() + START_TIMEOUT
-    while missing := [name for name in recorder.silent() if name not in later]:
+    while missing := [name for name in recorder.silent() if name not in optional]:
         check()
         if time.monotonic() > deadline:
             raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
-        recorder.spin(LOOK)
-    recorder.spin(SETTLE)
+        recorder.spin(POLL_PERIOD)
+    recorder.spin(SETTLING_TIME)
 
 
 def _follow(
@@ -252,28 +234,28 @@ def _follow(
 ) -> str:
     """Record until the needle is at the end of its path, or the time is over; return what went wrong."""
     points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
-    longest = TIMEOUT * float(arc_lengths(points)[-1]) / setup.follower.speed + SPARE + (duration or 0.0)
+    timeout = TIMEOUT_FACTOR * float(arc_lengths(points)[-1]) / setup.follower.speed + EXTRA_TIME + (duration or 0.0)
     began = time.monotonic()
     following, started = False, began
     while True:
         check()
-        recorder.spin(LOOK)
+        recorder.spin(POLL_PERIOD)
         if not following and recorder.taken[TIP_SETPOINT.recorded]:
             following, began = True, time.monotonic()
         if "path_follower" not in recorder.said and time.monotonic() - started < START_TIMEOUT:
             began = time.monotonic()  # its process is still loading
-        said, values = recorder.said.get("path_follower", ("", {}))
+        state, values = recorder.said.get("path_follower", ("", {}))
         elapsed = (time.monotonic() - began) * rate
         done = float(values.get("progress", 0.0))
         progress(done if duration is None else min(1.0, elapsed / duration))
-        if duration is not None and elapsed > duration + (0.0 if following else SPARE):
+        if duration is not None and elapsed > duration + (0.0 if following else EXTRA_TIME):
             return ""
-        if duration is None and said == "done":
-            recorder.spin(AFTERWARDS / rate)
+        if duration is None and state == "done":
+            recorder.spin(FINAL_TIME / rate)
             return ""
-        held = recorder.said.get("coil_bridge", ("", {}))[0]
-        if held.startswith(FAULT):
-            return f"coil_bridge: {held}"
-        if elapsed > longest:
+        bridge = recorder.said.get("coil_bridge", ("", {}))[0]
+        if bridge.startswith(FAULT):
+            return f"coil_bridge: {bridge}"
+        if elapsed > timeout:
             states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.said.items()))
             return f"after {elapsed:.0f} s only {done:.0%} of the path is done; {states}"

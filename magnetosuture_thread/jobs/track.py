@@ -1,25 +1,204 @@
-"""The job `magnetosuture track`: needle and thread in camera frames, without a graph."""
+"""Camera frames of picture files, folders and bags, and the job `magnetosuture track`: needle and thread in them."""
 
 from __future__ import annotations
 
 import math
+import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.jobs.frames import FrameFile, FrameSource, numbered
+from magnetosuture_thread.bags.bag_files import COMPRESSED_SUFFIXES, STORAGE_SUFFIXES
+from magnetosuture_thread.bags.damage_report import pluralize
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from magnetosuture_thread.vision.warm_up import warm_up
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own
+MIN_RATE, MAX_RATE = 0.1, 240.0  # frames/s, that video players show
+FRAMES_FOR_RATE = 300  # of a bag, from its beginning
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """One frame.
+
+    Attributes:
+        name: see `FrameSource.names`, or topic and stamp.
+        image: None if it is broken.
+        problem: why it is; else empty.
+        stamp: when it was taken [s]; None where nothing tells.
+    """
+
+    name: str
+    image: np.ndarray | None
+    problem: str = ""
+    stamp: float | None = None
+
+
+class FrameSource:
+    """The frames at given paths.
+
+    Args:
+        paths: picture files, one folder of pictures, or one bag.
+        remap: new name of a bag's topic by its recorded name.
+
+    Attributes:
+        count: number of frames.
+        names: of picture files, each there once: the file's name alone, with as many of its folders as tell it
+            apart from others of that name, and numbered where a file is given twice; empty for a bag.
+        is_sequence: whether the frames follow one another in time, as in a bag.
+        notes: what a bag's writer says of it.
+        doubts: on a bag, a line each: what is damaged, or why damage may not have been noticed.
+
+    Raises:
+        BagError: a path does not exist, a folder holds no pictures, or a bag cannot be used.
+    """
+
+    def __init__(self, paths: Sequence[Path], *, remap: Mapping[str, str] | None = None) -> None:
+        self._files: list[Path] = []
+        self._recording: Recording | None = None
+        self._channel = CAMERA["raw"]
+        self.notes: dict[str, str] = {}
+        self.doubts: list[str] = []
+        for path in paths:
+            self._add(path, remap, alone=len(paths) == 1)
+        self.is_sequence = self._recording is not None
+        if remap and self._recording is None:
+            raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
+        self.names = _names(self._files)
+        recording = self._recording
+        self.count = recording.counts[self._channel.recorded] if recording is not None else len(self._files)
+
+    @property
+    def refused(self) -> list[str]:
+        """Return why frames of a bag could not be taken, a line each, once all have been gone through."""
+        reasons = self._recording.refused if self._recording is not None else {}
+        return [f"{reason}: {pluralize(count, 'frame')} left out" for reason, count in reasons.items()]
+
+    def _add(self, path: Path, remap: Mapping[str, str] | None, alone: bool) -> None:
+        try:
+            path.stat()
+            is_folder = path.is_dir()
+            inside = sorted(path.iterdir()) if is_folder else []
+        except FileNotFoundError:
+            raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
+        except (OSError, ValueError) as error:
+            raise BagError(path, f"cannot be read: {error}") from None
+        if any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside)):
+            if not alone:
+                raise BagError(path, "is a bag; expected it alone, without other frames")
+            bag = Bag(path, remap=remap)
+            recording = self._recording = Recording(bag)
+            self.notes = bag.notes
+            self.doubts = [doubt for doubt in (str(bag.damage or ""), bag.unchecked) if doubt]
+            if recording.camera is None:
+                topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
+                raise BagError(path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
+            self._channel = recording.camera
+        elif is_folder:
+            pictures = [file for file in inside if file.suffix.lower() in PICTURES and file.is_file()]
+            if not pictures:
+                raise BagError(path, f"holds no pictures; expected files that end in {', '.join(PICTURES)}, or a bag")
+            self._files += pictures
+        else:
+            self._files.append(path)
+
+    def __iter__(self) -> Iterator[FrameFile]:
+        """Go through the frames: files in the order given, a folder by name, a bag by time."""
+        if self._recording is not None:
+            self._recording.refused.clear()
+            for record in self._recording.records([self._channel]):
+                yield self._recorded(record)
+            return
+        for name, file in zip(self.names, self._files, strict=True):
+            try:
+                yield FrameFile(name, decode_image(file.read_bytes()))
+            except OSError as error:
+                yield FrameFile(name, None, f"cannot be read: {error.strerror}")
+            except InvalidInputError as error:
+                yield FrameFile(name, None, str(error))
+
+    def rate(self) -> float:
+        """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
+        if self._recording is None:
+            return PICTURE_RATE
+        stamps = [_stamp(record) for record in islice(self._recording.records([self._channel]), FRAMES_FOR_RATE)]
+        intervals = [after - before for before, after in pairwise(stamps) if after > before]
+        if not intervals:
+            return PICTURE_RATE
+        # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
+        return min(MAX_RATE, max(MIN_RATE, round(1.0 / float(np.median(intervals)), 2)))
+
+    def _recorded(self, record: RecordedMessage) -> FrameFile:
+        """Return a recorded frame; it is broken where message or picture are."""
+        stamp = record.time * 1e-9
+        try:
+            message = record.decode()
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            if record.type_name == CAMERA["compressed"].type_name:
+                image = decode_image(message.data)
+            else:
+                image = unpack_image(message.data, message.height, message.width, message.step, message.encoding)
+        except (BagError, InvalidInputError) as error:
+            return FrameFile(f"{record.topic} {stamp:.6f}", None, str(error), stamp)
+        return FrameFile(f"{record.topic} {stamp:.6f}", np.asarray(image), "", stamp)
+
+
+def numbered(names: Sequence[str], form: str) -> list[str]:
+    """Return names each of which is there once: where one comes again, it gets a number.
+
+    Args:
+        names: that may come again.
+        form: of a name with its number, 2 and up, for example `{}_{}`.
+    """
+    given, numbers, taken = list[str](), Counter[str](), set(names)
+    for name in names:
+        numbers[name] += 1
+        own = name
+        while numbers[name] > 1 and (own := form.format(name, numbers[name])) in taken:
+            numbers[name] += 1
+        taken.add(own)
+        given.append(own)
+    return given
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """Return a name for each file; see `FrameSource.names`."""
+    parts = [Path(os.path.abspath(file)).parts for file in files]
+    names: dict[tuple[str, ...], str] = {}
+    unnamed, count = set(parts), 1
+    while unnamed:
+        uses = Counter(own[-count:] for own in unnamed)
+        told = {own for own in unnamed if uses[own[-count:]] == 1}
+        names |= {own: str(Path(*own[-count:])) for own in told}
+        unnamed, count = unnamed - told, count + 1
+    return numbered([names[own] for own in parts], "{} ({})")
+
+
+def _stamp(record: RecordedMessage) -> float:
+    """Return when a frame was taken [s]; when it was recorded, where it is broken."""
+    try:
+        stamp = record.decode().header.stamp
+    except BagError:
+        return record.time * 1e-9
+    return float(stamp.sec + stamp.nanosec * 1e-9)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magnetosuture_thread.console.control_lease import ControlLease
+from magnetosuture_thread.console.jog_controller import ControlLease
 
 
 def test_control_is_acquired_and_released():

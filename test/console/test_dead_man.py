@@ -7,7 +7,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magnetosuture_thread.console.dead_man import ZERO_VELOCITY, DeadManSwitch, DelayEstimator
+from magnetosuture_thread.console.jog_controller import ZERO_VELOCITY, DeadManSwitch, DelayEstimator
 
 EAST = (0.003, 0.0)
 NORTH = (0.0, 0.003)

@@ -17,7 +17,7 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.jobs.calibrate import CalibrationRequest, calibrate_bags, material_named, settings_of
+from magnetosuture_thread.jobs.calibrate import calibrate_bags, material_named, settings_of
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.setups import read_setup
 from test.calibration.runs import LENGTH, rig_run
@@ -155,18 +155,18 @@ def test_bags_of_different_threads_are_refused(folder: Path, tmp_path: Path):
     still = replace(trajectory(), metadata={})
     render_bag(still, setup, tmp_path / "silk", rate=15.0, poses=True)
     render_bag(still, read_setup("petri_35mm_polyamide"), tmp_path / "polyamide", rate=15.0, poses=True)
-    request = CalibrationRequest(setup=str(folder / "lab.yaml"))
+    own = str(folder / "lab.yaml")
     with pytest.raises(
         InvalidInputError, match="silk: got a thread with material silk_6_0, expected polyamide_7_0, as"
     ):
-        calibrate_bags([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", request)
+        calibrate_bags([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", setup_name=own)
 
 
 def test_a_bag_of_another_length_is_refused(folder: Path, tmp_path: Path):
     setup = tmp_path / "long.yaml"
     setup.write_text(SETUP.replace("0.019", "0.15"))
     with pytest.raises(BagError, match="is it another thread"):
-        calibrate_bags([folder / "one"], tmp_path / "found.yaml", CalibrationRequest(setup=str(setup)))
+        calibrate_bags([folder / "one"], tmp_path / "found.yaml", setup_name=str(setup))
 
 
 def test_a_material_is_told_by_how_it_begins():
@@ -180,6 +180,6 @@ def test_a_material_is_told_by_how_it_begins():
 def test_another_material_comes_with_its_own_numbers():
     setup = read_setup("petri_35mm_polyamide")
     own = replace(setup, model=replace(setup.model, elastic_modulus=3e9, diameter=7e-5))
-    assert settings_of(own, CalibrationRequest(material="polyamide")) == own.model
-    silk = settings_of(own, CalibrationRequest(material="silk", formulation="paper"))
+    assert settings_of(own, "polyamide", "") == own.model
+    silk = settings_of(own, "silk", "paper")
     assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.cli.commands.calibrate_coils import calibrate_coils
+from magnetosuture_thread.cli.commands.calibrate import calibrate_coils
 from magnetosuture_thread.coils.calibration import read_calibration
 from magnetosuture_thread.coils.field import coils_around, make_coils
 from magnetosuture_thread.coils.settings import CoilBridgeSettings

@@ -360,7 +360,8 @@ def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixt
 def test_without_ros_the_page_says_what_is_missing(monkeypatch, capsys: pytest.CaptureFixture[str]):
     for name in [name for name in sys.modules if name.startswith("magnetosuture_thread.nodes")]:
         monkeypatch.delitem(sys.modules, name)
-    for name in [name for name in sys.modules if "console_hosts" in name or name.split(".")[0] == "rclpy"]:
+    jobs = {f"magnetosuture_thread.jobs.{name}" for name in ("console", "console_hosts", "replay", "simulate")}
+    for name in [name for name in sys.modules if name in jobs or name.split(".")[0] == "rclpy"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert main(["console", "--port", "0"]) == 1

@@ -25,8 +25,7 @@ from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
 from magnetosuture_thread.interface import CURRENTS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, SCENE, Channel
 from magnetosuture_thread.jobs import evaluate_bag as job
 from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
-from magnetosuture_thread.jobs.evaluate_bag import Options
-from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions
+from magnetosuture_thread.jobs.evaluate_bag import RecordedPredictions
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
@@ -44,7 +43,7 @@ def broken(path: Path) -> Path:
 
 
 def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
-    (row,) = evaluate_bags([short_bag], tmp_path / "out", Options())
+    (row,) = evaluate_bags([short_bag], tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["pull.html", "table.csv", "table.json"]
     assert row["bag"] == "pull"
     assert row["setup"] == "petri_35mm_polyamide"
@@ -62,7 +61,7 @@ def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
 
 def test_what_is_wrong_with_one_bag_is_in_its_row(tmp_path: Path, short_bag: Path):
     said: list[str] = []
-    rows = evaluate_bags([broken(tmp_path / "=x"), short_bag], tmp_path / "out", Options(duration=0.4), log=said.append)
+    rows = evaluate_bags([broken(tmp_path / "=x"), short_bag], tmp_path / "out", duration=0.4, log=said.append)
     assert "nothing intact" in str(rows[0]["problem"])
     assert rows[1]["problem"] == ""
     assert not (tmp_path / "out" / "=x.html").exists()
@@ -73,8 +72,7 @@ def test_what_is_wrong_with_one_bag_is_in_its_row(tmp_path: Path, short_bag: Pat
 
 def test_workers_change_nothing_but_times(tmp_path: Path, short_bag: Path):
     bags = [short_bag, shutil.copytree(short_bag, tmp_path / "again" / "pull"), broken(tmp_path / "x")]
-    options = Options(duration=0.4)
-    one, two = (evaluate_bags(bags, tmp_path / f"out{n}", options, workers=n) for n in (1, 2))
+    one, two = (evaluate_bags(bags, tmp_path / f"out{n}", duration=0.4, workers=n) for n in (1, 2))
     assert without_times(one) == without_times(two)
     assert [row["bag"] for row in two] == ["pull", "pull-2", "x"]
     assert {path.name for path in (tmp_path / "out2").glob("*.html")} == {"pull.html", "pull-2.html"}
@@ -93,7 +91,7 @@ def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_ba
             for record in bag.records(names):
                 late = 20_000_000 if name in (NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded) else 0
                 writer.write(record.topic, record.time + late, record.data)
-    (row,) = evaluate_bags([both], tmp_path / "out", Options())
+    (row,) = evaluate_bags([both], tmp_path / "out")
     assert row["recorded_error_truth_frames"] == 28
     assert row["recorded_error_truth_mean_percent"] == pytest.approx(row["error_truth_mean_percent"], abs=1e-9)
     assert row["latency_frame_to_prediction_median_s"] == pytest.approx(0.02)
@@ -102,18 +100,17 @@ def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_ba
 
 
 def test_against_and_formulation_are_as_asked_for(tmp_path: Path, short_bag: Path):
-    options = Options(against="seen", formulation="paper", duration=0.4)
-    (row,) = evaluate_bags([short_bag], tmp_path / "out", options)
+    (row,) = evaluate_bags([short_bag], tmp_path / "out", against="seen", formulation="paper", duration=0.4)
     assert (row["error_truth_frames"], row["formulation"]) == (0, "paper")
-    (row,) = evaluate_bags([short_bag], tmp_path / "no", Options(source="poses"))
+    (row,) = evaluate_bags([short_bag], tmp_path / "no", source="poses")
     assert "/needle/measured_cp" in str(row["problem"])
 
 
 def test_a_wrong_set_up_is_said_at_once(tmp_path: Path, short_bag: Path):
     with pytest.raises(ConfigurationError):
-        evaluate_bags([short_bag], tmp_path / "out", Options(setup="none"))
+        evaluate_bags([short_bag], tmp_path / "out", setup_name="none")
     with pytest.raises(BagError, match="exists already"):
-        evaluate_bags([short_bag], tmp_path, Options())
+        evaluate_bags([short_bag], tmp_path)
     assert not (tmp_path / "out").exists()
 
 
@@ -122,7 +119,7 @@ def test_an_interruption_leaves_nothing(tmp_path: Path, short_bag: Path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        evaluate_bags([short_bag], tmp_path / "out", Options(), progress=interrupt)
+        evaluate_bags([short_bag], tmp_path / "out", progress=interrupt)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -211,7 +208,7 @@ def test_a_picture_has_the_obstacles_that_were_in_force(
         return draw_worst_frame(worst, *arguments, **named)
 
     monkeypatch.setattr(job, "draw_worst_frame", draw)
-    evaluate_bags([bag], tmp_path / "out", Options(duration=0.4))
+    evaluate_bags([bag], tmp_path / "out", duration=0.4)
     assert [worst.frame.obstacles for worst in shown] == [(ObstacleDisc((0.0, 0.012), 0.002),)] * len(shown)
     assert shown
     assert "Simulated camera frame at" in (tmp_path / "out" / "changed.html").read_text()
@@ -219,14 +216,14 @@ def test_a_picture_has_the_obstacles_that_were_in_force(
 
 def test_broken_currents_cost_no_figure(tmp_path: Path, short_bag: Path):
     bag = copied(short_bag, tmp_path / "b", [(CURRENTS, Bag(short_bag).start + 10**8, b"\0\1\0\0abc")])
-    (row,) = evaluate_bags([bag], tmp_path / "out", Options(duration=0.4))
+    (row,) = evaluate_bags([bag], tmp_path / "out", duration=0.4)
     assert row["problem"] == ""
 
 
 def test_why_nothing_was_predicted_is_said(tmp_path: Path, short_bag: Path):
     replay_offline(short_bag, tmp_path / "replay")
     bag = copied(tmp_path / "replay" / "bag", tmp_path / "b", [], leave=MEASURED_THREAD.recorded)
-    (row,) = evaluate_bags([bag], tmp_path / "out", Options(source="poses"))
+    (row,) = evaluate_bags([bag], tmp_path / "out", source="poses")
     assert str(row["problem"]).endswith("had a needle; waiting for the thread to be seen")
 
 
@@ -248,7 +245,7 @@ def test_recorded_predictions_of_frames_that_nobody_asks_for_hide_none(monkeypat
 def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short_bag: Path):
     said: list[str] = []
     bag = shutil.copytree(short_bag, tmp_path / "a\n\x1b[31m[b]<i>")
-    (row,) = evaluate_bags([bag], tmp_path / "out", Options(duration=0.3), log=said.append)
+    (row,) = evaluate_bags([bag], tmp_path / "out", duration=0.3, log=said.append)
     assert str(row["bag"]).isprintable()
     assert str(row["path"]).isprintable()
     assert (tmp_path / "out" / f"{row['bag']}.html").exists()

@@ -322,7 +322,7 @@ def test_a_bad_setup_is_refused_before_anything_starts(short_bag: Path, tmp_path
 
 
 def test_a_bag_of_raw_frames_alone_is_played(short_bag: Path, tmp_path: Path):
-    """The bag says which kind its images are, not the set-up; one that names no set-up gets the default."""
+    """The bag says which kind its images are, not the setup; one that names no setup gets the default."""
     with BagWriter(tmp_path / "raw") as writer:
         writer.add_topic(IMAGE.recorded, IMAGE.type_name)
         for each in Bag(short_bag).records({FRAMES}):
@@ -343,7 +343,7 @@ def test_a_bag_of_raw_frames_alone_is_played(short_bag: Path, tmp_path: Path):
     summary = replay_live(tmp_path / "raw", tmp_path / "out", log=said.append)
     assert (summary.frames, summary.tracked, summary.commands, summary.driven) == (30, 28, 0, 0)
     assert summary.error_truth is None
-    assert any(line.startswith("the bag names no set-up; taking petri_35mm_polyamide") for line in said)
+    assert any(line.startswith("the bag names no setup; taking petri_35mm_polyamide") for line in said)
     assert summary.simulated == ""
 
 

@@ -1,4 +1,4 @@
-"""What a bag is replayed with: its own scene and set-up, or those that are asked for."""
+"""What a bag is replayed with: its own scene and setup, or those that are asked for."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import SCENE
-from magnetosuture_thread.jobs.playing import Playing
-from magnetosuture_thread.jobs.replay_inputs import opened
-from magnetosuture_thread.jobs.simulate import SCENARIO_NOTE
+from magnetosuture_thread.jobs.replay import GraphInput
+from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, open_bag
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
@@ -48,9 +47,7 @@ def copied(short_bag: Path, tmp_path: Path):
 
 def given(path: Path, setup_name: str = "", start: float = 0.0):
     """Open a bag."""
-    return opened(
-        path, setup_name=setup_name, source="auto", start=start, duration=None, remap={}, frame="dish", log=print
-    )
+    return open_bag(path, print, setup_name=setup_name, start=start)
 
 
 def test_the_bags_own_scene_counts_whatever_the_setup_says(copied):
@@ -80,8 +77,8 @@ def test_a_damaged_scene_is_refused(copied):
 
 
 def test_a_setup_of_an_earlier_version_is_refused_with_what_to_do(copied):
-    path = copied([], **{"setup": "mine", SCENARIO_NOTE: OLD})
-    words = r"the bag's own set-up: got 'vision_tracker\.dish_diameter', expected .*; name a set-up by --setup"
+    path = copied([], **{"setup": "mine", SETUP_NOTE: OLD})
+    words = r"the bag's own setup: got 'vision_tracker\.dish_diameter', expected .*; name a setup by --setup"
     with pytest.raises(ConfigurationError, match=words), given(path):
         pass
     with given(path, setup_name="petri_35mm_polyamide") as found:
@@ -90,14 +87,14 @@ def test_a_setup_of_an_earlier_version_is_refused_with_what_to_do(copied):
 
 def test_the_scene_of_a_note_need_not_be_on_this_machine(copied):
     text = "/**: {ros__parameters: {scene: /nowhere/mine.yaml}}\n"
-    with given(copied([(0.0, POST)], **{SCENARIO_NOTE: text})) as found:
+    with given(copied([(0.0, POST)], **{SETUP_NOTE: text})) as found:
         assert found.setup.scene == POST
 
 
 def test_the_scene_is_played_first_and_nodes_begin_in_it(copied, tmp_path: Path):
     path = copied([(0.0, Scene()), (0.4, POST)], setup="petri_35mm_polyamide")
     with given(path, start=0.5) as found:
-        playing = Playing(found)
+        playing = GraphInput(found)
         first, *rest = playing.records()
         assert first.topic == SCENE.recorded
         assert first.time == found.begin <= rest[0].time
@@ -111,6 +108,6 @@ def test_the_scene_is_played_first_and_nodes_begin_in_it(copied, tmp_path: Path)
 def test_a_scene_that_changes_on_the_way_is_played_when_it_does(copied):
     path = copied([(0.0, Scene()), (0.4, POST)], setup="petri_35mm_polyamide")
     with given(path) as found:
-        told = [record for record in Playing(found).records() if record.topic == SCENE.recorded]
+        told = [record for record in GraphInput(found).records() if record.topic == SCENE.recorded]
         assert [parse_scene_message(record.decode()) for record in told] == [Scene(), POST]
         assert told[1].time == pytest.approx(found.begin + 4e8, abs=1e8)

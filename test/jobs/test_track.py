@@ -16,14 +16,13 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.cli.commands.calibrate_camera import calibrate_camera
-from magnetosuture_thread.cli.commands.track import track_table
+from magnetosuture_thread.cli.commands.calibrate import calibrate_camera
+from magnetosuture_thread.cli.commands.evaluate import track_table
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.jobs import frames
-from magnetosuture_thread.jobs.frames import FrameSource
+from magnetosuture_thread.jobs import track as frames
 from magnetosuture_thread.jobs.render import render_bag
-from magnetosuture_thread.jobs.track import settings_with, track
+from magnetosuture_thread.jobs.track import FrameSource, settings_with, track
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.look import State

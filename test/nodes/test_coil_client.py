@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.cli import main
-from magnetosuture_thread.cli.commands.coils import ACTIONS
+from magnetosuture_thread.cli.commands.run_graph import COIL_ACTIONS
 from magnetosuture_thread.nodes import coil_client
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 
@@ -55,4 +55,4 @@ def test_without_a_bridge_it_fails_and_says_so(
         code, said = press(capsys, action)
         assert code == 1
         assert "no coil_bridge" in said
-    assert set(ACTIONS) >= {"stop", "state"}
+    assert set(COIL_ACTIONS) >= {"stop", "state"}

@@ -12,36 +12,24 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from magnetosuture_thread.cli.arguments import add_remap, output_file
-from magnetosuture_thread.cli.command import DONE, Subparsers, command
+from magnetosuture_thread.cli.arguments import DONE, FAILED, Subparsers, add_remap, command, output_file
 from magnetosuture_thread.cli.terminal import make_console, make_log, printable, progress, write_json
 
-DAMAGED = 1
-MAX_NOTE_CHARS = 200  # characters of a note that are shown; one may hold a whole scenario
+MAX_NOTE_CHARS = 200  # of a note that are shown; one may hold a whole setup
 
 DESCRIPTION = """\
-Look through a bag, or make a whole one of what is intact in it. BAG is an mcap or sqlite3 file of any
-recorder, or the folder of a bag.
-"""
+Check a recorded bag, or repair it.
 
-CHECK = """\
-Go through all of a bag: every checksum, and every message's time and stamp. For each topic: its type, how
-many messages, their mean rate, when the first and the last came, the greatest gap, and how often a stamp
-went back; the types follow. What is damaged is said, with what is lost; all else is shown as it can be read.
-"""
-
-REPAIR = """\
-Write every intact message of a bag into a new one, with the old one's notes and definitions of types, and
-say how many there are and what is lost, where and when.
+BAG is an mcap or sqlite3 file of any recorder, or the folder of a bag.
 """
 
 
 def add(subparsers: Subparsers) -> None:
     """Add the command."""
-    parser = command(subparsers, "bag", "check a recorded bag, or repair it", DESCRIPTION, run_bag_check)
+    parser = command(subparsers, "bag", text=DESCRIPTION)
     actions = parser.add_subparsers(title="what to do", metavar="ACTION", required=True)
-    check = command(actions, "check", "say what a bag holds, and whether it is whole", CHECK, run_bag_check)
-    repair = command(actions, "repair", "make a whole bag of what is intact", REPAIR, run_repair)
+    check = command(actions, "check", run_bag_check)
+    repair = command(actions, "repair", run_repair)
     for action in (check, repair):
         action.add_argument("bag", type=Path, metavar="BAG", help="a bag's file or folder")
         add_remap(action)
@@ -51,7 +39,12 @@ def add(subparsers: Subparsers) -> None:
 
 
 def run_bag_check(options: argparse.Namespace) -> int:
-    """Say what a bag holds, and whether it is whole."""
+    """Report what a bag holds, and whether it is intact.
+
+    The whole bag is read: every checksum, and every message's time and stamp. For each topic: its type, how
+    many messages, their mean rate, when the first and the last came, the greatest gap, and how often a stamp
+    went back; the types follow. What is damaged is reported, with what is lost; all else is shown as it can be read.
+    """
     from magnetosuture_thread.bags.reader import Bag
     from magnetosuture_thread.bags.report import inspect_bag
 
@@ -63,11 +56,15 @@ def run_bag_check(options: argparse.Namespace) -> int:
     for line in _lines(found):
         make_log(console)(line)
     write_json(options.json, found)
-    return DAMAGED if found["damage"] or found["refused"] else DONE
+    return FAILED if found["damage"] or found["refused"] else DONE
 
 
 def run_repair(options: argparse.Namespace) -> int:
-    """Write what is intact in a bag into a new one."""
+    """Write every intact message of a bag into a new one.
+
+    The new bag has the old one's notes and definitions of types. The command reports how many messages there are and
+    what is lost, where and when.
+    """
     from magnetosuture_thread.bags.damage_report import pluralize
     from magnetosuture_thread.bags.reader import Bag
     from magnetosuture_thread.bags.repair import write_repaired_bag

@@ -11,8 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from magnetosuture_thread.cli.arguments import number_argument, output_file
-from magnetosuture_thread.cli.command import DONE, Subparsers, command
+from magnetosuture_thread.cli.arguments import DONE, Subparsers, command, number_argument, output_file
 from magnetosuture_thread.cli.terminal import make_console, make_log, write_json
 from magnetosuture_thread.errors import ConfigurationError
 
@@ -23,48 +22,39 @@ NEEDLE_WIDTH = 0.0004  # m
 PICTURES = (".png", ".svg")
 
 DESCRIPTION = """\
-Check a scene file, or draw it. FILE is a YAML or GeoJSON file, or the name of a scene that ships with the
+Check a scene file, or draw it.
+
+FILE is a YAML or GeoJSON file, or the name of a scene that ships with the
 package: dish_35mm, dish_35mm_post, dish_150mm or hernia_ring. Its format is in docs/scenes.md.
-"""
-
-CHECK = """\
-Read a scene file and show its dish, its version and its shapes. What is allowed and yet is often a slip is
-shown as a warning: shapes that overlap, gaps and holes narrower than the needle, shapes across the wall.
-A file that is no scene is refused with exit code 2; warnings do not change the exit code.
-
---json writes file, version, dish (diameter, depth [m]), shapes (name, kind, type, definition, bounds_m,
-area_m2, vertices) and warnings (what: overlap, gap, hole or wall; shapes; value [m], of an overlap [m^2];
-place [m]; text).
-"""
-
-DRAW = """\
-Draw a scene file from above, with names and scale, as PNG or SVG.
 """
 
 
 def add(subparsers: Subparsers) -> None:
     """Add the command."""
-    parser = command(subparsers, "scene", "check a scene file, or draw it", DESCRIPTION, run_scene_check)
+    parser = command(subparsers, "scene", text=DESCRIPTION)
     actions = parser.add_subparsers(title="what to do", metavar="ACTION", required=True)
-    check = command(actions, "check", "show what a scene holds, and what to look at", CHECK, run_scene_check)
-    draw = command(actions, "draw", "draw a scene as PNG or SVG", DRAW, run_draw)
+    check = command(actions, "check", run_scene_check)
+    draw = command(actions, "draw", run_draw)
     for action in (check, draw):
         action.add_argument("file", metavar="FILE", help="a scene's file or name")
-    check.add_argument(
-        "--needle-width",
-        type=number_argument(0.0, 0.1),
-        default=NEEDLE_WIDTH,
-        metavar="W",
-        help="gaps narrower than this are reported [m] (default: %(default)s)",
-    )
+    width = "gaps narrower than this are reported [m] (default: %(default)s)"
+    check.add_argument("--needle-width", type=number_argument(0.0, 0.1), default=NEEDLE_WIDTH, metavar="W", help=width)
     check.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
-    draw.add_argument(
-        "--output", type=output_file, required=True, metavar="FILE", help="the picture to write, .png or .svg"
-    )
+    picture = "the picture to write, .png or .svg"
+    draw.add_argument("--output", type=output_file, required=True, metavar="FILE", help=picture)
 
 
 def run_scene_check(options: argparse.Namespace) -> int:
-    """Show what a scene holds, and what to look at."""
+    """Show what a scene holds, with warnings.
+
+    A scene file is read, and its dish, its version and its shapes are shown. What is allowed and yet is often a slip is
+    shown as a warning: shapes that overlap, gaps and holes narrower than the needle, shapes across the wall.
+    A file that is no scene is refused with exit code 2; warnings do not change the exit code.
+
+    --json writes file, version, dish (diameter, depth [m]), shapes (name, kind, type, definition, bounds_m,
+    area_m2, vertices) and warnings (what: overlap, gap, hole or wall; shapes; value [m], of an overlap [m^2];
+    place [m]; text).
+    """
     from magnetosuture_thread.scene import read_scene
     from magnetosuture_thread.scene.checks import scene_warnings
 
@@ -87,7 +77,7 @@ def run_scene_check(options: argparse.Namespace) -> int:
 
 
 def run_draw(options: argparse.Namespace) -> int:
-    """Draw a scene."""
+    """Draw a scene file from above, with names and scale, as PNG or SVG."""
     if options.output.suffix not in PICTURES:
         raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
 

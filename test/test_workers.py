@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import importlib
+import multiprocessing
 import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from magnetosuture_thread.jobs.workers import ONE_THREAD, WorkerDiedError, run_all
+from magnetosuture_thread.workers import ONE_THREAD, WorkerDiedError, WorkerPool
 
 SOURCE = """
 import os
-from magnetosuture_thread.jobs.workers import ONE_THREAD
+from magnetosuture_thread.workers import ONE_THREAD
 
-def work(task, say, progress):
-    say(f"task {task}")
+def work(task, log, progress):
+    log(f"task {task}")
     progress(0.5)
     if task == 3:
         os._exit(9)
@@ -35,10 +36,10 @@ def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_each_task_is_done_once_and_a_process_that_dies_takes_only_its_own_with_it(work: Any):
-    results: dict[int, Any] = {}
     said: list[str] = []
     shares: list[float] = []
-    run_all(work, [1, 2, 3, 4, 5], 2, done=results.__setitem__, log=said.append, progress=shares.append)
+    with WorkerPool(work, 2) as pool:
+        results = dict(pool.run([1, 2, 3, 4, 5], log=said.append, progress=shares.append))
     assert isinstance(results.pop(2), WorkerDiedError)
     assert {index: square for index, (square, _, _) in results.items()} == {0: 1, 1: 4, 3: 16, 4: 25}
     assert all(threads == ["1"] * len(ONE_THREAD) for _, _, threads in results.values())
@@ -52,11 +53,20 @@ def test_what_ends_the_call_ends_the_processes(work: Any, workers: int):
     def interrupt(text: str) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        run_all(work, [1, 2, 4], workers, done=lambda index, result: None, log=interrupt)
+    with pytest.raises(KeyboardInterrupt), WorkerPool(work, workers) as pool:
+        list(pool.run([1, 2, 4], log=interrupt))
+    assert not multiprocessing.active_children()
 
 
 def test_one_task_needs_no_process_of_its_own(work: Any):
-    results: list[Any] = []
-    run_all(work, [2], 8, done=lambda index, result: results.append(result))
-    assert results[0][:2] == (4, os.getpid())
+    with WorkerPool(work, 8) as pool:
+        ((index, result),) = pool.run([2])
+    assert (index, *result[:2]) == (0, 4, os.getpid())
+
+
+def test_processes_serve_again_and_an_error_of_a_task_is_raised_here(work: Any):
+    with WorkerPool(work, 2) as pool:
+        first, second = dict(pool.run([1, 2])), dict(pool.run([4, 5]))
+        assert {process for _, process, _ in second.values()} <= {process for _, process, _ in first.values()}
+        with pytest.raises(TypeError):
+            list(pool.run(["no number", 1]))
