@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from magnetosuture_thread.cli.parser import make_parser
+from magnetosuture_thread.cli.main import make_parser
 
 import magnetosuture_thread
 from magnetosuture_thread.resources import share_directory
