@@ -68,9 +68,9 @@ def run_bag_check(options: argparse.Namespace) -> int:
 
 def run_repair(options: argparse.Namespace) -> int:
     """Write what is intact in a bag into a new one."""
-    from magnetosuture_thread.bags.damage_report import pluralize
     from magnetosuture_thread.bags.reader import Bag
-    from magnetosuture_thread.bags.repair import write_repaired_bag
+    from magnetosuture_thread.bags.storage import pluralize
+    from magnetosuture_thread.bags.writer import write_repaired_bag
     from magnetosuture_thread.jobs.output import whole_folder
 
     console = make_console()

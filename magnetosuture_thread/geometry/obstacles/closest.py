@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.polyline import Points
+
+Vector = tuple[float, float, float]
+"""A point or a direction in compiled code; its third coordinate is 0 in the plane."""
 
 
 @compiled
@@ -28,55 +27,12 @@ def closest_on_segment(px: float, py: float, ax: float, ay: float, bx: float, by
     return ax + t * dx, ay + t * dy, t
 
 
-@compiled
-def closest_on_triangle(
-    px: float, py: float, ax: float, ay: float, bx: float, by: float, cx: float, cy: float
-) -> tuple[float, float]:
-    """Return the point of a triangle abc in the plane that is closest to p; p itself when inside.
-
-    Otherwise the closest of the clamped projections onto the three edges. Either direction of abc will do.
-
-    Source: [Forghani2025], closest point on each triangle of an obstacle.
-    """
-    first = (bx - ax) * (py - ay) - (by - ay) * (px - ax)
-    second = (cx - bx) * (py - by) - (cy - by) * (px - bx)
-    third = (ax - cx) * (py - cy) - (ay - cy) * (px - cx)
-    area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    if (area > 0.0 and first >= 0.0 and second >= 0.0 and third >= 0.0) or (
-        area < 0.0 and first <= 0.0 and second <= 0.0 and third <= 0.0
-    ):
-        return px, py
-    qx, qy, _ = closest_on_segment(px, py, ax, ay, bx, by)
-    best = (px - qx) ** 2 + (py - qy) ** 2
-    rx, ry, _ = closest_on_segment(px, py, bx, by, cx, cy)
-    square = (px - rx) ** 2 + (py - ry) ** 2
-    if square < best:
-        best, qx, qy = square, rx, ry
-    rx, ry, _ = closest_on_segment(px, py, cx, cy, ax, ay)
-    if (px - rx) ** 2 + (py - ry) ** 2 < best:
-        qx, qy = rx, ry
-    return qx, qy
-
-
 FACE, EDGE_AB, EDGE_BC, EDGE_CA, VERTEX_A, VERTEX_B, VERTEX_C = range(7)
 """Regions around a triangle in space: by the part of it that is closest."""
 
 
 @compiled
-def closest_in_space(
-    px: float,
-    py: float,
-    pz: float,
-    ax: float,
-    ay: float,
-    az: float,
-    bx: float,
-    by: float,
-    bz: float,
-    cx: float,
-    cy: float,
-    cz: float,
-) -> tuple[float, float, float, int]:
+def closest_in_space(p: Vector, a: Vector, b: Vector, c: Vector) -> tuple[float, float, float, int]:
     """Return the point of a triangle abc in space that is closest to p, and the region that p is in.
 
     The vertices' regions are told by the signs of projections onto the edges, the edges' by those of the
@@ -84,6 +40,10 @@ def closest_in_space(
 
     Source: C. Ericson, Real-Time Collision Detection, 2004, section 5.1.5.
     """
+    px, py, pz = p
+    ax, ay, az = a
+    bx, by, bz = b
+    cx, cy, cz = c
     ux, uy, uz = bx - ax, by - ay, bz - az
     vx, vy, vz = cx - ax, cy - ay, cz - az
     d1 = ux * (px - ax) + uy * (py - ay) + uz * (pz - az)
@@ -113,48 +73,3 @@ def closest_in_space(
     total = weight_a + weight_b + weight_c
     t, s = weight_b / total, weight_c / total
     return ax + t * ux + s * vx, ay + t * uy + s * vy, az + t * uz + s * vz, FACE
-
-
-@compiled
-def _closest(points: Points, vertices: Points, triangles: NDArray[np.int64], closest: Points) -> None:
-    for i in range(len(points)):
-        for j in range(len(triangles)):
-            a, b, c = vertices[triangles[j, 0]], vertices[triangles[j, 1]], vertices[triangles[j, 2]]
-            if points.shape[1] == 2:
-                x, y = closest_on_triangle(points[i, 0], points[i, 1], a[0], a[1], b[0], b[1], c[0], c[1])
-            else:
-                x, y, z, _ = closest_in_space(
-                    points[i, 0], points[i, 1], points[i, 2], a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
-                )
-                closest[i, j, 2] = z
-            closest[i, j, 0] = x
-            closest[i, j, 1] = y
-
-
-def closest_on_triangles(points: Points, vertices: Points, triangles: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return for each point the closest point on each triangle.
-
-    In the plane a triangle is solid: a point inside is its own closest point.
-
-    Args:
-        points: shape (m, d), d = 2 or 3 [m].
-        vertices: shape (v, d) [m].
-        triangles: indices of vertices, shape (t, 3).
-
-    Returns:
-        Closest points, shape (m, t, d) [m].
-
-    Raises:
-        ValueError: when the shapes do not fit, or an index is out of range.
-
-    Source: [Forghani2025], closest point on each triangle of an obstacle.
-    """
-    # Copies: the compiled loop takes one kind of array, writable and contiguous.
-    points, vertices, triangles = np.array(points, float), np.array(vertices, float), np.array(triangles, np.int64)
-    if points.ndim != 2 or points.shape[1] not in (2, 3) or vertices.shape[1:] != points.shape[1:]:
-        raise ValueError(f"points {points.shape} and vertices {vertices.shape} must be (m, d) and (v, d), d = 2 or 3")
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or (triangles < 0).any() or (triangles >= len(vertices)).any():
-        raise ValueError("triangles must be (t, 3) indices of vertices")
-    closest = np.empty((len(points), len(triangles), points.shape[1]))
-    _closest(points, vertices, triangles, closest)
-    return closest

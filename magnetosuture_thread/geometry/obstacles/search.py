@@ -14,6 +14,7 @@ from magnetosuture_thread.geometry.obstacles.closest import (
     EDGE_CA,
     FACE,
     VERTEX_A,
+    Vector,
     closest_in_space,
 )
 from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_MARKS, FACE_WIDTH
@@ -43,23 +44,28 @@ class Nearest(NamedTuple):
     z: float
 
 
+class ContactRows(NamedTuple):
+    """Arrays that contacts are written to, row by row.
+
+    Attributes:
+        distance: signed distance, shape (c,) [m].
+        normal: outward direction, shape (c, d).
+    """
+
+    distance: NDArray[np.float64]
+    normal: NDArray[np.float64]
+
+
 @compiled
-def add_row(
-    start: int,
-    count: int,
-    length: float,
-    x: float,
-    y: float,
-    z: float,
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
-) -> int:
+def add_row(start: int, count: int, length: float, direction: Vector, rows: ContactRows) -> int:
     """Write a row unless it is the same boundary point as a row since `start`; return the new count.
 
     Where neighbouring edges are in line, rounding may give the point between them to both.
     """
     if count < 0:
         return count
+    distance, normal = rows.distance, rows.normal
+    x, y, z = direction
     dimension = normal.shape[1]
     for row in range(start, count):
         if (
@@ -111,7 +117,7 @@ def search_edges(
         distance: rows' signed distance, written from `count` on [m].
         normal: rows' outward direction.
     """
-    start = count
+    start, rows = count, ContactRows(distance, normal)
     limit = reach * reach if reach >= 0.0 else -1.0
     best = np.inf
     # Of the best: whether a vertex; the vector from it to the point; its normal or pseudo-normal.
@@ -132,9 +138,9 @@ def search_edges(
             ):
                 length = math.sqrt(square)
                 if length > MIN_DISTANCE:
-                    count = add_row(start, count, length, rx / length, ry / length, 0.0, distance, normal)
+                    count = add_row(start, count, length, (rx / length, ry / length, 0.0), rows)
                 else:
-                    count = add_row(start, count, length, numbers[k + 9], numbers[k + 10], 0.0, distance, normal)
+                    count = add_row(start, count, length, (numbers[k + 9], numbers[k + 10], 0.0), rows)
         elif along >= numbers[k + 6]:
             rx, ry = x - numbers[k + 2], y - numbers[k + 3]
             square = rx * rx + ry * ry
@@ -146,7 +152,7 @@ def search_edges(
             if square < best:
                 best, corner, bx, by, nx, ny = square, False, rx, ry, dy, -dx
             if side >= 0.0 and square <= limit:
-                count = add_row(start, count, side, dy, -dx, 0.0, distance, normal)
+                count = add_row(start, count, side, (dy, -dx, 0.0), rows)
     if best == np.inf:
         return Nearest(count, best, best, 0.0, 0.0, 0.0)
     length = math.sqrt(best)
@@ -158,66 +164,47 @@ def search_edges(
 
 @compiled
 def search_faces(
-    x: float,
-    y: float,
-    z: float,
+    point: Vector,
     reach: float,
+    table: NDArray[np.int64],
     numbers: NDArray[np.float64],
-    base: int,
-    index: NDArray[np.int32],
-    marks: int,
-    spokes: int,
+    entries: NDArray[np.int32],
     first: int,
     last: int,
     count: int,
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
+    rows: ContactRows,
 ) -> Nearest:
     """Return the nearest of some faces, and write a row for each local minimum of the distance outside.
 
     A face gives a row when the projection falls inside of it and the point is on its outer side; an edge or
-    a vertex when the closest point of all its faces is on it. Arguments as for `search_edges`, and:
+    a vertex when the closest point of all its faces is on it. Arguments are like those of `search_edges`:
 
     Args:
-        x: coordinate of the point [m].
-        y: coordinate of the point [m].
-        z: coordinate of the point [m].
+        point: coordinates [m].
         reach: greatest distance of a row; negative for no rows [m].
-        numbers: the table of features.
-        base: where the faces of this obstacle begin in it.
-        index: entries of cells, and marks of faces.
-        marks: where the marks of this obstacle begin in `index`.
-        spokes: where the spokes of this obstacle begin in `numbers`.
-        first: the first entry in `index`; with `first` negative, all faces 0 ... last - 1 are searched.
+        table: the obstacle's row of `WorkspaceData.tables`.
+        numbers: the table of features, and spokes.
+        entries: entries of cells, and marks of faces.
+        first: the first entry in `entries`; with `first` negative, all faces 0 ... last - 1 are searched.
         last: the one after the last entry.
         count: number of rows so far.
-        distance: rows' signed distance, written from `count` on [m].
-        normal: rows' outward direction.
+        rows: where rows are written from `count` on.
     """
-    start = count
+    x, y, z = point
+    start, base, marks, spokes = count, table[6], table[7], table[8]
     limit = reach * reach if reach >= 0.0 else -1.0
     best, bx, by, bz, face_normal, blunt = np.inf, 0.0, 0.0, 0.0, 0, False
     for slot in range(max(first, 0), last):
-        face = index[slot] if first >= 0 else slot
+        face = entries[slot] if first >= 0 else slot
         k = base + FACE_WIDTH * face
-        qx, qy, qz, region = closest_in_space(
-            x,
-            y,
-            z,
-            numbers[k],
-            numbers[k + 1],
-            numbers[k + 2],
-            numbers[k + 3],
-            numbers[k + 4],
-            numbers[k + 5],
-            numbers[k + 6],
-            numbers[k + 7],
-            numbers[k + 8],
-        )
+        a = (numbers[k], numbers[k + 1], numbers[k + 2])
+        b = (numbers[k + 3], numbers[k + 4], numbers[k + 5])
+        c = (numbers[k + 6], numbers[k + 7], numbers[k + 8])
+        qx, qy, qz, region = closest_in_space(point, a, b, c)
         # Where the normal of the region is in the row of numbers.
         if region == FACE:
             at = k + 9
-            rx, ry, rz = x - numbers[k], y - numbers[k + 1], z - numbers[k + 2]
+            rx, ry, rz = x - a[0], y - a[1], z - a[2]
             side = rx * numbers[at] + ry * numbers[at + 1] + rz * numbers[at + 2]
             square = side * side
         else:
@@ -232,24 +219,27 @@ def search_faces(
         mark = marks + FACE_MARKS * face
         if EDGE_AB <= region <= EDGE_CA:
             m = k + 12 + 3 * (region - EDGE_AB)
-            if index[mark + region - EDGE_AB] == 0 or rx * numbers[m] + ry * numbers[m + 1] + rz * numbers[m + 2] > 0.0:
+            if (
+                entries[mark + region - EDGE_AB] == 0
+                or rx * numbers[m] + ry * numbers[m + 1] + rz * numbers[m + 2] > 0.0
+            ):
                 continue
         elif region >= VERTEX_A:
-            spoke = index[mark + 3 + region - VERTEX_A]
+            spoke = entries[mark + 3 + region - VERTEX_A]
             if spoke < 0:
                 continue
-            while spoke < index[mark + 6 + region - VERTEX_A]:
+            while spoke < entries[mark + 6 + region - VERTEX_A]:
                 s = spokes + 3 * spoke
                 if rx * numbers[s] + ry * numbers[s + 1] + rz * numbers[s + 2] > 0.0:
                     break
                 spoke += 1
-            if spoke < index[mark + 6 + region - VERTEX_A]:
+            if spoke < entries[mark + 6 + region - VERTEX_A]:
                 continue
         length = math.sqrt(square)
         if region == FACE or length <= MIN_DISTANCE:
-            count = add_row(start, count, length, numbers[at], numbers[at + 1], numbers[at + 2], distance, normal)
+            count = add_row(start, count, length, (numbers[at], numbers[at + 1], numbers[at + 2]), rows)
         else:
-            count = add_row(start, count, length, rx / length, ry / length, rz / length, distance, normal)
+            count = add_row(start, count, length, (rx / length, ry / length, rz / length), rows)
     if best == np.inf:
         return Nearest(count, best, best, 0.0, 0.0, 0.0)
     length = math.sqrt(best)

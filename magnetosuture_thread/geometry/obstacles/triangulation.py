@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles.polygon import Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import Polygon
 from magnetosuture_thread.geometry.polyline import Points
 
 

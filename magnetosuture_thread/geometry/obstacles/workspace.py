@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
-from magnetosuture_thread.geometry.obstacles.disc import Disc
-from magnetosuture_thread.geometry.obstacles.mesh import Mesh
 from magnetosuture_thread.geometry.obstacles.packing import Obstacle, pack_obstacles
-from magnetosuture_thread.geometry.obstacles.polygon import Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 
 _INITIAL_ROWS = 256  # contacts that `near` has room for at first
