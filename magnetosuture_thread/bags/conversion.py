@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -54,23 +55,6 @@ class RigidTransform:
         return np.asarray(self.rotation.apply(points) + self.translation)
 
 
-@dataclass
-class _Edge:
-    """Transforms of a frame into its parents, over time, or one static transform."""
-
-    is_static: bool
-    stamps: list[int] = field(default_factory=list)
-    parents: list[str] = field(default_factory=list)
-    values: list[RigidTransform] = field(default_factory=list)
-
-    def lookup(self, stamp: int | None) -> tuple[str, RigidTransform] | None:
-        """Return parent and transform, the latest that is not later than a stamp; the last of all if None."""
-        if self.is_static or stamp is None:
-            return self.parents[-1], self.values[-1]
-        index = bisect_right(self.stamps, stamp) - 1
-        return (self.parents[index], self.values[index]) if index >= 0 else None
-
-
 class TransformTree:
     """Tree of frames.
 
@@ -80,8 +64,9 @@ class TransformTree:
     """
 
     def __init__(self, messages: Iterable[tuple[str, Any]]) -> None:
-        self._edges: dict[str, _Edge] = {}
-        moving: dict[str, list[tuple[int, str, RigidTransform]]] = {}
+        # By child frame, in the order of time: stamp, parent, and the transform into it from then on.
+        self._edges: dict[str, list[tuple[float, str, RigidTransform]]] = {}
+        static: dict[str, list[tuple[float, str, RigidTransform]]] = {}
         for topic, message in messages:
             for each in message.transforms:
                 child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
@@ -89,31 +74,25 @@ class TransformTree:
                 if rigid is None or child == parent:
                     continue
                 if topic == STATIC:
-                    self._edges[child] = _Edge(True, [0], [parent], [rigid])
+                    static[child] = [(-math.inf, parent, rigid)]
                 else:
                     stamp = each.header.stamp.sec * 10**9 + each.header.stamp.nanosec
-                    moving.setdefault(child, []).append((stamp, parent, rigid))
-        for child, entries in moving.items():
-            if child not in self._edges:
-                entries.sort(key=lambda entry: entry[0])
-                stamps, parents, values = zip(*entries, strict=True)
-                self._edges[child] = _Edge(False, list(stamps), list(parents), list(values))
+                    self._edges.setdefault(child, []).append((stamp, parent, rigid))
+        self._edges |= static
+        for entries in self._edges.values():
+            entries.sort(key=itemgetter(0))
 
     @property
     def frames(self) -> list[str]:
         """Names of all frames."""
-        parents = {parent for edge in self._edges.values() for parent in edge.parents}
-        return sorted(parents | set(self._edges))
+        return sorted({parent for entries in self._edges.values() for _, parent, _ in entries} | set(self._edges))
 
     def is_connected(self, frame: str, target: str) -> bool:
         """Return whether a frame can be transformed into another at any time."""
-        return self._lookup(frame, target, None) is not None
+        return self.lookup(frame, target, None) is not None
 
-    def lookup(self, frame: str, target: str, stamp: int) -> RigidTransform | None:
-        """Return the transform from a frame into another at a time [ns]; None where it is unknown."""
-        return self._lookup(frame, target, stamp)
-
-    def _lookup(self, frame: str, target: str, stamp: int | None) -> RigidTransform | None:
+    def lookup(self, frame: str, target: str, stamp: int | None) -> RigidTransform | None:
+        """Return the transform from a frame into another at a time [ns], the last if None; None where it is unknown."""
         ups, downs = self._ancestors(frame, stamp), self._ancestors(target, stamp)
         for ancestor, rigid in ups.items():
             if ancestor in downs:
@@ -123,8 +102,11 @@ class TransformTree:
     def _ancestors(self, frame: str, stamp: int | None) -> dict[str, RigidTransform]:
         """Return the transform of a frame into each of its ancestors, from the nearest on."""
         found, rigid = {frame: RigidTransform.identity()}, RigidTransform.identity()
-        while (edge := self._edges.get(frame)) is not None and (step := edge.lookup(stamp)) is not None:
-            frame, up = step
+        while entries := self._edges.get(frame):
+            index = len(entries) if stamp is None else bisect_right(entries, stamp, key=itemgetter(0))
+            if not index:
+                break  # Nothing is known as early as that.
+            _, frame, up = entries[index - 1]
             if frame in found:
                 break  # A cycle of frames.
             rigid = up.compose(rigid)
@@ -178,26 +160,6 @@ def pose_with_covariance(message: Any, time: int) -> Any:
     return MESSAGES.pose_with_covariance(_header_of(message), _pose_in(message), values)
 
 
-def path_of_path(message: Any, time: int) -> Any:
-    """Return a Path of a Path."""
-    return _path(message, [_pose(each.pose.position, each.pose.orientation) for each in message.poses])
-
-
-def path_of_poses(message: Any, time: int) -> Any:
-    """Return a Path of a PoseArray."""
-    return _path(message, [_pose(each.position, each.orientation) for each in message.poses])
-
-
-def path_of_polygon(message: Any, time: int) -> Any:
-    """Return a Path of a PolygonStamped, from its first point to its last."""
-    return _path(message, [_pose(point) for point in message.polygon.points])
-
-
-def path_of_vertices(message: Any, time: int) -> Any:
-    """Return a Path of a PredictedThread."""
-    return _path(message, [_pose(point) for point in message.positions])
-
-
 def path_of_marker(message: Any, time: int) -> Any:
     """Return a Path of a Marker that is a line strip."""
     if message.action != ADD or message.type != LINE_STRIP:
@@ -213,16 +175,6 @@ def path_of_marker(message: Any, time: int) -> Any:
     return _path(message, [MESSAGES.pose(xyz, UPRIGHT) for xyz in moved])
 
 
-def twist_of_twist(message: Any, time: int) -> Any:
-    """Return a TwistStamped of a TwistStamped."""
-    return MESSAGES.twist_stamped(_header_of(message), _twist(message.twist))
-
-
-def twist_without_stamp(message: Any, time: int) -> Any:
-    """Return a TwistStamped of a Twist: stamped when it was recorded, in no frame."""
-    return MESSAGES.twist_stamped(MESSAGES.header(time, ""), _twist(message))
-
-
 _POSES = (
     POSE,
     POSE_WITH_COVARIANCE,
@@ -234,13 +186,17 @@ CONVERSIONS: dict[str, dict[str, Convert]] = {
     POSE: dict.fromkeys(_POSES, pose_stamped),
     POSE_WITH_COVARIANCE: dict.fromkeys(_POSES, pose_with_covariance),
     PATH: {
-        PATH: path_of_path,
-        "geometry_msgs/msg/PoseArray": path_of_poses,
-        "geometry_msgs/msg/PolygonStamped": path_of_polygon,
+        PATH: lambda m, _: _path(m, [_pose(each.pose.position, each.pose.orientation) for each in m.poses]),
+        "geometry_msgs/msg/PoseArray": lambda m, _: _path(m, [_pose(e.position, e.orientation) for e in m.poses]),
+        "geometry_msgs/msg/PolygonStamped": lambda m, _: _path(m, [_pose(point) for point in m.polygon.points]),
         "visualization_msgs/msg/Marker": path_of_marker,
-        "magnetosuture_msgs/msg/PredictedThread": path_of_vertices,
+        "magnetosuture_msgs/msg/PredictedThread": lambda m, _: _path(m, [_pose(point) for point in m.positions]),
     },
-    TWIST: {TWIST: twist_of_twist, UNSTAMPED_TWIST: twist_without_stamp},
+    TWIST: {
+        TWIST: lambda m, _: MESSAGES.twist_stamped(_header_of(m), _twist(m.twist)),
+        # Stamped when it was recorded, in no frame.
+        UNSTAMPED_TWIST: lambda m, time: MESSAGES.twist_stamped(MESSAGES.header(time, ""), _twist(m)),
+    },
 }
 
 

@@ -140,7 +140,7 @@ class BagWriter:
             if self._writer.add_message(number, time, data):
                 self._reserve.grow(_RESERVE_BYTES + MAX_INDEX_BYTES * self._writer.state.chunks)
         except OSError as error:
-            raise self._end_early(error) from None
+            self._end(error)
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
         """Serialise a message of the type store and write it; otherwise as `write`."""
@@ -155,27 +155,24 @@ class BagWriter:
         """
         if self._closed:
             return
+        problem: OSError | None = None
         try:
             self._writer.flush()
         except OSError as error:
-            raise self._end_early(error) from None
+            problem = error
+        self._end(problem)
+
+    def _end(self, problem: OSError | None) -> None:
+        """Finish the bag with what is on the disk, if there is space for its summary; raise what ended it early."""
         self._closed = True
         self._reserve.release()
         try:
             self._finish()
         except OSError as error:
             self._writer.abandon()
-            raise self._refusal(error) from None
-
-    def _end_early(self, problem: OSError) -> RecordingEndedError:
-        """Finish the bag with what is on the disk, if there is space for its summary; return the error to raise."""
-        self._closed = True
-        self._reserve.release()
-        try:
-            self._finish()
-        except OSError:
-            self._writer.abandon()
-        return self._refusal(problem)
+            problem = problem or error
+        if problem is not None:
+            raise self._refusal(problem) from None
 
     def _refusal(self, problem: OSError) -> RecordingEndedError:
         kept = pluralize(self._writer.state.counts.total(), "message")

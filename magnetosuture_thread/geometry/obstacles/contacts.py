@@ -9,8 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.closest import Vector
-from magnetosuture_thread.geometry.obstacles.search import ContactRows, Nearest, add_row, search_edges, search_faces
+from magnetosuture_thread.geometry.obstacles.search import (
+    ContactRows,
+    Nearest,
+    Vector,
+    add_row,
+    search_edges,
+    search_faces,
+)
 from magnetosuture_thread.geometry.polyline import Points
 
 BALL, EDGES, FACES = range(3)

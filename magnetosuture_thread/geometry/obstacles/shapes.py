@@ -123,7 +123,7 @@ class Polygon:
         """
         for name, value in (("radius", radius), ("angle", angle), ("step", step)):
             if not (math.isfinite(value) and value > 0.0):
-                raise ConfigurationError(f"polygon.smoothed.{name}", value, "a positive number", source=self.source)
+                raise ConfigurationError(f"polygon.smoothed.{name}", value, "a positive number", self.source)
         problem: ConfigurationError | None = None
         for halvings in range(12):
             smaller = radius * 0.5**halvings
@@ -133,7 +133,7 @@ class Polygon:
             except ConfigurationError as error:
                 problem = error
         raise ConfigurationError(
-            "polygon.smoothed.radius", radius, f"a radius that leaves a polygon ({problem})", source=self.source
+            "polygon.smoothed.radius", radius, f"a radius that leaves a polygon ({problem})", self.source
         )
 
 
@@ -150,29 +150,25 @@ def check_metres(name: str, points: NDArray[np.float64], source: str) -> None:
     """
     wrong = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(wrong):
-        raise ConfigurationError(
-            f"{name}[{wrong[0]}]", tuple(points[wrong[0]].tolist()), "finite coordinates", source=source
-        )
+        raise ConfigurationError(f"{name}[{wrong[0]}]", tuple(points[wrong[0]].tolist()), "finite coordinates", source)
     largest = float(np.abs(points).max(initial=0.0))
     if largest > MAX_COORDINATE:
         raise ConfigurationError(
-            name, largest, f"coordinates of at most {MAX_COORDINATE:g} m: is it in metres?", source=source
+            name, largest, f"coordinates of at most {MAX_COORDINATE:g} m: is it in metres?", source
         )
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent < MIN_EXTENT:
-        raise ConfigurationError(
-            name, extent, f"an extent of at least {MIN_EXTENT:g} m: is it in metres?", source=source
-        )
+        raise ConfigurationError(name, extent, f"an extent of at least {MIN_EXTENT:g} m: is it in metres?", source)
 
 
 def _checked_ring(name: str, given: Sequence[Sequence[float]], source: str) -> Ring:
     """Return a ring without duplicates and closing point, once it is known to bound an area."""
     for i, point in enumerate(given):
         if len(point) != 2:
-            raise ConfigurationError(f"{name}[{i}]", tuple(point), "two coordinates x, y [m]", source=source)
+            raise ConfigurationError(f"{name}[{i}]", tuple(point), "two coordinates x, y [m]", source)
     points = [(float(x), float(y)) for x, y in given]
     if len(set(points)) < 3:
-        raise ConfigurationError(name, f"{len(set(points))} distinct points", "at least 3 points", source=source)
+        raise ConfigurationError(name, f"{len(set(points))} distinct points", "at least 3 points", source)
     array = np.array(points)
     check_metres(name, array, source)
     ring = tuple(point for i, point in enumerate(points) if point != points[i - 1])
@@ -180,11 +176,11 @@ def _checked_ring(name: str, given: Sequence[Sequence[float]], source: str) -> R
         # The loop above dropped the first of the two; the shape shall begin where it was given to begin.
         ring = (ring[-1], *ring[:-1])
     if _is_flat(array):
-        raise ConfigurationError(name, "zero area", "points that are not all on one line", source=source)
+        raise ConfigurationError(name, "zero area", "points that are not all on one line", source)
     shape = shapely.Polygon(ring)
     if not shape.is_valid:
         raise ConfigurationError(
-            name, str(explain_validity(shape)), "an outline that does not cross or touch itself", source=source
+            name, str(explain_validity(shape)), "an outline that does not cross or touch itself", source
         )
     return ring
 
@@ -204,7 +200,7 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
     for i, shape in enumerate(shapes):
         name = f"polygon.holes[{i}]"
         if not solid.intersects(shape):
-            raise ConfigurationError(name, "a hole outside the outline", "a hole inside the outline", source=source)
+            raise ConfigurationError(name, "a hole outside the outline", "a hole inside the outline", source)
         if not solid.contains_properly(shape):
             where = solid.exterior.intersection(shape.exterior)
             value = (
@@ -212,7 +208,7 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
                 if where.is_empty
                 else f"a hole that meets the outline at {_position_text(where)}"
             )
-            raise ConfigurationError(name, value, "a hole inside the outline, apart from it", source=source)
+            raise ConfigurationError(name, value, "a hole inside the outline, apart from it", source)
         for j, other in enumerate(shapes[:i]):
             if shape.intersects(other):
                 where = shape.intersection(other)
@@ -220,7 +216,7 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
                     name,
                     f"a hole that meets holes[{j}] at {_position_text(where)}",
                     "holes apart from each other",
-                    source=source,
+                    source,
                 )
 
 
@@ -347,7 +343,7 @@ class Mesh:
             object.__setattr__(self, name, array)
 
     def _refuse(self, name: str, value: object, expectation: str) -> None:
-        raise ConfigurationError(f"mesh.{name}", value, expectation, source=self.source)
+        raise ConfigurationError(f"mesh.{name}", value, expectation, self.source)
 
     def _check_faces(self, vertices: Points, faces: NDArray[np.int64]) -> None:
         """Refuse a face without area, to rounding."""

@@ -75,7 +75,7 @@ def triangulate(polygon: Polygon) -> Triangulation:
 
 
 def _refusal(polygon: Polygon, problem: str) -> ConfigurationError:
-    return ConfigurationError("polygon", problem, "a shape that can be cut into triangles", source=polygon.source)
+    return ConfigurationError("polygon", problem, "a shape that can be cut into triangles", polygon.source)
 
 
 def _check(polygon: Polygon, found: Triangulation) -> None:

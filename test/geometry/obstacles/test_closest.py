@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magnetosuture_thread.geometry.obstacles.closest import closest_on_segment
+from magnetosuture_thread.geometry.obstacles.search import closest_on_segment
 from test.geometry.obstacles.triangles import closest_on_triangles
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from magnetosuture_thread.geometry.obstacles.closest import closest_in_space
+from magnetosuture_thread.geometry.obstacles.search import closest_in_space
 
 
 @numba.njit
