@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from magnetosuture_thread.geometry.obstacles.contacts import WALL, WorkspaceData, find_contacts, wall_contact
-from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
 from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
-from magnetosuture_thread.geometry.obstacles.workspace import Contacts, Obstacle, Workspace
+from magnetosuture_thread.geometry.obstacles.workspace import Contacts, Workspace
 
 __all__ = [
     "WALL",

@@ -372,3 +372,7 @@ class Mesh:
                 f"two faces that both run from vertex {edge // n} to {edge % n}",
                 "faces all counter-clockwise, or all clockwise, seen from outside",
             )
+
+
+Obstacle = Disc | Polygon | Mesh
+"""Any shape that `Workspace` takes."""

@@ -27,8 +27,13 @@ from magnetosuture_thread.geometry.obstacles.search import (
     closest_in_space,
     closest_on_segment,
 )
-from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
+
+_MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
+_MIN_CELLS = 200
+_MAX_OVERVIEW_CELLS = 20_000  # of the grid that tells which obstacles are near
+_INITIAL_ROWS = 256  # contacts that `near` has room for at first
 
 
 @dataclass(frozen=True)
@@ -154,14 +159,6 @@ def _distance(x: float, y: float, z: float, corner: NDArray[np.float64]) -> floa
     return float(np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2))
 
 
-Obstacle = Disc | Polygon | Mesh
-"""Any shape that `Workspace` takes."""
-
-_MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
-_MIN_CELLS = 200
-_MAX_OVERVIEW_CELLS = 20_000  # of the grid that tells which obstacles are near
-
-
 class _FlatArray:
     """Concatenates arrays and keeps the offset of each."""
 
@@ -266,9 +263,6 @@ def _mark_inside(obstacle: int, data: WorkspaceData, rows: ContactRows) -> None:
                 if np.sqrt(found.square) <= frame[4]:
                     inside = 1 if found.signed < 0.0 else 0
                 entries[cell + 1] = inside
-
-
-_INITIAL_ROWS = 256  # contacts that `near` has room for at first
 
 
 @dataclass(frozen=True, eq=False)
