@@ -10,54 +10,34 @@ from typing import Any
 
 from magnetosuture_thread.configuration import quantity
 
-_QUANTITIES: dict[str, dict[str, Any]] = {
-    "scene": {
-        "default": "",
-        "description": "scene file: a path, or the name of one in config/scenes; none waits for the topic scene",
-    },
-    "needle_length": {
-        "default": 0.007,
-        "description": "length of the needle along its body",
-        "unit": "m",
-        "minimum": 0.001,
-        "maximum": 0.05,
-    },
-    "needle_width": {
-        "default": 0.0004,
-        "description": "width of the needle's body",
-        "unit": "m",
-        "minimum": 5e-5,
-        "maximum": 0.005,
-    },
-    "needle_curvature": {
-        "default": 0.0,
-        "description": "curvature of the needle's arc, positive to the left of its heading",
-        "unit": "1/m",
-        "minimum": -1000.0,
-        "maximum": 1000.0,
-    },
-    "thread_length": {
-        "default": 0.019,
-        "description": "rest length of the thread",
-        "unit": "m",
-        "minimum": 0.001,
-        "maximum": 2.0,
-    },
-    "viscosity": {
-        "default": 1.0,
-        "description": "dynamic viscosity of the liquid; glycerin at room temperature is about 1",
-        "unit": "Pa s",
-        "minimum": 1e-4,
-        "maximum": 100.0,
-    },
-    "driver_timeout": {
-        "default": 0.2,
-        "description": "without new currents for this long the coil drivers switch off by themselves; whole tenths "
-        "for RoboClaw boards",
-        "unit": "s",
-        "minimum": 0.05,
-        "maximum": 1.0,
-    },
+# Default, description, unit, minimum and maximum.
+_QUANTITIES: dict[str, tuple[Any, str, str, float | None, float | None]] = {
+    "scene": (
+        "",
+        "scene file: a path, or the name of one in config/scenes; none waits for the topic scene",
+        "",
+        None,
+        None,
+    ),
+    "needle_length": (0.007, "length of the needle along its body", "m", 0.001, 0.05),
+    "needle_width": (0.0004, "width of the needle's body", "m", 5e-5, 0.005),
+    "needle_curvature": (
+        0.0,
+        "curvature of the needle's arc, positive to the left of its heading",
+        "1/m",
+        -1000.0,
+        1000.0,
+    ),
+    "thread_length": (0.019, "rest length of the thread", "m", 0.001, 2.0),
+    "viscosity": (1.0, "dynamic viscosity of the liquid; glycerin at room temperature is about 1", "Pa s", 1e-4, 100.0),
+    "driver_timeout": (
+        0.2,
+        "without new currents for this long the coil drivers switch off by themselves; whole tenths for RoboClaw "
+        "boards",
+        "s",
+        0.05,
+        1.0,
+    ),
 }
 
 SHARED_PARAMETERS = tuple(_QUANTITIES)
@@ -66,5 +46,5 @@ SHARED_PARAMETERS = tuple(_QUANTITIES)
 
 def shared_parameter(name: str) -> Any:
     """Return the dataclass field of a shared parameter."""
-    about = dict(_QUANTITIES[name])
-    return quantity(about.pop("default"), about.pop("description"), **about)
+    default, description, unit, minimum, maximum = _QUANTITIES[name]
+    return quantity(default, description, unit=unit, minimum=minimum, maximum=maximum)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from magnetosuture_thread.cli.main import make_parser
 
 import magnetosuture_thread
+from magnetosuture_thread.cli.main import make_parser
 from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.setups import SETTINGS_CLASSES
 

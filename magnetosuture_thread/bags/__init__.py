@@ -1,1 +1,1 @@
-"""Bags: the only room that knows mcap and rosbags."""
+"""Bags: the only subpackage that imports mcap and rosbags."""

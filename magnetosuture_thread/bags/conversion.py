@@ -7,15 +7,130 @@ message was decoded, and return messages of our own type store.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magnetosuture_thread.bags.message_types import MESSAGES
-from magnetosuture_thread.bags.transforms import RigidTransform, rotation_from_message, transform_from_message
 from magnetosuture_thread.messages.building import ADD, LINE_STRIP
+
+STATIC = "/tf_static"
+TOPICS = ("/tf", STATIC)
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+
+
+@dataclass(frozen=True)
+class RigidTransform:
+    """Rigid transform between two frames: p' = R p + t.
+
+    Attributes:
+        rotation: R.
+        translation: t, shape (3,) [m].
+    """
+
+    rotation: Rotation
+    translation: np.ndarray
+
+    @staticmethod
+    def identity() -> RigidTransform:
+        """Return the identity."""
+        return RigidTransform(Rotation.identity(), np.zeros(3))
+
+    def compose(self, first: RigidTransform) -> RigidTransform:
+        """Return the transform that applies `first` and then this one."""
+        return RigidTransform(self.rotation * first.rotation, self.apply(first.translation))
+
+    def inverse(self) -> RigidTransform:
+        """Return the inverse transform."""
+        back = self.rotation.inv()
+        return RigidTransform(back, -back.apply(self.translation))
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Return points, shape (3,) or (n, 3) [m], in the other frame."""
+        return np.asarray(self.rotation.apply(points) + self.translation)
+
+
+class TransformTree:
+    """Tree of frames.
+
+    Args:
+        messages: topic and tf2_msgs/TFMessage in the order of the bag. Of static transforms the last one holds at any
+            time; one that moves holds from its stamp until the next.
+    """
+
+    def __init__(self, messages: Iterable[tuple[str, Any]]) -> None:
+        # By child frame, in the order of time: stamp, parent, and the transform into it from then on.
+        self._edges: dict[str, list[tuple[float, str, RigidTransform]]] = {}
+        static: dict[str, list[tuple[float, str, RigidTransform]]] = {}
+        for topic, message in messages:
+            for each in message.transforms:
+                child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
+                rigid = transform_from_message(each.transform)
+                if rigid is None or child == parent:
+                    continue
+                if topic == STATIC:
+                    static[child] = [(-math.inf, parent, rigid)]
+                else:
+                    stamp = each.header.stamp.sec * 10**9 + each.header.stamp.nanosec
+                    self._edges.setdefault(child, []).append((stamp, parent, rigid))
+        self._edges |= static
+        for entries in self._edges.values():
+            entries.sort(key=itemgetter(0))
+
+    @property
+    def frames(self) -> list[str]:
+        """Names of all frames."""
+        return sorted({parent for entries in self._edges.values() for _, parent, _ in entries} | set(self._edges))
+
+    def is_connected(self, frame: str, target: str) -> bool:
+        """Return whether a frame can be transformed into another at any time."""
+        return self.lookup(frame, target, None) is not None
+
+    def lookup(self, frame: str, target: str, stamp: int | None) -> RigidTransform | None:
+        """Return the transform from a frame into another at a time [ns], the last if None; None where it is unknown."""
+        ups, downs = self._ancestors(frame, stamp), self._ancestors(target, stamp)
+        for ancestor, rigid in ups.items():
+            if ancestor in downs:
+                return downs[ancestor].inverse().compose(rigid)
+        return None
+
+    def _ancestors(self, frame: str, stamp: int | None) -> dict[str, RigidTransform]:
+        """Return the transform of a frame into each of its ancestors, from the nearest on."""
+        found, rigid = {frame: RigidTransform.identity()}, RigidTransform.identity()
+        while entries := self._edges.get(frame):
+            index = len(entries) if stamp is None else bisect_right(entries, stamp, key=itemgetter(0))
+            if not index:
+                break  # Nothing is known as early as that.
+            _, frame, up = entries[index - 1]
+            if frame in found:
+                break  # A cycle of frames.
+            rigid = up.compose(rigid)
+            found[frame] = rigid
+        return found
+
+
+def transform_from_message(transform: Any) -> RigidTransform | None:
+    """Return the transform of a geometry_msgs/Transform; None if it is not finite or its quaternion has length 0."""
+    move, rotation = transform.translation, rotation_from_message(transform.rotation)
+    translation = np.array([move.x, move.y, move.z], dtype=float)
+    if rotation is None or not np.isfinite(translation).all():
+        return None
+    return RigidTransform(rotation, translation)
+
+
+def rotation_from_message(turn: Any) -> Rotation | None:
+    """Return the rotation of a geometry_msgs/Quaternion; None if it is not finite or of length 0."""
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
+    greatest = np.abs(quaternion).max()
+    if not np.isfinite(greatest) or not greatest:
+        return None
+    return Rotation.from_quat(quaternion / greatest)  # whose length neither vanishes nor overflows
+
 
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -45,26 +160,6 @@ def pose_with_covariance(message: Any, time: int) -> Any:
     return MESSAGES.pose_with_covariance(_header_of(message), _pose_in(message), values)
 
 
-def path_of_path(message: Any, time: int) -> Any:
-    """Return a Path of a Path."""
-    return _path(message, [_pose(each.pose.position, each.pose.orientation) for each in message.poses])
-
-
-def path_of_poses(message: Any, time: int) -> Any:
-    """Return a Path of a PoseArray."""
-    return _path(message, [_pose(each.position, each.orientation) for each in message.poses])
-
-
-def path_of_polygon(message: Any, time: int) -> Any:
-    """Return a Path of a PolygonStamped, from its first point to its last."""
-    return _path(message, [_pose(point) for point in message.polygon.points])
-
-
-def path_of_vertices(message: Any, time: int) -> Any:
-    """Return a Path of a PredictedThread."""
-    return _path(message, [_pose(point) for point in message.positions])
-
-
 def path_of_marker(message: Any, time: int) -> Any:
     """Return a Path of a Marker that is a line strip."""
     if message.action != ADD or message.type != LINE_STRIP:
@@ -80,16 +175,6 @@ def path_of_marker(message: Any, time: int) -> Any:
     return _path(message, [MESSAGES.pose(xyz, UPRIGHT) for xyz in moved])
 
 
-def twist_of_twist(message: Any, time: int) -> Any:
-    """Return a TwistStamped of a TwistStamped."""
-    return MESSAGES.twist_stamped(_header_of(message), _twist(message.twist))
-
-
-def twist_without_stamp(message: Any, time: int) -> Any:
-    """Return a TwistStamped of a Twist: stamped when it was recorded, in no frame."""
-    return MESSAGES.twist_stamped(MESSAGES.header(time, ""), _twist(message))
-
-
 _POSES = (
     POSE,
     POSE_WITH_COVARIANCE,
@@ -101,13 +186,17 @@ CONVERSIONS: dict[str, dict[str, Convert]] = {
     POSE: dict.fromkeys(_POSES, pose_stamped),
     POSE_WITH_COVARIANCE: dict.fromkeys(_POSES, pose_with_covariance),
     PATH: {
-        PATH: path_of_path,
-        "geometry_msgs/msg/PoseArray": path_of_poses,
-        "geometry_msgs/msg/PolygonStamped": path_of_polygon,
+        PATH: lambda m, _: _path(m, [_pose(each.pose.position, each.pose.orientation) for each in m.poses]),
+        "geometry_msgs/msg/PoseArray": lambda m, _: _path(m, [_pose(e.position, e.orientation) for e in m.poses]),
+        "geometry_msgs/msg/PolygonStamped": lambda m, _: _path(m, [_pose(point) for point in m.polygon.points]),
         "visualization_msgs/msg/Marker": path_of_marker,
-        "magnetosuture_msgs/msg/PredictedThread": path_of_vertices,
+        "magnetosuture_msgs/msg/PredictedThread": lambda m, _: _path(m, [_pose(point) for point in m.positions]),
     },
-    TWIST: {TWIST: twist_of_twist, UNSTAMPED_TWIST: twist_without_stamp},
+    TWIST: {
+        TWIST: lambda m, _: MESSAGES.twist_stamped(_header_of(m), _twist(m.twist)),
+        # Stamped when it was recorded, in no frame.
+        UNSTAMPED_TWIST: lambda m, time: MESSAGES.twist_stamped(MESSAGES.header(time, ""), _twist(m)),
+    },
 }
 
 

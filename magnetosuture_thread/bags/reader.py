@@ -9,10 +9,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from magnetosuture_thread.bags.bag_files import find_bag_files
-from magnetosuture_thread.bags.damage_report import CorruptRegion, DamageReport, merge_reports
+import zstandard
+
+from magnetosuture_thread.bags.bag_folder import find_bag_files
 from magnetosuture_thread.bags.mcap.file import McapFile
-from magnetosuture_thread.bags.message_packing import unpacked
 from magnetosuture_thread.bags.message_types import MessageDecoder
 from magnetosuture_thread.bags.remap import apply_remap
 from magnetosuture_thread.bags.sqlite import SqliteFile
@@ -20,9 +20,12 @@ from magnetosuture_thread.bags.storage import (
     CDR,
     BagStorage,
     Connection,
+    CorruptRegion,
+    DamageReport,
     MessageDefinition,
     StoredMessage,
     merge_by_time,
+    merge_reports,
 )
 from magnetosuture_thread.errors import BagError
 
@@ -234,3 +237,24 @@ def _file_size(file: Path) -> int:
         return file.stat().st_size
     except OSError:
         return 0
+
+
+_ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins like this: its first byte is 0
+_MAX_MESSAGE_BYTES = 1 << 30  # bytes of a message
+
+
+def unpacked(topic: str, data: bytes) -> bytes:
+    """Return a message as it was before the recorder packed it, if it did.
+
+    Raises:
+        BagError: it cannot be unpacked.
+    """
+    if not data.startswith(_ZSTD):
+        return data
+    try:
+        if zstandard.frame_content_size(data) > _MAX_MESSAGE_BYTES:
+            raise BagError(topic, f"a packed message is larger than {_MAX_MESSAGE_BYTES} bytes")
+        # Without a size in it, a frame is unpacked to this many bytes at most.
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=1 << 27)
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise BagError(topic, f"a packed message cannot be unpacked: {error}") from None

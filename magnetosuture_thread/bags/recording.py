@@ -7,10 +7,18 @@ from collections.abc import Collection, Iterator
 from typing import Any
 
 from magnetosuture_thread import interface
-from magnetosuture_thread.bags.conversion import CONVERSIONS, UNSTAMPED_TWIST, UnfitError, moved
+from magnetosuture_thread.bags.conversion import (
+    CONVERSIONS,
+    TF_MESSAGE,
+    TOPICS,
+    UNSTAMPED_TWIST,
+    RigidTransform,
+    TransformTree,
+    UnfitError,
+    moved,
+)
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.transforms import TF_MESSAGE, TOPICS, RigidTransform, TransformTree
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA, DISH_FRAME, Channel
 from magnetosuture_thread.messages.cdr import is_in_dish_frame, stamp_and_frame

@@ -11,8 +11,14 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
-from magnetosuture_thread.bags.damage_report import CorruptRegion, DamageReport, pluralize
-from magnetosuture_thread.bags.storage import Connection, MessageDefinition, StoredMessage
+from magnetosuture_thread.bags.storage import (
+    Connection,
+    CorruptRegion,
+    DamageReport,
+    MessageDefinition,
+    StoredMessage,
+    pluralize,
+)
 from magnetosuture_thread.errors import BagError
 
 UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"

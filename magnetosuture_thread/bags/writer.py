@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -12,10 +13,7 @@ from typing import Any
 
 import yaml
 
-from magnetosuture_thread.bags.damage_report import pluralize
-from magnetosuture_thread.bags.mcap.writer import MAX_INDEX_BYTES, McapWriter
-from magnetosuture_thread.bags.message_types import own_definition, typestore
-from magnetosuture_thread.bags.metadata import (
+from magnetosuture_thread.bags.bag_folder import (
     METADATA_FILE,
     NOTES,
     QOS,
@@ -25,7 +23,10 @@ from magnetosuture_thread.bags.metadata import (
     dump_qos_profiles,
     parse_qos_profiles,
 )
-from magnetosuture_thread.bags.storage import Connection, MessageDefinition
+from magnetosuture_thread.bags.mcap.writer import MAX_INDEX_BYTES, McapWriter
+from magnetosuture_thread.bags.message_types import own_definition, typestore
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.storage import Connection, MessageDefinition, pluralize
 from magnetosuture_thread.errors import BagError
 
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
@@ -139,7 +140,7 @@ class BagWriter:
             if self._writer.add_message(number, time, data):
                 self._reserve.grow(_RESERVE_BYTES + MAX_INDEX_BYTES * self._writer.state.chunks)
         except OSError as error:
-            raise self._end_early(error) from None
+            self._end(error)
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
         """Serialise a message of the type store and write it; otherwise as `write`."""
@@ -154,27 +155,24 @@ class BagWriter:
         """
         if self._closed:
             return
+        problem: OSError | None = None
         try:
             self._writer.flush()
         except OSError as error:
-            raise self._end_early(error) from None
+            problem = error
+        self._end(problem)
+
+    def _end(self, problem: OSError | None) -> None:
+        """Finish the bag with what is on the disk, if there is space for its summary; raise what ended it early."""
         self._closed = True
         self._reserve.release()
         try:
             self._finish()
         except OSError as error:
             self._writer.abandon()
-            raise self._refusal(error) from None
-
-    def _end_early(self, problem: OSError) -> RecordingEndedError:
-        """Finish the bag with what is on the disk, if there is space for its summary; return the error to raise."""
-        self._closed = True
-        self._reserve.release()
-        try:
-            self._finish()
-        except OSError:
-            self._writer.abandon()
-        return self._refusal(problem)
+            problem = problem or error
+        if problem is not None:
+            raise self._refusal(problem) from None
 
     def _refusal(self, problem: OSError) -> RecordingEndedError:
         kept = pluralize(self._writer.state.counts.total(), "message")
@@ -227,3 +225,49 @@ class _DiskReserve:
     def release(self) -> None:
         """Free the reserved space."""
         self._path.unlink(missing_ok=True)
+
+
+def write_repaired_bag(
+    bag: Bag,
+    folder: Path,
+    name: str,
+    refused: Counter[str],
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> int:
+    """Write every intact message of a bag into a new one, with its notes and definitions.
+
+    Types keep the definitions of the bag; ours is written where it has none and we know the type. Compressed messages
+    are decompressed, and topics have their remapped names.
+
+    Args:
+        bag: the bag to repair.
+        folder: of the new one; must be empty.
+        name: of the new one.
+        refused: counts the messages that cannot be decompressed, by reason.
+        progress: called with the completed fraction, 0 to 1.
+
+    Returns:
+        The number of messages.
+
+    Raises:
+        BagError: the new bag cannot be written.
+    """
+    numbers: dict[Connection, int] = {}
+    count = 0
+    with BagWriter(folder, bag.notes, name=name) as writer:
+        for connection in bag.connections():
+            if connection not in numbers:
+                numbers[connection] = writer.add_connection(_defined(bag, connection))
+        for connection, record in bag.every_record(refused):
+            writer.write_to(numbers[connection], record.time, record.data)
+            count += 1
+            progress((record.time - bag.start) / max(bag.end - bag.start, 1))
+    return count
+
+
+def _defined(bag: Bag, connection: Connection) -> Connection:
+    """Return a connection as it is written to the new bag."""
+    definition = connection.definition
+    if not definition.text:
+        definition = own_definition(definition.type_name)
+    return replace(connection, topic=bag.name_of(connection), definition=definition)

@@ -19,7 +19,7 @@ from matplotlib.path import Path as Outline
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import KINDS, Scene
-from magnetosuture_thread.scene.labels import place_labels
+from magnetosuture_thread.scene.labels import label_positions
 
 INK, FAINT = "#22303c", "#7d8790"
 LIQUID, WALL = "#f4f1ec", "#8f877b"
@@ -97,7 +97,7 @@ def _draw_names(axes: Axes, scene: Scene) -> None:
     texts = [axes.text(0.0, 0.0, shape.name, zorder=5, **style) for shape in scene.shapes]
     to_metres = axes.transData.inverted()
     boxes = [to_metres.transform_bbox(text.get_window_extent()) for text in texts]
-    places = place_labels(scene, [(1e-3 * float(box.width), 1e-3 * float(box.height)) for box in boxes])
+    places = label_positions(scene, [(1e-3 * float(box.width), 1e-3 * float(box.height)) for box in boxes])
     for text, place in zip(texts, places, strict=True):
         text.set_position((1e3 * place.middle[0], 1e3 * place.middle[1]))
         if place.line:

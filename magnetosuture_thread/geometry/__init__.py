@@ -1,1 +1,1 @@
-"""Geometry: polylines, obstacles, the camera's view. No other room is needed here."""
+"""Geometry: polylines, obstacles, the camera's view. It builds on no other subpackage."""

@@ -61,29 +61,3 @@ def project_onto_half_planes(
     if inside:
         found[0], found[1] = point[0], point[1]
     return inside or best < np.inf
-
-
-def nearest_in_half_planes(
-    point: NDArray[np.float64], rows: Points, bounds: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Return the point of an intersection of half planes that is nearest to a given one, exactly.
-
-        min |q - p|^2    such that    a_i . q >= b_i
-
-    A point that is not within already goes to one of the lines it is beyond of; along each of these the
-    others leave an interval, and the nearest point of it is a candidate. Quadratic in their number.
-
-    Args:
-        point: p, shape (2,).
-        rows: a_i, of any length; a row of zeros says nothing; shape (k, 2).
-        bounds: b_i, shape (k,).
-
-    Returns:
-        q, shape (2,), p itself where it is within; it may miss a line by 1e-12 of |p|. None where no
-        candidate passes that: the half planes have no point in common, or only rounding tells.
-
-    Source: none; the nearest point has at bounds one of the lines crossed as an active constraint.
-    """
-    found = np.empty(2)
-    point, rows, bounds = (np.ascontiguousarray(array, dtype=np.float64) for array in (point, rows, bounds))
-    return found if project_onto_half_planes(point, rows, bounds, np.empty((len(rows), 3)), found) else None

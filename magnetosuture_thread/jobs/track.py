@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.bags.bag_files import COMPRESSED_SUFFIXES, STORAGE_SUFFIXES
-from magnetosuture_thread.bags.damage_report import pluralize
+from magnetosuture_thread.bags.bag_folder import COMPRESSED_SUFFIXES, STORAGE_SUFFIXES
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.scene import Scene

@@ -6,7 +6,7 @@ from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
-from magnetosuture_thread.geometry.obstacles.polygon import Ring
+from magnetosuture_thread.geometry.obstacles.shapes import Ring
 from magnetosuture_thread.interface import DISH_FRAME, SCENE
 from magnetosuture_thread.scene.scene import (
     MAX_HOLES,

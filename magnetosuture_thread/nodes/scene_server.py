@@ -17,8 +17,7 @@ from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.scene import Scene, read_scene
-from magnetosuture_thread.scene.editing import SceneEditor
-from magnetosuture_thread.scene.settings import SceneServerSettings
+from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
 
 
 class SceneServerNode(Node):

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
-from magnetosuture_thread.scene.errors import scene_error
-from magnetosuture_thread.scene.files import read_scene
+from magnetosuture_thread.configuration import Configuration
+from magnetosuture_thread.scene.files import parse_yaml, read_scene
 from magnetosuture_thread.scene.mapping import shape_from_mapping
-from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, Scene, SceneShape
-from magnetosuture_thread.scene.text import parse_yaml
+from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, Scene, SceneShape, scene_error
+from magnetosuture_thread.shared_parameters import shared_parameter
+
+
+@dataclass(frozen=True)
+class SceneServerSettings(Configuration):
+    """The scene that is published first."""
+
+    GROUP: ClassVar[str] = "scene_server"
+
+    scene: str = shared_parameter("scene")
+
 
 MAX_SHAPE_CHARS = 300_000  # 10,000 vertices in full precision
 MAX_PATH_CHARS = 4096

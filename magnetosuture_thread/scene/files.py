@@ -1,4 +1,4 @@
-"""Scene files: a dish and named shapes in YAML.
+"""Scene files: a dish and named shapes in YAML, or GeoJSON, parsed with limits on size and depth.
 
 dish: {diameter: 0.05, depth: 0.004}     # [m]
 shapes:
@@ -9,20 +9,141 @@ from __future__ import annotations
 
 import json
 import os
+import stat
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from magnetosuture_thread.configuration import use_ros_numbers
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.resources import find_scene_file
-from magnetosuture_thread.scene.errors import scene_error
 from magnetosuture_thread.scene.geojson import scene_from_geojson, scene_to_geojson
 from magnetosuture_thread.scene.mapping import scene_from_mapping, scene_to_mapping
-from magnetosuture_thread.scene.scene import Scene
-from magnetosuture_thread.scene.text import parse_json, parse_yaml, read_text
+from magnetosuture_thread.scene.scene import Scene, scene_error
 
 GEOJSON_ENDINGS = (".json", ".geojson")
+MAX_FILE_BYTES = 1_000_000
+MAX_DEPTH = 20
+MAX_SCALAR_CHARS = 1000
+
+
+class _SceneLoader(yaml.CSafeLoader):  # the loader without libyaml takes ten times as long
+    """Reads YAML as setup files are read: 1e-5 is a number, nothing is a date, keys are unique."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return a mapping whose keys are text, each of them once."""
+        keys = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.tag != "tag:yaml.org,2002:str":
+                name = f"the name {key.value}" if isinstance(key, yaml.ScalarNode) else "a name"
+                raise yaml.constructor.ConstructorError(None, None, f"{name} that is no text", key.start_mark)
+            if key.value in keys:
+                raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
+            keys.add(key.value)
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
+
+
+use_ros_numbers(_SceneLoader, decimal_integers=True)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a regular file of at most `MAX_FILE_BYTES`.
+
+    Raises:
+        ConfigurationError: it cannot be read, is a device or a pipe, is too large, or is no text.
+    """
+    expectation = f"a regular file of at most {MAX_FILE_BYTES // 1000} kB of text"
+    try:
+        # Opening a pipe without a writer would block forever.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except (OSError, ValueError) as error:
+        raise scene_error(
+            "scene file", getattr(error, "strerror", None) or str(error), expectation, str(path)
+        ) from None
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise scene_error("scene file", "a folder, pipe or device", expectation, str(path))
+        data = b""
+        while len(data) <= MAX_FILE_BYTES and (part := os.read(descriptor, MAX_FILE_BYTES + 1 - len(data))):
+            data += part
+    except OSError as error:
+        raise scene_error("scene file", error.strerror or str(error), expectation, str(path)) from None
+    finally:
+        os.close(descriptor)
+    if len(data) > MAX_FILE_BYTES:
+        raise scene_error("scene file", "a larger file", expectation, str(path))
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise scene_error("scene file", "bytes that are no UTF-8 text", expectation, str(path)) from None
+
+
+def parse_yaml(text: str, source: str = "", what: str = "scene file") -> Any:
+    """Return the content of a YAML text: mappings with text for keys, lists, numbers, text, true, false and null.
+
+    Raises:
+        ConfigurationError: it is no YAML, or uses aliases or tags, or is too deep.
+    """
+    try:
+        depth = 0
+        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
+            problem = ""
+            if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
+                depth += 1
+                problem = f"lists and mappings {depth} deep" if depth > MAX_DEPTH else ""
+            elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
+                depth -= 1
+            elif isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_SCALAR_CHARS:
+                problem = f"a word of {len(event.value)} characters"
+            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
+                problem = "an anchor or alias (& or *)"
+            elif isinstance(event, yaml.NodeEvent) and getattr(event, "tag", None) not in (None, "!"):
+                problem = "a tag (!)"
+            if problem:
+                where = f" in line {event.start_mark.line + 1}" if event.start_mark else ""
+                raise scene_error(what, problem + where, f"plain YAML, at most {MAX_DEPTH} deep", source)
+        return yaml.load(text, _SceneLoader)
+    except yaml.YAMLError as error:
+        problem = " ".join(str(getattr(error, "problem", None) or error).split())
+        mark = getattr(error, "problem_mark", None)
+        raise scene_error(what, problem + (f" in line {mark.line + 1}" if mark else ""), "valid YAML", source) from None
+    except (ValueError, UnicodeError):
+        raise scene_error(what, "a character that YAML does not allow", "valid YAML", source) from None
+
+
+def parse_json(text: str, source: str = "", what: str = "scene file") -> Any:
+    """Return the content of a JSON text; duplicate names, NaN and Infinity are refused.
+
+    Raises:
+        ConfigurationError: it is no JSON, or is too deep.
+    """
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        mapping = dict(pairs)
+        if len(mapping) < len(pairs):
+            twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
+            raise scene_error(what, f"{twice} is given twice", "each name once", source)
+        return mapping
+
+    def whole(digits: str) -> int:
+        if len(digits) > MAX_SCALAR_CHARS:
+            raise scene_error(what, digits, "a number that can be written", source)
+        return int(digits)
+
+    def constant(name: str) -> float:
+        raise scene_error(what, name, "finite numbers", source)
+
+    try:
+        # Its own depth is bounded by that of Python's stack: the error for it is caught below.
+        found = json.loads(text, object_pairs_hook=once, parse_int=whole, parse_constant=constant)
+    except json.JSONDecodeError as error:
+        raise scene_error(what, f"{error.msg} in line {error.lineno}", "valid JSON", source) from None
+    except RecursionError:
+        raise scene_error(what, "lists too deep", f"JSON at most {MAX_DEPTH} deep", source) from None
+    return found
 
 
 class _Dumper(yaml.SafeDumper):

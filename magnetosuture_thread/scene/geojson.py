@@ -15,10 +15,10 @@ from typing import Any
 import shapely
 import shapely.geometry
 
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.errors import scene_error
 from magnetosuture_thread.scene.mapping import dish_from_mapping, make_scene, shape_from_mapping
-from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape
+from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, scene_error
 
 DISH = "dish"  # kind of the feature that is the dish
 GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less
@@ -114,22 +114,19 @@ class _FeatureReader:
         for given in properties:
             close = difflib.get_close_matches(given[:40], PROPERTIES, n=1, cutoff=0.85)
             if given not in PROPERTIES and close:  # a spelling error; others may belong to any program
-                raise scene_error(
-                    f"{where}.properties.{given}", properties[given], f"no such property: {close[0]}?", source
-                )
+                raise self._error(f"properties.{given}", properties[given], f"no such property: {close[0]}?")
         if not isinstance(geometry, Mapping):
-            raise scene_error(f"{where}.geometry", geometry, "a Point, Polygon or MultiPolygon", source)
+            raise self._error("geometry", geometry, "a Point, Polygon or MultiPolygon")
         self._type, self._coordinates = geometry.get("type"), geometry.get("coordinates")
 
     def dish(self) -> Dish:
         """Return the dish."""
         if self._type != "Point" or _planar(self._coordinates) != [0.0, 0.0]:
-            value = [self._type, self._coordinates]
-            raise scene_error(f"{self._where}.geometry", value, "a Point at 0, 0, the dish's centre", self._source)
+            raise self._error("geometry", [self._type, self._coordinates], "a Point at 0, 0, the dish's centre")
         given = self.properties
         fields = {name: given[name] for name in ("diameter", "depth") if given.get(name) is not None}
         if "diameter" not in fields and "radius" in given:
-            raise scene_error(f"{self._where}.properties.radius", given["radius"], "diameter, for a dish", self._source)
+            raise self._error("properties.radius", given["radius"], "diameter, for a dish")
         return dish_from_mapping(fields, self._source)
 
     def shapes(self) -> Iterator[SceneShape]:
@@ -141,15 +138,13 @@ class _FeatureReader:
             return
         parts: Any = [self._coordinates] if self._type == "Polygon" else self._coordinates
         if self._type not in ("Polygon", "MultiPolygon"):
-            raise scene_error(
-                f"{self._where}.geometry.type", self._type, "Point, Polygon or MultiPolygon", self._source
-            )
+            raise self._error("geometry.type", self._type, "Point, Polygon or MultiPolygon")
         if (
             not _is_list(parts)
             or not 0 < len(parts) <= MAX_SHAPES
             or not all(_is_list(part) and part for part in parts)
         ):
-            raise scene_error(f"{self._where}.geometry.coordinates", parts, "lists of rings of points", self._source)
+            raise self._error("geometry.coordinates", parts, "lists of rings of points")
         if self.properties.get("corner_radius") is not None:
             common["corner_radius"] = self.properties["corner_radius"]
         for number, rings in enumerate(parts, 1):
@@ -161,15 +156,16 @@ class _FeatureReader:
     def _shape(self, name: str, description: Mapping[str, Any]) -> SceneShape:
         return shape_from_mapping(name, description, self._source)
 
+    def _error(self, part: str, value: Any, expectation: str) -> ConfigurationError:
+        return scene_error(f"{self._where}.{part}", value, expectation, self._source)
+
     def _from_definition(self, shape: SceneShape) -> SceneShape:
         """Return the shape of the property `definition`, where it still matches the geometry."""
         definition = self.properties.get("definition")
         if definition is None:
             return shape
         if not isinstance(definition, Mapping):
-            raise scene_error(
-                f"{self._where}.properties.definition", definition, "a shape as in a scene file", self._source
-            )
+            raise self._error("properties.definition", definition, "a shape as in a scene file")
         defined = self._shape(shape.name, {**definition, "kind": shape.kind})
         return defined if _same(defined.geometry, shape.geometry) else shape
 

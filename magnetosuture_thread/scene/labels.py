@@ -28,7 +28,7 @@ class LabelPosition:
     line: tuple[tuple[float, float], ...] = ()
 
 
-def place_labels(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[LabelPosition]:
+def label_positions(scene: Scene, sizes: Sequence[tuple[float, float]]) -> list[LabelPosition]:
     """Return a position for the name of each shape: in the shape, in a hole of it, or beside it without overlap.
 
     Where no position is free, the name is placed in its shape.

@@ -7,11 +7,18 @@ from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
-from magnetosuture_thread.scene.errors import scene_error
-from magnetosuture_thread.scene.fields import ShapeFields
-from magnetosuture_thread.scene.scene import KINDS, MAX_NAME_CHARS, MAX_SHAPES, Dish, Scene, SceneShape, is_name
-from magnetosuture_thread.scene.shapes import ROUNDABLE, SHAPES
-from magnetosuture_thread.scene.text import is_number
+from magnetosuture_thread.scene.scene import (
+    KINDS,
+    MAX_NAME_CHARS,
+    MAX_SHAPES,
+    Dish,
+    Scene,
+    SceneShape,
+    is_name,
+    is_number,
+    scene_error,
+)
+from magnetosuture_thread.scene.shapes import ROUNDABLE, SHAPES, ShapeFields
 
 MAX_CORNER_RADIUS = 0.1  # m
 

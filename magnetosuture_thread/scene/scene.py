@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import reprlib
 import struct
 from collections import Counter
 from collections.abc import Mapping
@@ -14,9 +15,45 @@ from typing import Any
 import numpy as np
 import shapely
 
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.errors import scene_error
-from magnetosuture_thread.scene.text import is_number
+
+MAX_VALUE_CHARS = 80  # of a value in an error
+MAX_ERROR_NAME_CHARS = 120
+_SHORT_REPR = reprlib.Repr()
+_SHORT_REPR.maxlevel = _SHORT_REPR.maxdict = _SHORT_REPR.maxlist = _SHORT_REPR.maxtuple = 3
+_SHORT_REPR.maxstring = _SHORT_REPR.maxlong = _SHORT_REPR.maxother = MAX_VALUE_CHARS
+
+
+class _ShortRepr:
+    """A value as an error shows it: the beginning of its representation."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __repr__(self) -> str:
+        return self._text
+
+
+def scene_error(name: str, value: Any, expectation: str, source: str = "") -> ConfigurationError:
+    """Return the error for a part of a scene.
+
+    Args:
+        name: of the field, for example `post.disc.radius`; of a long one the beginning is shown.
+        value: what was given; of a long or deep one the beginning is shown.
+        expectation: what would have been accepted, with its unit.
+        source: the file.
+    """
+    text = _SHORT_REPR.repr(value)
+    if len(text) > 2 * MAX_VALUE_CHARS:
+        text = f"{text[: 2 * MAX_VALUE_CHARS]}…"
+    short = _ShortRepr(text) if isinstance(value, (str, list, tuple, dict)) or len(text) > MAX_VALUE_CHARS else value
+    # A name comes from a file too: control characters and line ends are shown as escapes.
+    name = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in name[: MAX_ERROR_NAME_CHARS + 1])
+    return ConfigurationError(
+        name if len(name) <= MAX_ERROR_NAME_CHARS else f"{name[:MAX_ERROR_NAME_CHARS]}…", short, expectation, source
+    )
+
 
 KINDS = ("tissue", "instrument", "wall")
 """What a shape is: tissue, an instrument or post, or a rigid wall inside of the dish."""
@@ -28,6 +65,16 @@ MAX_NAME_CHARS = 64
 MAX_COORDINATE = 1.0  # m; anything larger is in another unit
 MIN_RADIUS = 1e-6  # m
 VERSION_CHARS = 16
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number, and not a boolean."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond any float
+        return False
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.bags.conversion import rotation_from_message
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.transforms import rotation_from_message
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import GROUND_TRUTH_NEEDLE, NEEDLE_COMMAND

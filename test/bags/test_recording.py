@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from magnetosuture_thread.bags.conversion import TransformTree
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.remap import parse_remap
 from magnetosuture_thread.bags.storage import MessageDefinition
-from magnetosuture_thread.bags.transforms import TransformTree
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.interface import (

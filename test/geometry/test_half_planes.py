@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.geometry.half_planes import ROUNDING, nearest_in_half_planes
+from magnetosuture_thread.geometry.half_planes import ROUNDING, project_onto_half_planes
 
 NUMBERS = st.floats(-1.0, 1.0)
 
@@ -21,6 +21,13 @@ def half_planes(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if draw(st.booleans()):
         rows, least = np.concatenate([rows, (1.0 + 1e-15) * rows]), np.concatenate([least, least])
     return np.array([draw(NUMBERS), draw(NUMBERS)]), rows, least * np.linalg.norm(rows, axis=1)
+
+
+def nearest_in_half_planes(point: np.ndarray, rows: np.ndarray, bounds: np.ndarray) -> np.ndarray | None:
+    """Return the nearest point of the half planes' intersection; None where there is none."""
+    found = np.empty(2)
+    point, rows, bounds = (np.ascontiguousarray(array, dtype=np.float64) for array in (point, rows, bounds))
+    return found if project_onto_half_planes(point, rows, bounds, np.empty((len(rows), 3)), found) else None
 
 
 def missing(rows: np.ndarray, least: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import shapely
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, shape_from_mapping
 from magnetosuture_thread.scene.checks import farthest_point, scene_warnings
-from magnetosuture_thread.scene.labels import LabelPosition, place_labels
+from magnetosuture_thread.scene.labels import LabelPosition, label_positions
 
 WIDTH = 0.0004
 SQUARE = ((0.0, 0.0), (0.004, 0.0), (0.004, 0.004), (0.0, 0.004))
@@ -94,9 +94,9 @@ def test_names_stand_clear_of_other_shapes_and_of_each_other():
     sizes = [(0.003, 0.001), (0.006, 0.001), (0.006, 0.001)]
     boxes = [
         shapely.box(x - w / 2, y - h / 2, x + w / 2, y + h / 2)
-        for (x, y), (w, h) in zip((place.middle for place in place_labels(known, sizes)), sizes, strict=True)
+        for (x, y), (w, h) in zip((place.middle for place in label_positions(known, sizes)), sizes, strict=True)
     ]
-    for place, shape, box in zip(place_labels(known, sizes), known.shapes, boxes, strict=True):
+    for place, shape, box in zip(label_positions(known, sizes), known.shapes, boxes, strict=True):
         start, end = map(shapely.Point, place.line)
         assert box.distance(start) < 1e-12
         assert shape.solid.distance(end) < 1e-12
@@ -108,5 +108,5 @@ def test_names_stand_clear_of_other_shapes_and_of_each_other():
 
 def test_a_name_that_fits_stands_in_its_shape_and_one_that_fits_nowhere_too():
     known = scene(moved(0.0, 0.0), Disc((-0.01, 0.0), 0.0005))
-    places = place_labels(known, [(0.002, 0.0005), (0.05, 0.01)])
+    places = label_positions(known, [(0.002, 0.0005), (0.05, 0.01)])
     assert places == [LabelPosition(known.shapes[0].label_point), LabelPosition((-0.01, 0.0))]

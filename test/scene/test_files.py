@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, scene_to_mapping, write_scene
-from magnetosuture_thread.scene.text import MAX_FILE_BYTES, parse_yaml
+from magnetosuture_thread.scene.files import MAX_FILE_BYTES, parse_yaml
 from test.scene.scenes import SHAPES, every_shape
 
 DISH = "dish: {diameter: 0.035, depth: 0.003}\n"

@@ -11,7 +11,6 @@ from typing import BinaryIO
 
 from mcap.opcode import Opcode
 
-from magnetosuture_thread.bags.damage_report import pluralize
 from magnetosuture_thread.bags.mcap.records import (
     MAGIC,
     MESSAGE_HEADER,
@@ -22,7 +21,7 @@ from magnetosuture_thread.bags.mcap.records import (
 from magnetosuture_thread.bags.mcap.salvage import salvage
 from magnetosuture_thread.bags.mcap.scan import Block, Scanner
 from magnetosuture_thread.bags.mcap.summary import read_summary
-from magnetosuture_thread.bags.storage import StoredMessage, merge_by_time
+from magnetosuture_thread.bags.storage import StoredMessage, merge_by_time, pluralize
 from magnetosuture_thread.errors import BagError
 
 

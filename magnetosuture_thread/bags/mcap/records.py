@@ -17,24 +17,10 @@ from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
 
 import zstandard
+from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
 RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of the content
@@ -43,18 +29,18 @@ MIN_PRIVATE_OPCODE = 0x80
 MAX_CHUNK_BYTES = 1 << 30  # of a chunk in memory, compressed or not
 
 _READERS: dict[int, Callable[[ReadDataStream], Any]] = {
-    Opcode.HEADER: Header.read,
-    Opcode.FOOTER: Footer.read,
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.MESSAGE_INDEX: MessageIndex.read,
-    Opcode.CHUNK_INDEX: ChunkIndex.read,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
-    Opcode.STATISTICS: Statistics.read,
-    Opcode.METADATA: Metadata.read,
-    Opcode.METADATA_INDEX: MetadataIndex.read,
-    Opcode.SUMMARY_OFFSET: SummaryOffset.read,
-    Opcode.DATA_END: DataEnd.read,
+    Opcode.HEADER: mcap_records.Header.read,
+    Opcode.FOOTER: mcap_records.Footer.read,
+    Opcode.SCHEMA: mcap_records.Schema.read,
+    Opcode.CHANNEL: mcap_records.Channel.read,
+    Opcode.MESSAGE_INDEX: mcap_records.MessageIndex.read,
+    Opcode.CHUNK_INDEX: mcap_records.ChunkIndex.read,
+    Opcode.ATTACHMENT_INDEX: mcap_records.AttachmentIndex.read,
+    Opcode.STATISTICS: mcap_records.Statistics.read,
+    Opcode.METADATA: mcap_records.Metadata.read,
+    Opcode.METADATA_INDEX: mcap_records.MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: mcap_records.SummaryOffset.read,
+    Opcode.DATA_END: mcap_records.DataEnd.read,
 }
 # First and last time, uncompressed size, its checksum, length of the compression's name.
 _CHUNK_HEADER = struct.Struct("<QQQII")
@@ -114,7 +100,7 @@ def iterate_records(content: bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, start, position
 
 
-def encode_records(*records: McapRecord) -> bytes:
+def encode_records(*records: mcap_records.McapRecord) -> bytes:
     """Return records as they are in a file."""
     builder: Any = RecordBuilder()
     for record in records:

@@ -12,13 +12,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from magnetosuture_thread.bags.damage_report import CorruptRegion, DamageReport, pluralize
-from magnetosuture_thread.bags.mcap.channels import ChannelTable
+from magnetosuture_thread.bags.bag_folder import NOTES, verified_notes
 from magnetosuture_thread.bags.mcap.records import RECORD_HEADER
 from magnetosuture_thread.bags.mcap.scan import Block, ScanResult
-from magnetosuture_thread.bags.mcap.summary import IndexedChunk, McapSummary
-from magnetosuture_thread.bags.metadata import NOTES, verified_notes
-from magnetosuture_thread.bags.storage import Connection
+from magnetosuture_thread.bags.mcap.summary import ChannelTable, IndexedChunk, McapSummary
+from magnetosuture_thread.bags.storage import Connection, CorruptRegion, DamageReport, pluralize
 
 UNCHECKED = "has no checksums: damage to it cannot be noticed"
 PARTLY_UNCHECKED = "has messages without a checksum: damage to them cannot be noticed"

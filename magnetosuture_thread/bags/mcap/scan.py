@@ -17,8 +17,6 @@ from typing import BinaryIO, NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from magnetosuture_thread.bags.damage_report import CorruptRegion
-from magnetosuture_thread.bags.mcap.channels import ChannelTable
 from magnetosuture_thread.bags.mcap.records import (
     MAGIC,
     MAX_CHUNK_BYTES,
@@ -33,7 +31,8 @@ from magnetosuture_thread.bags.mcap.records import (
     iterate_records,
     parse_record,
 )
-from magnetosuture_thread.bags.mcap.summary import McapSummary
+from magnetosuture_thread.bags.mcap.summary import ChannelTable, McapSummary
+from magnetosuture_thread.bags.storage import CorruptRegion
 
 _SKIP_BYTES = 1 << 20  # read at a time where a record is skipped
 _RUN_BYTES = 1 << 20  # of messages outside of chunks in one block

@@ -19,27 +19,111 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import BinaryIO
+from itertools import chain
+from typing import BinaryIO, NamedTuple
 
 import zstandard
+from mcap import records as mcap_records
 from mcap.opcode import Opcode
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
 
-from magnetosuture_thread.bags.mcap.chunk_builder import ChunkBuilder, PendingMessage, encode_message_index
-from magnetosuture_thread.bags.mcap.records import MAGIC, RECORD_HEADER, encode_records
+from magnetosuture_thread.bags.mcap.records import MAGIC, MESSAGE_HEADER, RECORD_HEADER, encode_records
 from magnetosuture_thread.bags.storage import Connection
+
+_MESSAGE = struct.Struct("<BQHIQQ")  # the header of a message's record, and what is before the data
+_INDEX = struct.Struct("<BQHI")  # the header of a message index, its channel, and its size
+
+
+class PendingMessage(NamedTuple):
+    """A message that is not written yet: channel id, sequence number, time [ns], CDR bytes."""
+
+    channel: int
+    sequence: int
+    time: int
+    data: bytes
+
+
+class BuiltChunk(NamedTuple):
+    """The content of a chunk to be written.
+
+    Attributes:
+        data: its records, uncompressed.
+        entries: time and offset of each message, by channel.
+        first: time of the first message [ns].
+        last: time of the last message [ns].
+    """
+
+    data: bytes
+    entries: dict[int, list[tuple[int, int]]]
+    first: int
+    last: int
+
+
+class ChunkBuilder:
+    """Collects messages for a chunk.
+
+    The only state is a list that grows: whatever interrupts a recorder between two messages or within one, as Ctrl-C
+    may, the messages stay complete.
+
+    Attributes:
+        size: number of bytes of the messages so far.
+    """
+
+    def __init__(self) -> None:
+        self._messages: list[PendingMessage] = []
+        self._first = self._last = 0
+        self.size = 0
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self._messages)
+
+    @property
+    def span(self) -> int:
+        """Time from the first message to the last [ns]."""
+        return self._last - self._first
+
+    def add(self, message: PendingMessage) -> None:
+        """Add a message."""
+        time, is_first = message.time, not self._messages
+        self._messages.append(message)
+        self.size += len(message.data)
+        if is_first or time < self._first:
+            self._first = time
+        if is_first or time > self._last:
+            self._last = time
+
+    def build(
+        self, channels: Mapping[int, mcap_records.Channel], schemas: Mapping[int, mcap_records.Schema]
+    ) -> BuiltChunk:
+        """Return the content of the chunk: the messages, with the channels and schemas that they need."""
+        content: list[bytes] = []
+        size = 0
+        entries: dict[int, list[tuple[int, int]]] = {}
+        defined: set[int] = set()
+        for number, sequence, time, data in self._messages:
+            if number not in entries:
+                channel = channels[number]
+                if channel.schema_id and channel.schema_id not in defined:
+                    content.append(encode_records(schemas[channel.schema_id]))
+                    size += len(content[-1])
+                    defined.add(channel.schema_id)
+                content.append(encode_records(channel))
+                size += len(content[-1])
+                entries[number] = []
+            entries[number].append((time, size))
+            length = MESSAGE_HEADER.size + len(data)
+            content += (_MESSAGE.pack(Opcode.MESSAGE, length, number, sequence, time, time), data)
+            size += _MESSAGE.size + len(data)
+        times = [message.time for message in self._messages]
+        return BuiltChunk(b"".join(content), entries, min(times), max(times))
+
+
+def encode_message_index(channel: int, entries: list[tuple[int, int]]) -> bytes:
+    """Return the record with time and offset of each message of a channel in a chunk."""
+    offsets = struct.pack(f"<{2 * len(entries)}Q", *chain.from_iterable(entries))
+    length = _INDEX.size - RECORD_HEADER.size + len(offsets)
+    return _INDEX.pack(Opcode.MESSAGE_INDEX, length, channel, len(offsets)) + offsets
+
 
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
@@ -85,15 +169,15 @@ class McapWriter:
 
     def __init__(self, stream: BinaryIO, metadata: Mapping[str, Mapping[str, str]]) -> None:
         self._stream = stream
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, mcap_records.Schema] = {}
+        self._channels: dict[int, mcap_records.Channel] = {}
         self._numbers: dict[object, int] = {}  # of schemas, by their definition
         self._sequences: Counter[int] = Counter()
         self._index: list[bytes] = []  # entries of the chunk index
         self._compressor = zstandard.ZstdCompressor()
         self.state = WriterState(0, 0, 0, Counter(), None, 0, ChunkBuilder())
-        self.state = self._append(MAGIC + encode_records(Header("ros2", "magnetosuture_thread")))
-        self._metadata_index: list[MetadataIndex] = []
+        self.state = self._append(MAGIC + encode_records(mcap_records.Header("ros2", "magnetosuture_thread")))
+        self._metadata_index: list[mcap_records.MetadataIndex] = []
         self._write_metadata(metadata)
 
     def add_channel(self, connection: Connection) -> int:
@@ -101,9 +185,11 @@ class McapWriter:
         definition, schema = connection.definition, 0
         if definition.type_name:
             schema = self._numbers.setdefault(definition, len(self._numbers) + 1)
-            self._schemas[schema] = Schema(schema, definition.text.encode(), definition.encoding, definition.type_name)
+            self._schemas[schema] = mcap_records.Schema(
+                schema, definition.text.encode(), definition.encoding, definition.type_name
+            )
         number = len(self._channels) + 1
-        self._channels[number] = Channel(
+        self._channels[number] = mcap_records.Channel(
             number, connection.topic, connection.serialization, dict(connection.metadata), schema
         )
         return number
@@ -134,12 +220,12 @@ class McapWriter:
             return
         content, entries, first, last = before.pending.build(self._channels, self._schemas)
         compressed = self._compressor.compress(content)
-        body = encode_records(Chunk("zstd", compressed, last, first, zlib.crc32(content), len(content)))
+        body = encode_records(mcap_records.Chunk("zstd", compressed, last, first, zlib.crc32(content), len(content)))
         indices, offsets = b"", dict[int, int]()
         for channel, messages in entries.items():
             offsets[channel] = before.size + len(body) + len(indices)
             indices += encode_message_index(channel, messages)
-        entry = ChunkIndex(
+        entry = mcap_records.ChunkIndex(
             chunk_length=len(body),
             chunk_start_offset=before.size,
             compression="zstd",
@@ -175,7 +261,7 @@ class McapWriter:
         chunks = self.state
         try:
             self._write_metadata(metadata)
-            self.state = self._append(encode_records(DataEnd(self.state.crc)))
+            self.state = self._append(encode_records(mcap_records.DataEnd(self.state.crc)))
             self.state = self._append(self._summary())
             os.fsync(self._stream.fileno())
         except OSError:
@@ -191,8 +277,8 @@ class McapWriter:
     def _write_metadata(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         """Write metadata, a record for each name."""
         for name, entries in metadata.items():
-            record = encode_records(Metadata(name, dict(entries)))
-            entry = MetadataIndex(self.state.size, len(record), name)
+            record = encode_records(mcap_records.Metadata(name, dict(entries)))
+            entry = mcap_records.MetadataIndex(self.state.size, len(record), name)
             self.state = self._append(record)
             self._metadata_index.append(entry)
 
@@ -216,7 +302,7 @@ class McapWriter:
         """Return all records after the data end."""
         data, at = b"", self.state.size
         offsets = b""
-        statistics = Statistics(
+        statistics = mcap_records.Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self.state.counts),
@@ -235,9 +321,9 @@ class McapWriter:
             (Opcode.METADATA_INDEX, encode_records(*self._metadata_index)),
         ):
             if group:
-                offsets += encode_records(SummaryOffset(opcode, at + len(data), len(group)))
+                offsets += encode_records(mcap_records.SummaryOffset(opcode, at + len(data), len(group)))
                 data += group
         footer = (at, at + len(data))
         data += offsets
         crc = zlib.crc32(RECORD_HEADER.pack(Opcode.FOOTER, 20) + struct.pack("<QQ", *footer), zlib.crc32(data))
-        return data + encode_records(Footer(*footer, crc)) + MAGIC
+        return data + encode_records(mcap_records.Footer(*footer, crc)) + MAGIC

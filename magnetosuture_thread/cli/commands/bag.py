@@ -65,9 +65,9 @@ def run_repair(options: argparse.Namespace) -> int:
     The new bag has the old one's notes and definitions of types. The command reports how many messages there are and
     what is lost, where and when.
     """
-    from magnetosuture_thread.bags.damage_report import pluralize
     from magnetosuture_thread.bags.reader import Bag
-    from magnetosuture_thread.bags.repair import write_repaired_bag
+    from magnetosuture_thread.bags.storage import pluralize
+    from magnetosuture_thread.bags.writer import write_repaired_bag
     from magnetosuture_thread.jobs.output import whole_folder
 
     console = make_console()

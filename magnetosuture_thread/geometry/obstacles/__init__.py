@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from magnetosuture_thread.geometry.obstacles.closest import closest_on_triangles
 from magnetosuture_thread.geometry.obstacles.contacts import WALL, WorkspaceData, find_contacts, wall_contact
-from magnetosuture_thread.geometry.obstacles.disc import Disc
-from magnetosuture_thread.geometry.obstacles.mesh import Mesh
-from magnetosuture_thread.geometry.obstacles.packing import Obstacle
-from magnetosuture_thread.geometry.obstacles.polygon import Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
 from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
 from magnetosuture_thread.geometry.obstacles.workspace import Contacts, Workspace
 
@@ -21,7 +17,6 @@ __all__ = [
     "Triangulation",
     "Workspace",
     "WorkspaceData",
-    "closest_on_triangles",
     "find_contacts",
     "triangulate",
     "wall_contact",

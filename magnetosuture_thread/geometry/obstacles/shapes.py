@@ -1,4 +1,4 @@
-"""Polygons: flat obstacles with an outline and holes."""
+"""Shapes of obstacles: discs, polygons with holes, and meshes in space."""
 
 from __future__ import annotations
 
@@ -12,6 +12,39 @@ from numpy.typing import NDArray
 from shapely.validation import explain_validity
 
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.polyline import Points
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A disc in the plane, or a ball in space.
+
+    Attributes:
+        centre: coordinates of the centre, d values [m].
+        radius: radius [m].
+    """
+
+    centre: tuple[float, ...]
+    radius: float
+
+    def signed_distance(self, points: Points) -> tuple[NDArray[np.float64], Points]:
+        """Return the signed distance of points from the surface, and the outward direction.
+
+        Args:
+            points: shape (m, d) [m].
+
+        Returns:
+            Distance, shape (m,), negative inside [m]; its gradient, unit vectors, shape (m, d). At the
+            very centre, where every direction is as good, the first axis.
+        """
+        offset = points - np.asarray(self.centre)
+        distance = np.linalg.norm(offset, axis=1)
+        first_axis = np.zeros_like(offset)
+        first_axis[:, 0] = 1.0
+        safe = np.where(distance > 0.0, distance, 1.0)[:, None]
+        normal = np.where(distance[:, None] > 0.0, offset / safe, first_axis)
+        return distance - self.radius, normal
+
 
 MAX_COORDINATE = 10.0
 """A coordinate beyond this is taken for one in another unit [m]."""
@@ -90,7 +123,7 @@ class Polygon:
         """
         for name, value in (("radius", radius), ("angle", angle), ("step", step)):
             if not (math.isfinite(value) and value > 0.0):
-                raise ConfigurationError(f"polygon.smoothed.{name}", value, "a positive number", source=self.source)
+                raise ConfigurationError(f"polygon.smoothed.{name}", value, "a positive number", self.source)
         problem: ConfigurationError | None = None
         for halvings in range(12):
             smaller = radius * 0.5**halvings
@@ -100,7 +133,7 @@ class Polygon:
             except ConfigurationError as error:
                 problem = error
         raise ConfigurationError(
-            "polygon.smoothed.radius", radius, f"a radius that leaves a polygon ({problem})", source=self.source
+            "polygon.smoothed.radius", radius, f"a radius that leaves a polygon ({problem})", self.source
         )
 
 
@@ -117,29 +150,25 @@ def check_metres(name: str, points: NDArray[np.float64], source: str) -> None:
     """
     wrong = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(wrong):
-        raise ConfigurationError(
-            f"{name}[{wrong[0]}]", tuple(points[wrong[0]].tolist()), "finite coordinates", source=source
-        )
+        raise ConfigurationError(f"{name}[{wrong[0]}]", tuple(points[wrong[0]].tolist()), "finite coordinates", source)
     largest = float(np.abs(points).max(initial=0.0))
     if largest > MAX_COORDINATE:
         raise ConfigurationError(
-            name, largest, f"coordinates of at most {MAX_COORDINATE:g} m: is it in metres?", source=source
+            name, largest, f"coordinates of at most {MAX_COORDINATE:g} m: is it in metres?", source
         )
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent < MIN_EXTENT:
-        raise ConfigurationError(
-            name, extent, f"an extent of at least {MIN_EXTENT:g} m: is it in metres?", source=source
-        )
+        raise ConfigurationError(name, extent, f"an extent of at least {MIN_EXTENT:g} m: is it in metres?", source)
 
 
 def _checked_ring(name: str, given: Sequence[Sequence[float]], source: str) -> Ring:
     """Return a ring without duplicates and closing point, once it is known to bound an area."""
     for i, point in enumerate(given):
         if len(point) != 2:
-            raise ConfigurationError(f"{name}[{i}]", tuple(point), "two coordinates x, y [m]", source=source)
+            raise ConfigurationError(f"{name}[{i}]", tuple(point), "two coordinates x, y [m]", source)
     points = [(float(x), float(y)) for x, y in given]
     if len(set(points)) < 3:
-        raise ConfigurationError(name, f"{len(set(points))} distinct points", "at least 3 points", source=source)
+        raise ConfigurationError(name, f"{len(set(points))} distinct points", "at least 3 points", source)
     array = np.array(points)
     check_metres(name, array, source)
     ring = tuple(point for i, point in enumerate(points) if point != points[i - 1])
@@ -147,11 +176,11 @@ def _checked_ring(name: str, given: Sequence[Sequence[float]], source: str) -> R
         # The loop above dropped the first of the two; the shape shall begin where it was given to begin.
         ring = (ring[-1], *ring[:-1])
     if _is_flat(array):
-        raise ConfigurationError(name, "zero area", "points that are not all on one line", source=source)
+        raise ConfigurationError(name, "zero area", "points that are not all on one line", source)
     shape = shapely.Polygon(ring)
     if not shape.is_valid:
         raise ConfigurationError(
-            name, str(explain_validity(shape)), "an outline that does not cross or touch itself", source=source
+            name, str(explain_validity(shape)), "an outline that does not cross or touch itself", source
         )
     return ring
 
@@ -171,7 +200,7 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
     for i, shape in enumerate(shapes):
         name = f"polygon.holes[{i}]"
         if not solid.intersects(shape):
-            raise ConfigurationError(name, "a hole outside the outline", "a hole inside the outline", source=source)
+            raise ConfigurationError(name, "a hole outside the outline", "a hole inside the outline", source)
         if not solid.contains_properly(shape):
             where = solid.exterior.intersection(shape.exterior)
             value = (
@@ -179,7 +208,7 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
                 if where.is_empty
                 else f"a hole that meets the outline at {_position_text(where)}"
             )
-            raise ConfigurationError(name, value, "a hole inside the outline, apart from it", source=source)
+            raise ConfigurationError(name, value, "a hole inside the outline, apart from it", source)
         for j, other in enumerate(shapes[:i]):
             if shape.intersects(other):
                 where = shape.intersection(other)
@@ -187,7 +216,7 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
                     name,
                     f"a hole that meets holes[{j}] at {_position_text(where)}",
                     "holes apart from each other",
-                    source=source,
+                    source,
                 )
 
 
@@ -261,3 +290,89 @@ def _arc(before: Vertex, corner: Vertex, after: Vertex, turned: float, tangent: 
         corner[0] + tangent * (after[0] - corner[0]) / length,
         corner[1] + tangent * (after[1] - corner[1]) / length,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A solid in space, bounded by a closed surface of triangles.
+
+        volume = sum over the faces of a . (b x c) / 6
+
+    Faces are kept counter-clockwise seen from outside; when all were given the other way, all are flipped.
+
+    Attributes:
+        vertices: shape (v, 3) [m].
+        faces: indices of vertices, shape (f, 3).
+        source: the file that the shape came from, for the error.
+
+    Raises:
+        ConfigurationError: when it bounds no solid: not finite, an index out of range, a face without
+            area, an edge that is not between two faces in opposite directions, no volume, or coordinates
+            that cannot be metres.
+    """
+
+    vertices: Points
+    faces: NDArray[np.int64]
+    source: str = field(default="", repr=False)
+
+    def __post_init__(self) -> None:
+        """Check and normalise what was given."""
+        vertices = np.array(self.vertices, dtype=np.float64)
+        faces = np.array(self.faces)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            self._refuse("vertices", f"shape {vertices.shape}", "shape (v, 3) [m]")
+        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or not np.issubdtype(faces.dtype, np.integer):
+            self._refuse("faces", f"shape {faces.shape} of {faces.dtype}", "integers of shape (f, 3), f >= 1")
+        faces = faces.astype(np.int64)
+        check_metres("mesh.vertices", vertices, self.source)
+        outside = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
+        if len(outside):
+            self._refuse(
+                f"faces[{outside[0]}]", faces[outside[0]].tolist(), f"indices of vertices, 0 to {len(vertices) - 1}"
+            )
+        self._check_faces(vertices, faces)
+        self._check_edges(faces)
+        a, b, c = np.moveaxis(vertices[faces] - vertices[faces[0, 0]], 1, 0)
+        volume = float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
+        if abs(volume) <= 1e-12 * float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) ** 3:
+            self._refuse("faces", f"a volume of {volume:.3g} m^3", "a surface around a volume")
+        if volume < 0.0:
+            faces = np.ascontiguousarray(faces[:, ::-1])
+        for name, array in (("vertices", vertices), ("faces", faces)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def _refuse(self, name: str, value: object, expectation: str) -> None:
+        raise ConfigurationError(f"mesh.{name}", value, expectation, self.source)
+
+    def _check_faces(self, vertices: Points, faces: NDArray[np.int64]) -> None:
+        """Refuse a face without area, to rounding."""
+        a, b, c = np.moveaxis(vertices[faces], 1, 0)
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        longest = np.max([np.sum((b - a) ** 2, axis=1), np.sum((c - b) ** 2, axis=1), np.sum((a - c) ** 2, axis=1)], 0)
+        flat = np.flatnonzero(area <= 1e-10 * longest)
+        if len(flat):
+            self._refuse(f"faces[{flat[0]}]", faces[flat[0]].tolist(), "three vertices that are not on one line")
+
+    def _check_edges(self, faces: NDArray[np.int64]) -> None:
+        """Refuse a surface that is open, or whose faces do not agree on what is outside."""
+        n = int(faces.max()) + 1
+        tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+        either, counts = np.unique(np.minimum(tails, heads) * n + np.maximum(tails, heads), return_counts=True)
+        if (counts != 2).any():
+            edge, count = int(either[counts != 2][0]), int(counts[counts != 2][0])
+            self._refuse(
+                "faces", f"{count} faces at the edge of vertices {edge // n} and {edge % n}", "a closed surface: 2 each"
+            )
+        edges, counts = np.unique(tails * n + heads, return_counts=True)
+        if (counts != 1).any():
+            edge = int(edges[counts != 1][0])
+            self._refuse(
+                "faces",
+                f"two faces that both run from vertex {edge // n} to {edge % n}",
+                "faces all counter-clockwise, or all clockwise, seen from outside",
+            )
+
+
+Obstacle = Disc | Polygon | Mesh
+"""Any shape that `Workspace` takes."""
