@@ -12,18 +12,18 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection
 
-from magnetosuture_thread.calibration.passage import Passage
-from magnetosuture_thread.calibration.replays import Run, Task, attempt
+from magnetosuture_thread.calibration.recorded_run import RecordedRun
+from magnetosuture_thread.calibration.residuals import RunTasks, Task, replay_with_parameters
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.geometry.polyline import Points
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # meant for the parent, which ends its workers itself
 
-_passages: tuple[Passage, ...] = ()
+_passages: tuple[RecordedRun, ...] = ()
 
 
 @contextmanager
-def pool(passages: Sequence[Passage], workers: int) -> Iterator[Run]:
+def pool(passages: Sequence[RecordedRun], workers: int) -> Iterator[RunTasks]:
     """Give what runs tasks: here, or in processes of its own.
 
     Ctrl-C is the parent's, and ends the processes at once, whatever they are at.
@@ -36,7 +36,7 @@ def pool(passages: Sequence[Passage], workers: int) -> Iterator[Run]:
         GraphError: a process died.
     """
     if workers <= 1:
-        yield lambda tasks: [attempt(passages[index], settings) for index, settings in tasks]
+        yield lambda tasks: [replay_with_parameters(passages[index], settings) for index, settings in tasks]
         return
     others = set(multiprocessing.active_children())
     executor = ProcessPoolExecutor(
@@ -65,7 +65,7 @@ def pool(passages: Sequence[Passage], workers: int) -> Iterator[Run]:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin(passages: tuple[Passage, ...]) -> None:
+def _begin(passages: tuple[RecordedRun, ...]) -> None:
     """Take the passages, and end whenever the parent does, however it ends."""
     global _passages
     _passages = passages
@@ -81,4 +81,4 @@ def _begin(passages: tuple[Passage, ...]) -> None:
 
 def _work(task: Task) -> Points:
     index, settings = task
-    return attempt(_passages[index], settings)
+    return replay_with_parameters(_passages[index], settings)

@@ -9,15 +9,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from magnetosuture_thread.calibration.parameters import chosen
-from magnetosuture_thread.calibration.passage import Passage, passage_of
-from magnetosuture_thread.calibration.picture import draw_calibration
+from magnetosuture_thread.calibration.output import to_yaml
+from magnetosuture_thread.calibration.parameters import choose_parameters
+from magnetosuture_thread.calibration.plot import draw_calibration
 from magnetosuture_thread.calibration.pool import pool
-from magnetosuture_thread.calibration.replays import Best
+from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
+from magnetosuture_thread.calibration.residuals import BestSettings
 from magnetosuture_thread.calibration.result import BagFit, CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate as fit
-from magnetosuture_thread.calibration.search import unfinished
-from magnetosuture_thread.calibration.yaml_text import to_yaml
+from magnetosuture_thread.calibration.search import unfinished_result
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.jobs.output import whole_file
 from magnetosuture_thread.jobs.replay_inputs import Given, opened
@@ -90,14 +90,14 @@ def calibrate_bags(
         InvalidInputError: the bags are of different threads.
     """
     passages, settings = _read(bags, request, log, lambda share: progress(READING * share))
-    best = Best()
+    best = BestSettings()
     try:
         with pool(passages, min(request.workers, os.cpu_count() or 1)) as run:
             calibration, fits = fit(
                 passages,
                 settings,
                 request.parameters,
-                run=run,
+                run_tasks=run,
                 best=best,
                 progress=lambda share: progress(READING + (1.0 - READING) * share),
                 log=log,
@@ -106,7 +106,7 @@ def calibrate_bags(
         if best.settings is None:
             raise
         log("interrupted; writing the best so far")
-        calibration, fits = unfinished(passages, settings, best)
+        calibration, fits = unfinished_result(passages, settings, best)
     _write(calibration, fits, output, picture or output.with_suffix(".png"), json_file)
     return calibration
 
@@ -125,9 +125,9 @@ def _write(
 
 def _read(
     bags: Sequence[Path], request: Request, log: Log, progress: Progress
-) -> tuple[list[Passage], ThreadModelSettings]:
+) -> tuple[list[RecordedRun], ThreadModelSettings]:
     """Read all bags, their frames tracked once, and return what the set-up says of the thread."""
-    passages: list[Passage] = []
+    passages: list[RecordedRun] = []
     settings: ThreadModelSettings | None = None
     threads: list[tuple[Path, Setup]] = []
     for index, path in enumerate(bags):
@@ -146,7 +146,7 @@ def _read(
             log=log,
         ) as given:
             own = settings_of(given.setup, request)
-            chosen(own.formulation, request.parameters)  # what is wrong is said before the bag is read
+            choose_parameters(own.formulation, request.parameters)  # what is wrong is said before the bag is read
             _check_same(threads, path, _named(given) or given.setup)
             if settings is not None and own != settings:
                 name, first = given.setup.name, threads[0][1].name
@@ -156,7 +156,7 @@ def _read(
             seen = read_observations(given.recording, given.setup, source=given.source, progress=share)
             simulated = given.recording.notes.get("simulated", "")
             try:
-                passages.append(passage_of(str(path), seen, own, request.against, simulated, given.setup.scene))
+                passages.append(read_run(str(path), seen, own, request.against, simulated, given.setup.scene))
             except BagError:
                 if problem := seen.thread_problem():
                     raise BagError(path, problem) from None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from magnetosuture_thread.bags.bag_files import STORAGE_SUFFIXES, find_bag_files
 from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
-from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv, table_json
+from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
 from magnetosuture_thread.jobs.evaluate_bag import Options, evaluate_bag, printable_path
 from magnetosuture_thread.jobs.frames import numbered
 from magnetosuture_thread.jobs.output import whole_folder

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from magnetosuture_thread.bags.recording import CHANNELS
 from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.evaluation.bag_table import Row, row_of
-from magnetosuture_thread.evaluation.frames import FrameResult, Observation
+from magnetosuture_thread.evaluation.frames import FrameResult, Observation, WorstFrame
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures
 from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, ReportPicture, draw_worst_frame
-from magnetosuture_thread.evaluation.series import WorstFrame
+from magnetosuture_thread.evaluation.tables import Row, row_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import DISH_FRAME, GROUND_TRUTH_THREAD, MEASURED_THREAD, PREDICTED_THREAD
 from magnetosuture_thread.jobs.evaluate_live import RecordedPredictions, live_figures

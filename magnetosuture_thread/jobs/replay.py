@@ -15,8 +15,8 @@ from magnetosuture_thread.evaluation.graph_outputs import (
     CurrentSeries,
     GraphCollector,
     ReplaySummary,
-    stage_latencies,
 )
+from magnetosuture_thread.evaluation.metrics import stage_latencies
 from magnetosuture_thread.interface import (
     CURRENTS,
     GROUND_TRUTH_THREAD,
@@ -238,8 +238,8 @@ class _Replay:
             frames=frames,
             tracked=collector.poses,
             commands=len(commands),
-            driven=len(collector.driven & set(commands)),
-            latency=stage_latencies(live.published, live.arrived, collector.driven),
+            driven=len(collector.applied & set(commands)),
+            latency=stage_latencies(live.published, live.arrived, collector.applied),
             currents=replayed.against(recorded),
             refused=self.refused,
             dropped=losses.dropped(),

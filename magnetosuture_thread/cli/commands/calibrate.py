@@ -71,7 +71,7 @@ def add(subparsers: Subparsers) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Fit the thread's parameters to recorded bags."""
-    from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
+    from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table
     from magnetosuture_thread.jobs.calibrate import Request, calibrate_bags
 
     console = make_console()
