@@ -116,7 +116,8 @@ def _scores(
     blocks, whole = [], []
     for j, r, w, run in zip(jacobian, solution.residuals, solution.weights, runs, strict=True):
         by_frame = np.einsum("knp,kn->kp", j / size, w * r)
-        blocks += [by_frame[run.blocks == index].sum(axis=0) for index in np.unique(run.blocks)]
+        block = run.blocks
+        blocks += [by_frame[block == index].sum(axis=0) for index in np.unique(block)]
         whole.append(by_frame.sum(axis=0))
     return np.array(blocks), np.array(whole)
 
@@ -159,31 +160,26 @@ def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -
         runs: that it was fitted to.
     """
     parameters, settings = solution.parameters, solution.settings
-    counts = [parameter.counts(settings) for parameter in parameters]
+    counts = np.array([parameter.counts(settings) for parameter in parameters])
     found: dict[int, Identifiability] = {}
-    left = list(range(len(parameters)))
-    for index in list(left):
+    for index, parameter in enumerate(parameters):
         if solution.at_bound(index):
-            ending = f"the fit ends at its bound, {parameters[index].from_fit(float(solution.x[index])):.3g}"
-            found[index] = Identifiability(ending, np.inf, 0.0)
-            left.remove(index)
+            reason = f"the fit ends at its bound, {parameter.from_fit(float(solution.x[index])):.3g}"
+            found[index] = Identifiability(reason, np.inf, 0.0)
+    left = [index for index in range(len(parameters)) if index not in found]
     while left:
         uncertainty = estimate_uncertainty(solution, runs, left)
+        half, effect = uncertainty.half.tolist(), (uncertainty.effect * counts[left]).tolist()
         pairs = np.abs(uncertainty.correlation - np.eye(len(left)))
         if pairs.max() <= COLLINEAR:
+            for place, index in enumerate(left):
+                reason = _too_short(solution, index, runs) or _reason(solution, index, effect[place], half[place])
+                found[index] = Identifiability(reason, half[place], effect[place])
             break
-        pair = np.unravel_index(int(pairs.argmax()), pairs.shape)
-        one, other = sorted(pair, key=lambda place: uncertainty.effect[place] * counts[left[place]])
+        one, other = sorted(np.unravel_index(int(pairs.argmax()), pairs.shape), key=lambda place: effect[place])
         name, value = parameters[left[other]].name, uncertainty.correlation[one, other]
         reason = f"cannot be told apart from {name}: correlation {value:.2f}"
-        found[left[one]] = Identifiability(
-            reason, float(uncertainty.half[one]), float(uncertainty.effect[one] * counts[left[one]])
-        )
-        del left[one]
-    for place, index in enumerate(left):
-        effect, half = float(uncertainty.effect[place] * counts[index]), float(uncertainty.half[place])
-        reason = _too_short(solution, index, runs) or _reason(solution, index, effect, half)
-        found[index] = Identifiability(reason, half, effect)
+        found[left.pop(one)] = Identifiability(reason, half[one], effect[one])
     return [found[index] for index in range(len(parameters))]
 
 
@@ -191,7 +187,7 @@ def _reason(solution: FitSolution, index: int, effect: float, half: float) -> st
     parameter, settings = solution.parameters[index], solution.settings
     if effect < FLOOR:
         change = (
-            "a factor of two" if parameter.kind != "plain" else f"{parameter.counts(settings):.3g} {parameter.unit}"
+            f"{parameter.counts(settings):.3g} {parameter.unit}" if parameter.kind == "plain" else "a factor of two"
         )
         moved = f"{change} moves the prediction by {100.0 * effect:.2g} % of the length only"
         return f"{moved}, less than the {100.0 * FLOOR:g} % that camera, tracker and model are wrong by"

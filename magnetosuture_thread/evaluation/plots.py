@@ -6,10 +6,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
@@ -22,6 +18,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.evaluation.frames import FrameResult, TimeSeries
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.reference_scores import CaseResult
+from magnetosuture_thread.evaluation.scene_plot import shape_patch
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
@@ -286,20 +283,19 @@ def draw_instants(
     styles: Sequence[tuple[str, dict[str, Any]]],
     instants: Iterable[tuple[str, Sequence[Points]]],
 ) -> None:
-    """Draw the needle's way, round obstacles, and threads at some instants, in millimetres.
+    """Draw the needle's way, obstacles, and threads at some instants, in millimetres.
 
     Args:
         axes: to draw in.
         tails: the needle's tail over time, shape (T, 2) [m].
-        obstacles: of which the discs are drawn.
+        obstacles: discs and polygons [m].
         styles: name and line of each thread of an instant.
         instants: label, empty for none, and threads from the needle's tail on, each of shape (m, 2) [m].
     """
     axes.plot(*(1e3 * tails.T), color=FAINT, linewidth=0.7, alpha=0.6)
     for shape in obstacles:
-        if isinstance(shape, Disc):
-            centre, radius = (1e3 * shape.centre[0], 1e3 * shape.centre[1]), 1e3 * shape.radius
-            axes.add_patch(Circle(centre, radius, facecolor=OBSTACLE, edgecolor=INK, linewidth=0.8))
+        if isinstance(shape, Disc | Polygon):
+            axes.add_patch(shape_patch(shape, facecolor=OBSTACLE, edgecolor=INK, linewidth=0.8))
     for index, (label, threads) in enumerate(instants):
         for (name, style), points in zip(styles, threads, strict=True):
             axes.plot(*(1e3 * points.T), label=name if index == 0 else None, **{"linewidth": 1.0, **style})
