@@ -66,9 +66,9 @@ def calibrate(
         settings: what the set-up and the material say; where the fit starts.
         names: of settings to fit; all that the formulation has if empty.
         run_tasks: gives the predictions of tasks; here, one after the other, if None.
-        best: is told the best so far at every moment.
-        progress: is told the share done.
-        log: is told a line at the end of each stage.
+        best: is updated with the best so far at every moment.
+        progress: called with the share done, 0 to 1.
+        log: called with a line at the end of each stage.
 
     Returns:
         What was found, and each bag before and after.
