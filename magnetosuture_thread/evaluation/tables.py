@@ -54,7 +54,7 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
             row[f"{prefix}_{target}_frames"] = found.get("count", 0)
             row |= {f"{prefix}_{target}_{short}_percent": found.get(name) for name, short in ERRORS.items()}
     row |= {
-        "seen_share": figures.seen_share,
+        "seen_share": figures.measured_share,
         "stretch_max": figures.strain,
         "residual_max": figures.residual,
         "contact_frames": figures.contact_frames,

@@ -89,14 +89,14 @@ def thread_behavior(
 
             log(setup.name)
             simulate(str(setup.path), folder / setup.name, log=log, progress=advance)
-            runs.append(_judged(folder / setup.name, setup))
+            runs.append(_evaluated(folder / setup.name, setup))
         figures = [run.summary.to_json() for run in runs]
         (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         draw_behavior(folder / "behaviour.png", runs)
     return runs
 
 
-def _judged(path: Path, setup: Setup) -> BehaviorRun:
+def _evaluated(path: Path, setup: Setup) -> BehaviorRun:
     """Return a run's figures and the frames to show."""
     bag = Bag(path)
     collector = measure_loop(bag, setup)

@@ -44,7 +44,7 @@ class BagFigures:
         error: prediction error by `truth` and `seen`: count, mean, median, p99, maximum [% of length]; None for none.
         recorded_error: the same of the predictions that the bag holds; empty without any.
         target: what the worst frames are compared with, `truth` or `seen`; empty if nothing could be scored.
-        seen_share: part of the thread's length that is seen, mean over the predicted frames.
+        measured_share: part of the thread's length that is measured, mean over the predicted frames.
         strain: greatest absolute strain of a segment.
         residual: greatest scaled residual of a solve.
         minimum: minimum margin of each kind.
@@ -61,7 +61,7 @@ class BagFigures:
     error: Mapping[str, Mapping[str, float] | None]
     recorded_error: Mapping[str, Mapping[str, float] | None]
     target: str
-    seen_share: float
+    measured_share: float
     strain: float
     residual: float
     minimum: Mapping[str, MinimumMargin]
@@ -87,7 +87,7 @@ class BagFigures:
             error=metrics.errors(),
             recorded_error=metrics.errors("recorded_error"),
             target=metrics.target,
-            seen_share=metrics.mean("seen_share"),
+            measured_share=metrics.mean("seen_share"),
             strain=metrics.maximum("strain"),
             residual=metrics.maximum("residual"),
             minimum=metrics.minimum_margins,
@@ -233,11 +233,11 @@ def _holds(about: BagDetails, least: MinimumMargin) -> bool:
     return least.clearance >= _min_clearance(about, least)
 
 
-def margin_state(about: BagDetails, least: MinimumMargin) -> str:
+def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
     """Return in words whether a barrier held."""
-    if not _holds(about, least):
+    if not _holds(about, margin):
         return "broken"
-    return "holds" if least.clearance >= -1e-9 else "holds within the tolerance"
+    return "holds" if margin.clearance >= -1e-9 else "holds within the tolerance"
 
 
 def _strain(figures: BagFigures) -> Headline:

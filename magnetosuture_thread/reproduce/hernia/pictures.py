@@ -167,7 +167,7 @@ def draw_thread(axes: Axes, instant: SteeredInstant) -> None:
 
 
 def caption(instant: SteeredInstant) -> str:
-    """Say an instant for a person."""
+    """Return the state of friction at an instant in words."""
     friction = instant.margins.friction
     count = f"{len(friction.nodes)} node{'s' if len(friction.nodes) != 1 else ''}"
     return {
