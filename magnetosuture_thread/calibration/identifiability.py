@@ -1,4 +1,4 @@
-"""Which numbers the data can tell, and why not the others.
+"""Which parameters the data identify, with 95 % intervals, and why not the others.
 
 A number cannot be identified where
 
@@ -20,6 +20,22 @@ A number cannot be identified where
 The effect that others make up for counts for nothing, because what they are is not known either.
 
 Source: l by scaling, zeta_perp V ~ EI / l^3. Deviation: none.
+
+The intervals believe in blocks of time, not in single residuals. Residuals of neighbouring nodes and frames are
+anything but independent. With A = J' W J and, for each block g of time (`RecordedRun.blocks`), its score
+u_g = J_g' W r_g, the covariance is the sandwich
+
+    C = A^-1 ( G / (G - 1) sum_g u_g u_g' ) A^-1
+
+for G blocks; with three runs and more also with each run as one block, and the wider one counts. What no
+block can tell, because it is wrong in all of them alike, comes on top: an error of the whole chain of camera, tracker
+and model that lies along a parameter's own effect moves that parameter by
+
+    CHAIN / (mean size of its effect that no other parameter makes up for)
+
+so that half of the interval is t_{0.975, G-1} sqrt(C_kk) + CHAIN / effect_k.
+
+Source: cluster-robust covariance, K.-Y. Liang, S. L. Zeger, Biometrika 73 (1986). Deviation: the term of the chain.
 """
 
 from __future__ import annotations
@@ -28,15 +44,92 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student
 
-from magnetosuture_thread.calibration.fit import FitSolution
+from magnetosuture_thread.calibration.fit import Array, FitSolution
 from magnetosuture_thread.calibration.parameters import STIFFNESS_OVER_DRAG
-from magnetosuture_thread.calibration.passage import Passage
-from magnetosuture_thread.calibration.uncertainty import uncertainty_of
+from magnetosuture_thread.calibration.recorded_run import RecordedRun
 
 COLLINEAR = 0.95
 FLOOR = 2e-3  # of the length
 MIN_BEND = 0.07  # of the length; silk of 150 mm has 0.03, polyamide of 19 mm 0.2 to 0.6
+CLUSTERS = 3  # runs, from which on each is a block too
+CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time
+MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """How well numbers are determined.
+
+    Attributes:
+        half: half of the 95 % interval of each, in the scale of the fit, shape (P,).
+        effect: mean size of d residual / d x of each that no other makes up for, as a share of the length, shape (P,).
+        correlation: of their estimates, from J' W J, shape (P, P).
+    """
+
+    half: Array
+    effect: Array
+    correlation: Array
+
+
+def estimate_uncertainty(solution: FitSolution, runs: Sequence[RecordedRun], columns: Sequence[int]) -> Uncertainty:
+    """Return how well some of a solution's numbers are determined, the others taken as they are.
+
+    Args:
+        solution: of a fit.
+        runs: that it was fitted to.
+        columns: of the numbers.
+    """
+    count = len(columns)
+    jacobian = [j[..., list(columns)] for j in solution.jacobian]
+    flat = np.concatenate([j[run.known] for j, run in zip(jacobian, runs, strict=True)])
+    weights = np.concatenate([w[p.known] for w, p in zip(solution.weights, runs, strict=True)])
+    size = np.maximum(np.sqrt((weights[:, None] * flat**2).sum(axis=0)), MIN_EFFECT)
+    scaled = flat / size
+    gram = scaled.T @ (weights[:, None] * scaled)
+    inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
+    deviation = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    correlation = np.clip(inverse / np.outer(deviation, deviation), -1.0, 1.0)
+    effect = np.array([_own_effect(flat, weights, index) for index in range(count)])
+    blocks, whole = _scores(solution, jacobian, runs, size)
+    half = _half(inverse, blocks) / size
+    if len(runs) >= CLUSTERS:
+        half = np.maximum(half, _half(inverse, whole) / size)
+    return Uncertainty(half + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation)
+
+
+def _half(inverse: Array, scores: Array) -> Array:
+    """Return half of each 95 % interval by the scores of blocks, shape (G, P)."""
+    count = len(scores)
+    if count < 2:
+        return np.full(scores.shape[1], np.inf)
+    middle = count / (count - 1.0) * scores.T @ scores
+    variance = np.maximum(np.diag(inverse @ middle @ inverse), 0.0)
+    return np.asarray(student.ppf(0.975, count - 1) * np.sqrt(variance))
+
+
+def _scores(
+    solution: FitSolution, jacobian: Sequence[Array], runs: Sequence[RecordedRun], size: Array
+) -> tuple[Array, Array]:
+    """Return J' W r of each block of time, and of each run."""
+    blocks, whole = [], []
+    for j, r, w, run in zip(jacobian, solution.residuals, solution.weights, runs, strict=True):
+        by_frame = np.einsum("knp,kn->kp", j / size, w * r)
+        block = run.blocks
+        blocks += [by_frame[block == index].sum(axis=0) for index in np.unique(block)]
+        whole.append(by_frame.sum(axis=0))
+    return np.array(blocks), np.array(whole)
+
+
+def _own_effect(flat: Array, weights: Array, index: int) -> float:
+    """Return the mean size of a column of the Jacobian, less what the other columns make up for."""
+    own, others = flat[:, index], np.delete(flat, index, axis=1)
+    if others.shape[1]:
+        root = np.sqrt(weights)[:, None]
+        scale = np.maximum(np.linalg.norm(root * others, axis=0), MIN_EFFECT)
+        own = own - (others / scale) @ np.linalg.lstsq(root * others / scale, root[:, 0] * own, rcond=None)[0]
+    return float(np.abs(own).mean())
 
 
 @dataclass(frozen=True)
@@ -59,47 +152,42 @@ class Identifiability:
         return not self.reason
 
 
-def assess_identifiability(solution: FitSolution, passages: Sequence[Passage]) -> list[Identifiability]:
+def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -> list[Identifiability]:
     """Return what the data say of each of a solution's numbers.
 
     Args:
         solution: of a fit to all that is unknown.
-        passages: that it was fitted to.
+        runs: that it was fitted to.
     """
     parameters, settings = solution.parameters, solution.settings
-    counts = [parameter.counts(settings) for parameter in parameters]
-    verdicts: dict[int, Identifiability] = {}
-    left = list(range(len(parameters)))
-    for index in list(left):
+    counts = np.array([parameter.counts(settings) for parameter in parameters])
+    found: dict[int, Identifiability] = {}
+    for index, parameter in enumerate(parameters):
         if solution.at_bound(index):
-            ending = f"the fit ends at its bound, {parameters[index].from_fit(float(solution.x[index])):.3g}"
-            verdicts[index] = Identifiability(ending, np.inf, 0.0)
-            left.remove(index)
+            reason = f"the fit ends at its bound, {parameter.from_fit(float(solution.x[index])):.3g}"
+            found[index] = Identifiability(reason, np.inf, 0.0)
+    left = [index for index in range(len(parameters)) if index not in found]
     while left:
-        uncertainty = uncertainty_of(solution, passages, left)
+        uncertainty = estimate_uncertainty(solution, runs, left)
+        half, effect = uncertainty.half.tolist(), (uncertainty.effect * counts[left]).tolist()
         pairs = np.abs(uncertainty.correlation - np.eye(len(left)))
         if pairs.max() <= COLLINEAR:
+            for place, index in enumerate(left):
+                reason = _too_short(solution, index, runs) or _reason(solution, index, effect[place], half[place])
+                found[index] = Identifiability(reason, half[place], effect[place])
             break
-        pair = np.unravel_index(int(pairs.argmax()), pairs.shape)
-        one, other = sorted(pair, key=lambda place: uncertainty.effect[place] * counts[left[place]])
+        one, other = sorted(np.unravel_index(int(pairs.argmax()), pairs.shape), key=lambda place: effect[place])
         name, value = parameters[left[other]].name, uncertainty.correlation[one, other]
         reason = f"cannot be told apart from {name}: correlation {value:.2f}"
-        verdicts[left[one]] = Identifiability(
-            reason, float(uncertainty.half[one]), float(uncertainty.effect[one] * counts[left[one]])
-        )
-        del left[one]
-    for place, index in enumerate(left):
-        effect, half = float(uncertainty.effect[place] * counts[index]), float(uncertainty.half[place])
-        reason = _too_short(solution, index, passages) or _reason(solution, index, effect, half)
-        verdicts[index] = Identifiability(reason, half, effect)
-    return [verdicts[index] for index in range(len(parameters))]
+        found[left.pop(one)] = Identifiability(reason, half[one], effect[one])
+    return [found[index] for index in range(len(parameters))]
 
 
 def _reason(solution: FitSolution, index: int, effect: float, half: float) -> str:
     parameter, settings = solution.parameters[index], solution.settings
     if effect < FLOOR:
         change = (
-            "a factor of two" if parameter.kind != "plain" else f"{parameter.counts(settings):.3g} {parameter.unit}"
+            f"{parameter.counts(settings):.3g} {parameter.unit}" if parameter.kind == "plain" else "a factor of two"
         )
         moved = f"{change} moves the prediction by {100.0 * effect:.2g} % of the length only"
         return f"{moved}, less than the {100.0 * FLOOR:g} % that camera, tracker and model are wrong by"
@@ -109,10 +197,10 @@ def _reason(solution: FitSolution, index: int, effect: float, half: float) -> st
     return ""
 
 
-def _too_short(solution: FitSolution, index: int, passages: Sequence[Passage]) -> str:
+def _too_short(solution: FitSolution, index: int, runs: Sequence[RecordedRun]) -> str:
     """Return in words that the stiffness acts on too small a part of the thread; empty if it does not."""
     parameter, length = solution.parameters[index], solution.settings.thread_length
-    speed = min(passage.speed for passage in passages)
+    speed = min(run.speed for run in runs)
     if parameter is not STIFFNESS_OVER_DRAG or speed <= 0.0:
         return ""
     bend = float(np.cbrt(parameter.from_fit(float(solution.x[index])) / speed))

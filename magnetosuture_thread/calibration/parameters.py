@@ -1,4 +1,4 @@
-"""What a calibration can fit, and how each enters the settings of the thread model.
+"""The parameters that a calibration can fit, and how each enters the settings of the thread model.
 
 Of the thread's bending stiffness EI and the liquid's drag across it, zeta_perp, only the ratio
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -26,11 +26,11 @@ OFFSET = "attachment_offset"
 DOUBLED = math.log(2.0)
 WIDEST = math.log(1.5)  # of a logarithm: half an interval beyond says nothing of use
 LOGARITHM = 700.0  # whose exponential is a number yet
-STIFFNESS = 1e3  # B is looked for within this factor of the material's
-STIFFEST = 0.99e12  # Pa; just within what a set-up may say
-OFFSET_COUNTS, OFFSET_MOST = 0.01, 0.1  # of the thread's length
+STIFFNESS_RANGE = 1e3  # B is looked for within this factor of the material's
+MAX_MODULUS = 0.99e12  # Pa; just within what a set-up may say
+OFFSET_COUNTS, MAX_OFFSET = 0.01, 0.1  # of the thread's length
 MAX_KAPPA = 0.999  # kappa
-LEAST_WEIGHT, GREATEST_WEIGHT = 1e-6, 1e7  # W_stiff; beyond, every step needs another solver
+MIN_WEIGHT, MAX_WEIGHT = 1e-6, 1e7  # W_stiff; beyond, every step needs another solver
 
 Settings = ThreadModelSettings
 
@@ -44,22 +44,32 @@ class Parameter:
         setting: the field of `ThreadModelSettings` that it belongs to.
         unit: of its value.
         kind: `log`: x = ln value, for what is positive; `plain`: x = value; `lost`: x = ln (1 - value).
-        read: its value in settings.
-        write: settings with another value.
         bounds: least and greatest value.
         counts: a change of x that counts: a factor of two, or what is said of it.
-        widest: half of a 95 % interval of x beyond which the parameter counts as unknown.
+        getter: its value in settings, if it is not the setting itself.
+        setter: settings with another value, likewise.
     """
 
     name: str
     setting: str
     unit: str
     kind: str
-    read: Callable[[Settings], float]
-    write: Callable[[Settings, float], Settings]
     bounds: Callable[[Settings], tuple[float, float]]
-    counts: Callable[[Settings], float]
-    widest: Callable[[Settings], float]
+    counts: Callable[[Settings], float] = field(default=lambda settings: DOUBLED)
+    getter: Callable[[Settings], float] | None = None
+    setter: Callable[[Settings, float], Settings] | None = None
+
+    def read(self, settings: Settings) -> float:
+        """Return its value in settings."""
+        return float(getattr(settings, self.setting)) if self.getter is None else self.getter(settings)
+
+    def write(self, settings: Settings, value: float) -> Settings:
+        """Return settings with another value."""
+        return _replaced(settings, self.setting, value) if self.setter is None else self.setter(settings, value)
+
+    def widest(self, settings: Settings) -> float:
+        """Return half of a 95 % interval of x beyond which the parameter counts as unknown."""
+        return self.counts(settings) if self.kind == "plain" else WIDEST
 
     def to_fit(self, value: float) -> float:
         """Return x of a value."""
@@ -82,14 +92,18 @@ class Parameter:
         """Return settings with what others say of this number."""
         if self.setting == OFFSET:
             return self.write(settings, self.read(start))
-        changes: dict[str, Any] = {self.setting: getattr(start, self.setting)}
-        return replace(settings, **changes)
+        return _replaced(settings, self.setting, getattr(start, self.setting))
 
     def interval(self, x: float, half: float) -> tuple[float, float]:
         """Return the ends of x - half ... x + half as values, the lower one first."""
         ends = (x - half, x + half) if self.kind == "plain" else (max(x - half, -LOGARITHM), min(x + half, LOGARITHM))
         low, high = sorted(self.from_fit(end) for end in ends)
         return low, high
+
+
+def _replaced(settings: Settings, field: str, value: Any) -> Settings:
+    changes: dict[str, Any] = {field: value}
+    return replace(settings, **changes)
 
 
 def stiffness_over_drag(settings: Settings) -> float:
@@ -106,8 +120,8 @@ def with_stiffness_over_drag(settings: Settings, value: float) -> Settings:
 
 def _stiffness_bounds(settings: Settings) -> tuple[float, float]:
     middle = stiffness_over_drag(replace(settings, elastic_modulus=0.0))  # the material's
-    most = stiffness_over_drag(replace(settings, elastic_modulus=STIFFEST))
-    return middle / STIFFNESS, min(middle * STIFFNESS, most)
+    most = stiffness_over_drag(replace(settings, elastic_modulus=MAX_MODULUS))
+    return middle / STIFFNESS_RANGE, min(middle * STIFFNESS_RANGE, most)
 
 
 def _curvature_bounds(settings: Settings) -> tuple[float, float]:
@@ -125,25 +139,13 @@ def _offset(index: int, name: str) -> Parameter:
         return replace(settings, attachment_offset=tuple(both) if any(both) else ())
 
     def bounds(settings: Settings) -> tuple[float, float]:
-        most = min(0.01, OFFSET_MOST * settings.thread_length)
+        most = min(0.01, MAX_OFFSET * settings.thread_length)
         return -most, most
 
     def counts(settings: Settings) -> float:
         return OFFSET_COUNTS * settings.thread_length
 
-    return Parameter(f"offset {name}", OFFSET, "m", "plain", read, write, bounds, counts, counts)
-
-
-def _plain(field: str) -> Callable[[Settings], float]:
-    return lambda settings: float(getattr(settings, field))
-
-
-def _replaced(field: str) -> Callable[[Settings, float], Settings]:
-    def write(settings: Settings, value: float) -> Settings:
-        changes: dict[str, Any] = {field: value}
-        return replace(settings, **changes)
-
-    return write
+    return Parameter(f"offset {name}", OFFSET, "m", "plain", bounds, counts, read, write)
 
 
 STIFFNESS_OVER_DRAG = Parameter(
@@ -151,55 +153,27 @@ STIFFNESS_OVER_DRAG = Parameter(
     "elastic_modulus",
     "m^4/s",
     "log",
-    stiffness_over_drag,
-    with_stiffness_over_drag,
     _stiffness_bounds,
-    lambda settings: DOUBLED,
-    lambda settings: WIDEST,
+    getter=stiffness_over_drag,
+    setter=with_stiffness_over_drag,
 )
-DRAG_ANISOTROPY = Parameter(
-    "drag anisotropy",
-    "drag_anisotropy",
-    "",
-    "log",
-    _plain("drag_anisotropy"),
-    _replaced("drag_anisotropy"),
-    lambda settings: (0.05, 1.0),
-    lambda settings: DOUBLED,
-    lambda settings: WIDEST,
-)
+DRAG_ANISOTROPY = Parameter("drag anisotropy", "drag_anisotropy", "", "log", lambda settings: (0.05, 1.0))
 REST_CURVATURE = Parameter(
     "rest curvature",
     "rest_curvature",
     "1/m",
     "plain",
-    _plain("rest_curvature"),
-    _replaced("rest_curvature"),
     _curvature_bounds,
     lambda settings: 1.0 / settings.thread_length,  # by which the thread turns by one radian on its whole length
-    lambda settings: 1.0 / settings.thread_length,
 )
-DAMPING = Parameter(
-    "kappa",
-    "paper_damping",
-    "",
-    "lost",
-    _plain("paper_damping"),
-    _replaced("paper_damping"),
-    lambda settings: (0.0, MAX_KAPPA),
-    lambda settings: DOUBLED,
-    lambda settings: WIDEST,
-)
+DAMPING = Parameter("kappa", "paper_damping", "", "lost", lambda settings: (0.0, MAX_KAPPA))
 STIFFNESS_WEIGHT = Parameter(
     "W_stiff",
     "paper_stiffness_weight",
     "",
     "log",
-    lambda settings: settings.paper_stiffness_weight or MATERIALS[settings.material].stiffness_weight,
-    _replaced("paper_stiffness_weight"),
-    lambda settings: (LEAST_WEIGHT, GREATEST_WEIGHT),
-    lambda settings: DOUBLED,
-    lambda settings: WIDEST,
+    lambda settings: (MIN_WEIGHT, MAX_WEIGHT),
+    getter=lambda settings: settings.paper_stiffness_weight or MATERIALS[settings.material].stiffness_weight,
 )
 OF_FORMULATION: dict[str, tuple[Parameter, ...]] = {
     "rod": (STIFFNESS_OVER_DRAG, DRAG_ANISOTROPY, REST_CURVATURE, _offset(0, "along"), _offset(1, "left")),
@@ -213,7 +187,7 @@ def known_settings(formulation: str) -> tuple[str, ...]:
     return (*names, ATTACHMENT) if formulation == "rod" else tuple(names)
 
 
-def chosen(formulation: str, names: Sequence[str] = ()) -> tuple[tuple[Parameter, ...], bool]:
+def choose_parameters(formulation: str, names: Sequence[str] = ()) -> tuple[tuple[Parameter, ...], bool]:
     """Return the parameters to fit, and whether the attachment is one of them.
 
     Args:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from magnetosuture_thread.calibration.passage import Passage
-from magnetosuture_thread.calibration.replays import Run, Task, attempt
+from magnetosuture_thread.calibration.recorded_run import RecordedRun
+from magnetosuture_thread.calibration.residuals import RunTasks, Task, replay_with_parameters
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.workers import WorkerDiedError, WorkerPool

@@ -1,4 +1,4 @@
-"""What a calibration found."""
+"""The result of a calibration: estimates, attachment, and errors of each bag before and after."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.calibration.passage import Passage
-from magnetosuture_thread.calibration.replays import frame_errors, mean_across, mean_error
+from magnetosuture_thread.calibration.recorded_run import RecordedRun
+from magnetosuture_thread.calibration.residuals import frame_errors, mean_across, mean_error
+from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.settings import ThreadModelSettings
 
@@ -107,12 +108,9 @@ class BagErrors:
             return ""
         better = self.across_after <= self.across_before
         end = "what is left lies along it, where noise moves what is seen" if better else "do not use"
-        return (
-            f"{self.name}: the nodes are {self.after:.3g} % of the length off after the fit, {self.before:.3g} % "
-            "before; "
-            f"across the thread, which is what was fitted, {self.across_after:.3g} % after, {self.across_before:.3g} % "
-            f"before: {end}"
-        )
+        nodes = f"the nodes are {self.after:.3g} % of the length off after the fit, {self.before:.3g} % before"
+        across = f"{self.across_after:.3g} % after, {self.across_before:.3g} % before"
+        return f"{self.name}: {nodes}; across the thread, which is what was fitted, {across}: {end}"
 
 
 @dataclass(frozen=True)
@@ -120,18 +118,18 @@ class BagFit:
     """One bag before and after, for the picture.
 
     Attributes:
-        passage: the bag.
+        run: the bag.
         before: predicted nodes with what the set-up says, shape (K, n + 1, 2) [m].
         after: calibrated.
     """
 
-    passage: Passage
+    run: RecordedRun
     before: Points
     after: Points
 
     def error(self, vertices: Points, length: float) -> NDArray[np.float64]:
         """Return the prediction error of each compared frame [% of length]."""
-        return frame_errors(vertices, self.passage.targets, length)
+        return frame_errors(vertices, self.run.targets, length)
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ class CalibrationResult:
         attachment: which fits better; None if it was not asked for.
         scores: of each bag.
         simulated: what of each bag is simulated; empty for what nothing says so of.
-        replays: how many passages were replayed.
+        replays: how many runs were replayed.
         finished: whether it came to its end; else this is the best so far.
     """
 
@@ -159,6 +157,23 @@ class CalibrationResult:
     simulated: tuple[str, ...]
     replays: int
     finished: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        settings: ThreadModelSettings,
+        start: ThreadModelSettings,
+        fits: Sequence[BagFit],
+        estimates: tuple[Estimate, ...],
+        attachment: AttachmentDecision | None,
+        replays: int,
+        held_out: Sequence[Points | None] | None = None,
+        finished: bool = True,
+    ) -> CalibrationResult:
+        """Return the result of fits of some bags; `held_out` as in `bag_errors`."""
+        scores, simulated = bag_errors(fits, start.thread_length, held_out), tuple(fit.run.simulated for fit in fits)
+        against = fits[0].run.against
+        return cls(settings, start, against, estimates, attachment, scores, simulated, replays, finished)
 
     @property
     def warnings(self) -> list[str]:
@@ -189,24 +204,23 @@ class CalibrationResult:
             "material": self.settings.material,
             "formulation": self.settings.formulation,
             "against": self.against,
-            "parameters": [_plain(asdict(estimate)) for estimate in self.estimates],
+            "parameters": [_plain(estimate) for estimate in self.estimates],
             "attachment": asdict(self.attachment) if self.attachment is not None else None,
             "bags": [
-                {**_plain(asdict(score)), "simulated": words}
-                for score, words in zip(self.scores, self.simulated, strict=True)
+                {**_plain(score), "simulated": words} for score, words in zip(self.scores, self.simulated, strict=True)
             ],
             "warnings": self.warnings,
             "replays": self.replays,
         }
 
 
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in values.items()
-    }
+def _plain(values: Any) -> dict[str, Any]:
+    return {key: finite_or_none(value) for key, value in asdict(values).items()}
 
 
-def scores_of(fits: Sequence[BagFit], length: float, held_out: Sequence[Points] | None = None) -> tuple[BagErrors, ...]:
+def bag_errors(
+    fits: Sequence[BagFit], length: float, held_out: Sequence[Points | None] | None = None
+) -> tuple[BagErrors, ...]:
     """Return the errors of all bags.
 
     Args:
@@ -215,12 +229,13 @@ def scores_of(fits: Sequence[BagFit], length: float, held_out: Sequence[Points] 
         held_out: predicted nodes of each, calibrated by the other bags.
     """
     scores = []
-    for index, fit in enumerate(fits):
-        predicted = (fit.before, fit.after, held_out[index] if held_out else None)
-        seen, truth = (
-            [math.nan if vertices is None else mean_error(vertices, targets, length) for vertices in predicted]
-            for targets in (fit.passage.targets, fit.passage.truths)
-        )
-        off = [mean_across(vertices, fit.passage, length) for vertices in (fit.before, fit.after)]
-        scores.append(BagErrors(fit.passage.name, len(fit.passage.frames), *seen, *truth, *off))
+    for fit, held in zip(fits, held_out or [None] * len(fits), strict=True):
+        run = fit.run
+        errors = [
+            math.nan if vertices is None else mean_error(vertices, targets, length)
+            for targets in (run.targets, run.ground_truths)
+            for vertices in (fit.before, fit.after, held)
+        ]
+        off = [mean_across(vertices, run, length) for vertices in (fit.before, fit.after)]
+        scores.append(BagErrors(run.name, len(run.frames), *errors, *off))
     return tuple(scores)

@@ -1,23 +1,24 @@
-"""The way of a calibration: several starts, the fit to all that is unknown, what it tells, and what that predicts."""
+"""The calibration procedure: initial guesses, the fit to all that is unknown, what is identified, predictions by it."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
-from magnetosuture_thread.calibration.fit import Array, FitSolution, Objective, scale_of
+from magnetosuture_thread.calibration.fit import Array, FitSolution, Objective, initial_guesses, robust_scale
 from magnetosuture_thread.calibration.identifiability import Identifiability, assess_identifiability
 from magnetosuture_thread.calibration.parameters import (
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,
     Parameter,
-    chosen,
+    choose_parameters,
 )
-from magnetosuture_thread.calibration.passage import Passage
-from magnetosuture_thread.calibration.replays import Best, Replays, Run, mean_across
+from magnetosuture_thread.calibration.recorded_run import RecordedRun
+from magnetosuture_thread.calibration.residuals import BestSettings, Replays, RunTasks, mean_across
 from magnetosuture_thread.calibration.result import (
     FIXED,
     IDENTIFIED,
@@ -27,11 +28,7 @@ from magnetosuture_thread.calibration.result import (
     BagFit,
     CalibrationResult,
     Estimate,
-    scores_of,
 )
-from magnetosuture_thread.calibration.stages import Stages
-from magnetosuture_thread.calibration.starts import starts
-from magnetosuture_thread.calibration.uncertainty import BLOCKS
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.session import ThreadSession
@@ -46,32 +43,32 @@ Progress = Callable[[float], None]
 
 
 def calibrate(
-    passages: Sequence[Passage],
+    runs: Sequence[RecordedRun],
     settings: ThreadModelSettings,
     names: Sequence[str] = (),
     *,
-    run: Run | None = None,
-    best: Best | None = None,
+    run_tasks: RunTasks | None = None,
+    best: BestSettings | None = None,
     progress: Progress = lambda share: None,
     log: Log = lambda line: None,
 ) -> tuple[CalibrationResult, list[BagFit]]:
-    """Fit what the passages can tell of a thread.
+    """Fit what the runs can tell of a thread.
 
     1. Stiffnesses from a hundredth to a hundred times the material's are tried with each attachment, and the best
        of them fitted alone, by the whole distance of prediction and thread.
     2. All that is unknown is fitted, by the distance across the thread, with a robust loss.
     3. The attachment is the one that fits better, if the difference is beyond its own scatter over blocks of time.
     4. What cannot be identified is put back to what the set-up says, and the rest is fitted again.
-    5. With several passages, each is predicted by a fit to the others.
+    5. With several runs, each is predicted by a fit to the others.
 
     Args:
-        passages: recorded runs of one thread.
+        runs: recorded runs of one thread.
         settings: what the set-up and the material say; where the fit starts.
         names: of settings to fit; all that the formulation has if empty.
-        run: gives the predictions of tasks; here, one after the other, if None.
-        best: is told the best so far at every moment.
-        progress: is told the share done.
-        log: is told a line at the end of each stage.
+        run_tasks: gives the predictions of tasks; here, one after the other, if None.
+        best: is updated with the best so far at every moment.
+        progress: called with the share done, 0 to 1.
+        log: called with a line at the end of each stage.
 
     Returns:
         What was found, and each bag before and after.
@@ -79,24 +76,24 @@ def calibrate(
     Raises:
         ConfigurationError: a name is unknown, the thread is not in a liquid, or an obstacle cannot be used.
     """
-    parameters, both = chosen(settings.formulation, names)
+    parameters, both = choose_parameters(settings.formulation, names)
     if settings.medium != "liquid":
         raise ConfigurationError("thread_model.medium", settings.medium, "liquid: what is fitted is bending over drag")
-    replays = Replays(passages, run, best)
-    stages = Stages(replays.best, progress, log)
-    for scene in dict.fromkeys(passage.scene for passage in passages):
+    replays = Replays(runs, run_tasks, best, progress, log)
+    for scene in dict.fromkeys(run.scene for run in runs):
         ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
-    replays.tell(stages.told)
-    return _Search(replays, settings, parameters, both, stages).go()
+    result = _Search(replays, settings, parameters, both).go()
+    progress(1.0)
+    return result
 
 
-def unfinished(
-    passages: Sequence[Passage], settings: ThreadModelSettings, best: Best
+def unfinished_result(
+    runs: Sequence[RecordedRun], settings: ThreadModelSettings, best: BestSettings
 ) -> tuple[CalibrationResult, list[BagFit]]:
     """Return the best that an interrupted search had come to, without intervals.
 
     Args:
-        passages: recorded runs.
+        runs: recorded runs.
         settings: where it started.
         best: of the search; its settings must be known.
     """
@@ -108,13 +105,9 @@ def unfinished(
     attachment = None
     if found.attachment != settings.attachment:
         attachment = AttachmentDecision(found.attachment, settings.attachment, {}, looked=False)
-    fits = [BagFit(*parts) for parts in zip(passages, best.first, best.vertices, strict=True)]
-    scores, simulated = scores_of(fits, settings.thread_length), tuple(passage.simulated for passage in passages)
-    against = passages[0].against
-    done = CalibrationResult(
-        found, settings, against, estimates, attachment, scores, simulated, best.replays, finished=False
-    )
-    return done, fits
+    fits = [BagFit(*parts) for parts in zip(runs, best.first, best.vertices, strict=True)]
+    result = CalibrationResult.of(found, settings, fits, estimates, attachment, best.replays, finished=False)
+    return result, fits
 
 
 @dataclass
@@ -123,51 +116,39 @@ class _Search:
     start: ThreadModelSettings
     parameters: tuple[Parameter, ...]
     both: bool
-    stages: Stages
 
     def go(self) -> tuple[CalibrationResult, list[BagFit]]:
-        passages, count = self.replays.passages, len(self.replays.passages)
+        runs, count = self.replays.runs, len(self.replays.runs)
         self.replays.error(self.start)
-        candidates = starts(self.replays, self.start, self.parameters, self.both, self.stages)
-        self.stages.begin("fit", count * len(candidates) * 6 * (len(self.parameters) + 1))
+        candidates = initial_guesses(self.replays, self.start, self.parameters, self.both)
+        self.replays.begin_stage("fit", count * len(candidates) * 6 * (len(self.parameters) + 1))
         solutions = [self._fitted(Objective(self.replays, settings, self.parameters)) for settings in candidates]
         solution, attachment = self._attached(solutions)
-        self.stages.end("fitted all that is unknown")
-        verdicts = assess_identifiability(solution, passages)
-        self.stages.begin("identified", count * 4 * len(self.parameters))
-        settings, statuses = self._identified(solution, verdicts)
-        self.stages.end("fitted what can be identified")
+        self.replays.end_stage("fitted all that is unknown")
+        found = assess_identifiability(solution, runs)
+        self.replays.begin_stage("identified", count * 4 * len(self.parameters))
+        settings, statuses = self._identified(solution, found)
+        self.replays.end_stage("fitted what can be identified")
         fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
         held_out = None
         if count > 1:
-            self.stages.begin("held out", count * (count - 1) * 3 * (len(fitted) + 1))
+            self.replays.begin_stage("held out", count * (count - 1) * 3 * (len(fitted) + 1))
             held_out = [self._held_out(settings, fitted, solution.scale, index) for index in range(count)]
-            self.stages.end("predicted each bag by the others")
+            self.replays.end_stage("predicted each bag by the others")
         before, after = self.replays.of([self.start, settings])
-        fits = [BagFit(*parts) for parts in zip(passages, before, after, strict=True)]
-        calibration = CalibrationResult(
-            settings,
-            self.start,
-            passages[0].against,
-            tuple(
-                self._estimate(solution, index, verdict, status, settings)
-                for index, (verdict, status) in enumerate(zip(verdicts, statuses, strict=True))
-            ),
-            attachment,
-            scores_of(fits, self.start.thread_length, held_out),
-            tuple(passage.simulated for passage in passages),
-            self.replays.best.replays,
+        fits = [BagFit(*parts) for parts in zip(runs, before, after, strict=True)]
+        estimates = tuple(
+            self._estimate(solution, index, each, status, settings)
+            for index, (each, status) in enumerate(zip(found, statuses, strict=True))
         )
-        self.stages.done()
-        return calibration, fits
+        replays = self.replays.best.replays
+        return CalibrationResult.of(settings, self.start, fits, estimates, attachment, replays, held_out), fits
 
-    def _fitted(self, objective: Objective, scale: float | None = None) -> FitSolution:
+    def _fitted(self, objective: Objective) -> FitSolution:
         """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
-        if scale is not None:
-            return objective.fit(scale=scale)
-        scale = scale_of(objective.residuals(objective.start()))
+        scale = robust_scale(objective.residuals(objective.start()))
         solution = objective.fit(scale=scale)
-        narrower = scale_of(solution.residuals)
+        narrower = robust_scale(solution.residuals)
         return objective.fit(solution.x, narrower) if narrower < NARROWER * scale else solution
 
     def _attached(self, solutions: Sequence[FitSolution]) -> tuple[FitSolution, AttachmentDecision | None]:
@@ -189,65 +170,62 @@ class _Search:
         return best, AttachmentDecision(best.settings.attachment, self.start.attachment, errors, reason)
 
     def _blocks(self, solution: FitSolution) -> Array:
-        """Return the mean distance across the thread in each block of time of each passage [% of length]."""
+        """Return the mean distance across the thread in each block of time of each run [% of length]."""
         result = []
-        for residual, passage in zip(solution.residuals, self.replays.passages, strict=True):
-            block = np.minimum(BLOCKS * passage.times / passage.times[-1], BLOCKS - 1).astype(int)
-            result += [
-                100.0 * float(np.abs(residual[block == index])[passage.known[block == index]].mean())
-                for index in np.unique(block)
-            ]
+        for residual, run in zip(solution.residuals, self.replays.runs, strict=True):
+            block, sizes = run.blocks, 100.0 * np.abs(residual)
+            result += [float(sizes[block == k][run.known[block == k]].mean()) for k in np.unique(block)]
         return np.array(result)
 
     def _identified(
-        self, solution: FitSolution, verdicts: Sequence[Identifiability]
+        self, solution: FitSolution, found: Sequence[Identifiability]
     ) -> tuple[ThreadModelSettings, list[str]]:
         """Return the fit of what can be identified, and what became of each number."""
-        statuses = [self._status(solution, index, verdict) for index, verdict in enumerate(verdicts)]
-        if all(verdict.identified for verdict in verdicts):
+        statuses = [self._status(solution, index, each) for index, each in enumerate(found)]
+        if all(each.identified for each in found):
             return solution.settings, statuses
         spare = [index for index, status in enumerate(statuses) if status == FIXED]
-        spare.sort(key=lambda i: (self.parameters[i] is not STIFFNESS_OVER_DRAG, -verdicts[i].effect))
+        spare.sort(key=lambda i: (self.parameters[i] is not STIFFNESS_OVER_DRAG, -found[i].effect))
         most = self._error(solution.settings) + GIVEN_WAY
         while True:
             base = solution.settings
             for parameter, status in zip(self.parameters, statuses, strict=True):
                 base = base if status != FIXED else parameter.reset(base, self.start)
             fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
-            settings = self._fitted(Objective(self.replays, base, fitted), solution.scale).settings if fitted else base
+            settings = Objective(self.replays, base, fitted).fit(scale=solution.scale).settings if fitted else base
             if self._error(settings) <= most or not spare:
                 return settings, statuses
             statuses[spare.pop(0)] = STAND_IN
 
-    def _status(self, solution: FitSolution, index: int, verdict: Identifiability) -> str:
+    def _status(self, solution: FitSolution, index: int, each: Identifiability) -> str:
         """Return what becomes of a number at first: the set-up's is kept unless the data contradict it."""
-        if verdict.identified:
+        if each.identified:
             return IDENTIFIED
         parameter = self.parameters[index]
         off = abs(parameter.to_fit(parameter.read(self.start)) - float(solution.x[index]))
-        return STAND_IN if off > verdict.half else FIXED
+        return STAND_IN if off > each.half else FIXED
 
     def _error(self, settings: ThreadModelSettings) -> float:
         """Return the mean distance across the thread [% of length]."""
-        pairs = zip(self.replays.of([settings])[0], self.replays.passages, strict=True)
+        pairs = zip(self.replays.of([settings])[0], self.replays.runs, strict=True)
         return float(np.mean([mean_across(v, p, settings.thread_length) for v, p in pairs]))
 
     def _held_out(self, settings: ThreadModelSettings, fitted: Sequence[Parameter], scale: float, index: int) -> Points:
-        """Return what is predicted of a passage by a fit to the others."""
-        others = [other for other in range(len(self.replays.passages)) if other != index]
+        """Return what is predicted of a run by a fit to the others."""
+        others = [other for other in range(len(self.replays.runs)) if other != index]
         if fitted:
             settings = Objective(self.replays, settings, fitted, others).fit(scale=scale).settings
         return self.replays.of([settings], [index])[0][0]
 
     def _estimate(
-        self, solution: FitSolution, index: int, verdict: Identifiability, status: str, settings: ThreadModelSettings
+        self, solution: FitSolution, index: int, each: Identifiability, status: str, settings: ThreadModelSettings
     ) -> Estimate:
         parameter = self.parameters[index]
         value = parameter.read(settings)
-        low = high = float("nan")
-        if np.isfinite(verdict.half):
+        low = high = math.nan
+        if np.isfinite(each.half):
             middle = parameter.to_fit(value) if status == IDENTIFIED else float(solution.x[index])
-            low, high = parameter.interval(middle, verdict.half)
-        start, effect = parameter.read(self.start), 100.0 * verdict.effect
+            low, high = parameter.interval(middle, each.half)
+        start, effect = parameter.read(self.start), 100.0 * each.effect
         named = parameter.name, parameter.setting, parameter.unit
-        return Estimate(*named, value, start, low, high, status, verdict.reason, effect, parameter.kind == "log")
+        return Estimate(*named, value, start, low, high, status, each.reason, effect, parameter.kind == "log")

@@ -1,9 +1,12 @@
-"""One frame: what was observed of needle and thread, and what was predicted."""
+"""Frames of a run, measured and predicted, and what is kept of them: columns, error along the thread, worst frames."""
 
 from __future__ import annotations
 
 import math
+from array import array
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,32 +16,41 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.margins import Margins, node_clearance
 from magnetosuture_thread.model.predictor import Prediction
 
+Array = NDArray[np.float64]
 
-def _none() -> Points:
+MAP_GAP = 3.0  # times the usual interval; the error map is empty where nothing came for longer
+MAP_COLUMNS = 300
+WORST_FRAMES = 5
+MIN_DISTANCE = 1.0  # s; between two of the worst frames
+MARGIN = "margin_"  # columns of margins, by the barrier's name
+BIN = 0.5  # s; of each bin the worst frame is kept
+
+
+def _no_points() -> Points:
     return np.empty((0, 2))
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What one camera frame, or one recorded pose, says.
+    """Measured needle and thread of one camera frame, or of one recorded pose.
 
     Attributes:
         stamp: of the frame [ns].
         tail: the needle's tail, shape (2,) [m]; shape (0,) where the needle was not found.
         heading: unit vector from tail to tip, shape (2,); shape (0,) where the needle was not found.
-        seen: the thread's measured centreline, from the tail on, shape (m, 2) [m]; m = 0 for none.
-        truth: the thread's ground truth, if the bag holds it, shape (m, 2) [m].
+        measured: the thread's centreline, from the tail on, shape (m, 2) [m]; m = 0 for none.
+        ground_truth: of the thread, if the bag holds it, shape (m, 2) [m].
         reason: why the needle was not found.
         processing: time that the tracker took for the frame [s]; nan where the poses were recorded.
     """
 
     stamp: int
-    tail: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    heading: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    seen: Points = field(default_factory=_none)
-    truth: Points = field(default_factory=_none)
+    tail: Array = field(default_factory=lambda: np.empty(0))
+    heading: Array = field(default_factory=lambda: np.empty(0))
+    measured: Points = field(default_factory=_no_points)
+    ground_truth: Points = field(default_factory=_no_points)
     reason: str = ""
-    processing: float = float("nan")
+    processing: float = math.nan
 
     @property
     def found(self) -> bool:
@@ -48,7 +60,7 @@ class Observation:
 
 @dataclass
 class FrameResult:
-    """What was predicted of one frame, beside what was measured and the ground truth.
+    """Predicted thread of one frame, beside the measured one and the ground truth.
 
     Attributes:
         stamp: of the frame [ns].
@@ -58,33 +70,29 @@ class FrameResult:
         step_time: of the model [s].
         margins: None if they prove nothing.
         in_contact: whether the thread touches an obstacle or the wall.
-        seen: the thread's measured centreline, shape (m, 2) [m].
-        truth: its ground truth, if the bag holds it, shape (m, 2) [m].
+        measured: the thread's centreline, shape (m, 2) [m].
+        ground_truth: of the thread, if the bag holds it, shape (m, 2) [m].
         tail: the needle's measured tail, shape (2,) [m].
         heading: the needle's measured angle [rad].
         obstacles: in force.
         recorded: the prediction that the bag holds of the same frame, shape (n + 1, 2) [m].
-        seen_share: part of the thread's length that was measured.
-        error_seen: prediction error against the measured centreline [% of length].
-        error_truth: the same against the ground truth.
+        errors: prediction error by target, `truth` and `seen` [% of length]; set when it is computed.
     """
 
     stamp: int
-    vertices: Points = field(default_factory=_none)
+    vertices: Points = field(default_factory=_no_points)
     strain: float = math.nan
     residual: float = math.nan
     step_time: float = math.nan
     margins: Margins | None = None
     in_contact: bool = False
-    seen: Points = field(default_factory=_none)
-    truth: Points = field(default_factory=_none)
+    measured: Points = field(default_factory=_no_points)
+    ground_truth: Points = field(default_factory=_no_points)
     tail: Points = field(default_factory=lambda: np.empty(0))
     heading: float = math.nan
     obstacles: tuple[Obstacle, ...] = ()
     recorded: Points | None = None
-    seen_share: float = 0.0
-    error_seen: float = math.nan
-    error_truth: float = math.nan
+    errors: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -115,16 +123,194 @@ class FrameResult:
             step_time,
             margins,
             margins is not None and bool(margins.in_contact),
-            observation.seen,
-            observation.truth,
+            observation.measured,
+            observation.ground_truth,
             observation.tail,
             math.atan2(observation.heading[1], observation.heading[0]),
             obstacles,
             recorded,
         )
 
+    def target_curve(self, target: str) -> Points:
+        """Return what the prediction is compared with, of `truth` and `seen`."""
+        return self.ground_truth if target == "truth" else self.measured
+
     @property
-    def clearance(self) -> NDArray[np.float64]:
+    def clearance(self) -> Array:
         """Minimum clearance of an obstacle or the wall for each node, shape (n + 1,) [m]; inf where none is near."""
         count = len(self.vertices)
         return np.full(count, np.inf) if self.margins is None else node_clearance(self.margins, count)
+
+
+class TimeSeries:
+    """Columns of numbers that grow by a row a frame, at 8 bytes a number.
+
+    An hour at 30 frames a second is 0.9 MB a column; threads and pictures are not kept here.
+
+    Args:
+        names: of the columns.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._times = array("d")
+        self._columns = {name: array("d") for name in names}
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self._times)
+
+    def add(self, time: float, values: Mapping[str, float]) -> None:
+        """Add a row; a column that is not named is nan there.
+
+        Args:
+            time: since the bag's start [s].
+            values: by column; a column of a user's barrier (`MARGIN`) begins when it first has a value.
+
+        Raises:
+            KeyError: there is no such column.
+        """
+        for name in values.keys() - self._columns.keys():
+            if not name.startswith(MARGIN):
+                raise KeyError(f"no such columns: {name}")
+            self._columns[name] = array("d", [math.nan] * len(self._times))
+        self._times.append(time)
+        for name, column in self._columns.items():
+            column.append(values.get(name, math.nan))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the columns."""
+        return tuple(self._columns)
+
+    @property
+    def times(self) -> Array:
+        """Return the time of each row [s]."""
+        return np.array(self._times)
+
+    def column(self, name: str) -> Array:
+        """Return a column."""
+        return np.array(self._columns[name])
+
+    def has(self, name: str) -> bool:
+        """Return whether a column holds any number."""
+        return bool(np.isfinite(self.column(name)).any())
+
+
+class ErrorGrid(NamedTuple):
+    """The greatest error by time and arc length.
+
+    Attributes:
+        times: of each column [s].
+        lengths: arc length of each row, from the needle's tail on [m].
+        errors: shape (rows, columns) [% of the thread's length]; nan where nothing is known.
+    """
+
+    times: Array
+    lengths: Array
+    errors: Array
+
+
+class ErrorMap:
+    """Accumulates the error along the thread: when it is full, neighbouring columns become one, with the greater error.
+
+    Args:
+        length: of the thread [m].
+        columns: of the map.
+    """
+
+    def __init__(self, length: float, columns: int = MAP_COLUMNS) -> None:
+        self._length = length
+        self._limit = 2 * columns
+        self._frames = 1  # of a column
+        self._filled = 0  # frames in the last column
+        self._times: list[float] = []
+        self._columns: list[Array] = []
+
+    def add(self, time: float, errors: Array) -> None:
+        """Add the errors of one frame's nodes, in % of the length."""
+        if not np.isfinite(errors).any():
+            return
+        if self._columns and self._filled < self._frames:
+            self._columns[-1] = np.fmax(self._columns[-1], errors)
+            self._filled += 1
+            return
+        if len(self._columns) == self._limit:
+            self._columns = [np.fmax(a, b) for a, b in zip(self._columns[::2], self._columns[1::2], strict=True)]
+            self._times = self._times[::2]
+            self._frames *= 2
+        self._times.append(time)
+        self._columns.append(errors)
+        self._filled = 1
+
+    def grid(self) -> ErrorGrid | None:
+        """Return the map, an empty column in each long gap; None if there is nothing."""
+        if not self._columns:
+            return None
+        times, errors = np.array(self._times), np.column_stack(self._columns)
+        rows = errors.shape[0]
+        lengths = self._length * np.arange(1, rows + 1) / rows
+        if len(times) > 2:
+            steps = np.diff(times)
+            usual = float(np.median(steps))
+            gaps = np.flatnonzero(steps > MAP_GAP * usual) + 1
+            # A column just after the gap's beginning and one just before its end: both are empty.
+            times = np.insert(
+                times, np.repeat(gaps, 2), np.column_stack([times[gaps - 1] + usual, times[gaps] - usual]).ravel()
+            )
+            errors = np.insert(errors, np.repeat(gaps, 2), np.nan, axis=1)
+        return ErrorGrid(times, lengths, errors)
+
+
+@dataclass(frozen=True)
+class WorstFrame:
+    """A frame in which the prediction is far off.
+
+    Attributes:
+        time: since the bag's start [s].
+        error: of the prediction [% of length].
+        frame: what was predicted, measured and true.
+    """
+
+    time: float
+    error: float
+    frame: FrameResult
+
+
+class WorstFrames:
+    """Keeps the frames with the greatest errors, few of them however long the bag is.
+
+    Args:
+        count: of frames to find.
+        apart: least time between two of them [s].
+    """
+
+    def __init__(self, count: int = WORST_FRAMES, apart: float = MIN_DISTANCE) -> None:
+        self._count = count
+        self._apart = apart
+        # A frame takes out the bins within `apart` of it, on both sides: no more of the worst bins are needed.
+        self._enough = count * (2 * math.ceil(apart / BIN) + 3)
+        self._bins: dict[int, WorstFrame] = {}
+
+    def add(self, time: float, error: float, frame: FrameResult) -> None:
+        """Add one frame; one without an error is passed over."""
+        if not math.isfinite(error):
+            return
+        bin_ = math.floor(time / BIN)
+        held = self._bins.get(bin_)
+        if held is not None and held.error >= error:
+            return
+        self._bins[bin_] = WorstFrame(time, error, frame)
+        if len(self._bins) > 2 * self._enough:
+            kept = sorted(self._bins.items(), key=lambda item: -item[1].error)[: self._enough]
+            # The bin that is being filled stays: its worst frame may be still to come.
+            self._bins = dict(kept) | {bin_: self._bins[bin_]}
+
+    def found(self) -> list[WorstFrame]:
+        """Return the worst frames, the worst first."""
+        chosen: list[WorstFrame] = []
+        for worst in sorted(self._bins.values(), key=lambda worst: (-worst.error, worst.time)):
+            if all(abs(worst.time - other.time) >= self._apart for other in chosen):
+                chosen.append(worst)
+            if len(chosen) == self._count:
+                break
+        return chosen

@@ -1,31 +1,34 @@
-"""What a recorded graph published, put side by side by stamp, and the figures of a replay."""
+"""What a graph published, put side by side by stamp: the figures of a replay and of a closed loop."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magnetosuture_thread.evaluation.frames import FrameResult
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
+from magnetosuture_thread import interface
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.evaluation.frames import Array, FrameResult
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, finite_or_none
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import (
-    CAMERA,
-    CURRENTS,
-    DIAGNOSTICS,
-    GROUND_TRUTH_THREAD,
-    MARGINS,
-    MEASURED_THREAD,
-    NEEDLE_COMMAND,
-    NEEDLE_POSE,
-    PREDICTED_THREAD,
-)
 from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose
 
 CURRENT_VALID = 0.05  # s; a recorded current counts as in force for this long
+TRACKED = 1  # as in the message TrackerState
+WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the ground truth, or ...
+WRONG_HEADING = np.radians(5.0)  # ... turned by more, is wrong
+OF_FRAMES = {
+    c.recorded
+    for c in (
+        interface.NEEDLE_POSE,
+        interface.MEASURED_THREAD,
+        interface.PREDICTED_THREAD,
+        interface.MARGINS,
+        interface.GROUND_TRUTH_THREAD,
+    )
+}
 
 
 class GraphCollector:
@@ -38,7 +41,7 @@ class GraphCollector:
 
     Attributes:
         poses: frames in which the needle was found.
-        driven: stamps of the commands that were followed, not stopped [ns].
+        applied: stamps of the commands that were followed, not stopped [ns].
         health: what each node reported last of itself.
     """
 
@@ -46,26 +49,34 @@ class GraphCollector:
         self._length = length
         self._frames: dict[int, FrameResult] = {}
         self.poses = 0
-        self.driven: set[int] = set()
+        self.applied: set[int] = set()
         self.health: dict[str, str] = {}
 
     def add(self, topic: str, message: Any) -> None:
-        """Take one message; topics that say nothing about a frame are ignored."""
-        taker = {
-            NEEDLE_POSE.recorded: self._take_pose,
-            MEASURED_THREAD.recorded: self._take_seen,
-            PREDICTED_THREAD.recorded: self._take_prediction,
-            MARGINS.recorded: self._take_margins,
-            GROUND_TRUTH_THREAD.recorded: self._take_truth,
-        }.get(topic)
-        if topic == DIAGNOSTICS.recorded:
+        """Add one message; topics that say nothing about a frame are ignored."""
+        if topic == interface.DIAGNOSTICS.recorded:
             self.health.update({status.name.split(":")[0]: status.message for status in message.status})
+        if topic == interface.CURRENTS.recorded and not message.stop:
+            self.applied.add(nanoseconds(message.command))
+        if topic not in OF_FRAMES:
             return
-        if topic == CURRENTS.recorded and not message.stop:
-            self.driven.add(nanoseconds(message.command))
-        if taker is not None:
-            time = nanoseconds(message.header.stamp)
-            taker(self._frames.setdefault(time, FrameResult(time)), message)
+        stamp = nanoseconds(message.header.stamp)
+        frame = self._frames.setdefault(stamp, FrameResult(stamp))
+        if topic == interface.NEEDLE_POSE.recorded:
+            x, y, frame.heading = planar_pose(message.pose.pose)
+            frame.tail = np.array([x, y])
+            self.poses += 1
+        elif topic == interface.MEASURED_THREAD.recorded:
+            frame.measured = _path(message)
+        elif topic == interface.GROUND_TRUTH_THREAD.recorded:
+            frame.ground_truth = _path(message)
+        elif topic == interface.PREDICTED_THREAD.recorded:
+            frame.vertices = np.array([[p.x, p.y] for p in message.positions]).reshape(-1, 2)
+            frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
+            frame.residual, frame.step_time = message.residual, message.step_time
+        elif message.valid:
+            frame.margins = margins_of(message)
+            frame.in_contact = bool(frame.margins.in_contact)
 
     def frames(self, first: int = 0, last: int | None = None) -> list[FrameResult]:
         """Return the frames with a prediction, by time; their errors are set by `metrics`.
@@ -74,10 +85,8 @@ class GraphCollector:
             first: stamp of the first one [ns].
             last: stamp of the last one; of all if None.
         """
-        found = (frame for frame in self._frames.values() if len(frame.vertices))
-        return sorted(
-            (f for f in found if first <= f.stamp and (last is None or f.stamp <= last)), key=lambda f: f.stamp
-        )
+        last = max(self._frames, default=0) if last is None else last
+        return [frame for at, frame in sorted(self._frames.items()) if len(frame.vertices) and first <= at <= last]
 
     def metrics(self, start: int = 0, frames: list[FrameResult] | None = None) -> RunMetrics:
         """Return the figures of frames, of all if None; times count from `start` [ns]."""
@@ -87,56 +96,9 @@ class GraphCollector:
         metrics.compare()
         return metrics
 
-    def _take_pose(self, frame: FrameResult, message: Any) -> None:
-        x, y, frame.heading = planar_pose(message.pose.pose)
-        frame.tail = np.array([x, y])
-        self.poses += 1
-
-    def _take_seen(self, frame: FrameResult, message: Any) -> None:
-        frame.seen = _path(message)
-
-    def _take_truth(self, frame: FrameResult, message: Any) -> None:
-        frame.truth = _path(message)
-
-    def _take_prediction(self, frame: FrameResult, message: Any) -> None:
-        frame.vertices = np.array([[p.x, p.y] for p in message.positions]).reshape(-1, 2)
-        frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
-        frame.residual = message.residual
-        frame.step_time = message.step_time
-
-    def _take_margins(self, frame: FrameResult, message: Any) -> None:
-        if message.valid:
-            frame.margins = margins_of(message)
-            frame.in_contact = bool(frame.margins.in_contact)
-
 
 def _path(message: Any) -> Points:
     return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
-
-
-def stage_latencies(
-    published: Mapping[str, Mapping[int, float]], arrived: Mapping[str, Mapping[int, float]], driven: Set[int]
-) -> dict[str, Percentiles | None]:
-    """Return the latency of each stage of the graph [s].
-
-    Args:
-        published: of each input topic, when the message of a stamp was published [s].
-        arrived: of each output topic, when the first message of a stamp arrived [s].
-        driven: stamps of the commands that were followed; the watchdog's zeros answer no command.
-    """
-    camera = {stamp: at for channel in CAMERA.values() for stamp, at in published.get(channel.name, {}).items()}
-    commands = {stamp: at for stamp, at in published.get(NEEDLE_COMMAND.name, {}).items() if stamp in driven}
-    poses, predictions = arrived.get(NEEDLE_POSE.name, {}), arrived.get(PREDICTED_THREAD.name, {})
-    stages: dict[str, tuple[Mapping[int, float], Mapping[int, float]]] = {
-        "frame to needle pose": (camera, poses),
-        "pose to prediction": (poses, predictions),
-        "frame to prediction": (camera, predictions),
-        "command to currents": (commands, arrived.get(CURRENTS.name, {})),
-    }
-    return {
-        stage: Percentiles.of([after[stamp] - before[stamp] for stamp in after if stamp in before])
-        for stage, (before, after) in stages.items()
-    }
 
 
 @dataclass(frozen=True)
@@ -167,22 +129,22 @@ class CurrentSeries:
     """Currents over time, from messages in any order of arrival."""
 
     def __init__(self) -> None:
-        self._taken: dict[int, tuple[NDArray[np.float64], bool]] = {}
+        self._received: dict[int, tuple[Array, bool]] = {}
 
     def add(self, message: Any) -> None:
-        """Take a message CoilCurrents, of ROS or of the bags' type store."""
+        """Add a message CoilCurrents, of ROS or of the bags' type store."""
         stamp = nanoseconds(message.header.stamp)
-        self._taken[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)
+        self._received[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)
 
     def against(self, recorded: CurrentSeries) -> CurrentDifference | None:
         """Compare with what was recorded; None where nothing can be."""
-        theirs = np.array(sorted(recorded._taken))
+        theirs = np.array(sorted(recorded._received))
         apart, sizes, stops = [], [], []
-        for stamp, (currents, stopped) in sorted(self._taken.items()):
+        for stamp, (currents, stopped) in sorted(self._received.items()):
             index = int(np.searchsorted(theirs, stamp, side="right")) - 1
             if index < 0 or stamp - theirs[index] > CURRENT_VALID * 1e9:
                 continue
-            other, other_stopped = recorded._taken[int(theirs[index])]
+            other, other_stopped = recorded._received[int(theirs[index])]
             if other.shape != currents.shape:
                 continue
             apart.append(currents - other)
@@ -260,3 +222,165 @@ class ReplaySummary:
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above."""
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class LoopSummary:
+    """The figures of a closed loop. Everything in it is simulated.
+
+    Attributes:
+        setup: the scenario's name.
+        duration: from the start of the steering until the path was done, or to the end; all figures are of
+            this time [s].
+        frames: camera frames, lost ones too.
+        skipped: frames that are missing: the rig had no time for them.
+        tracked: frames with a pose.
+        lost: frames that the tracker looked at without giving a pose.
+        wrong: poses farther from the truth than 0.3 mm or 5 degrees.
+        predicted: frames with a predicted thread.
+        saturated: share of the currents at a limit.
+        tail_error: distance of the tracked tail from the truth, root of the mean square [m].
+        heading_error: of the tracked heading, the same [rad].
+        path_error: distance of the needle's true tip from where the path wanted it, the same [m].
+        path_error_greatest: greatest such distance [m].
+        processing: of a frame in the tracker [s].
+        step_time: of the model's step [s].
+        latency: from a frame's stamp to the arrival of what was made of it [s].
+        error_truth: prediction error against the truth [% of length].
+        error_seen: the same against the seen centreline.
+        seen_share: part of the thread's length that the camera saw, mean.
+        stretch: greatest absolute stretch of a segment.
+    """
+
+    setup: str
+    duration: float
+    frames: int
+    skipped: int
+    tracked: int
+    lost: int
+    wrong: int
+    predicted: int
+    saturated: float
+    tail_error: float
+    heading_error: float
+    path_error: float
+    path_error_greatest: float
+    processing: Percentiles | None
+    step_time: Percentiles | None
+    latency: dict[str, Percentiles | None]
+    error_truth: dict[str, float] | None
+    error_seen: dict[str, float] | None
+    seen_share: float
+    stretch: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as plain values, None where there is none; units as above."""
+        return {key: finite_or_none(value) for key, value in asdict(self).items()}
+
+
+class LoopCollector:
+    """Puts the messages of a closed loop side by side by their stamps.
+
+    Args:
+        thread_length: [m]
+        needle_length: along the needle's body [m].
+        needle_curvature: of its arc [1/m].
+        frame_rate: of the camera [Hz].
+
+    Attributes:
+        instants: the predicted frames by time, once `summary` was asked for.
+    """
+
+    def __init__(self, thread_length: float, needle_length: float, needle_curvature: float, frame_rate: float) -> None:
+        self._threads = GraphCollector(thread_length)
+        self._needle = needle_length
+        self._curvature = needle_curvature
+        self._rate = frame_rate
+        self._truth: dict[int, Array] = {}
+        self._tracked: dict[int, Array] = {}
+        self._setpoints: dict[int, Array] = {}
+        self._poses = {
+            interface.GROUND_TRUTH_NEEDLE.recorded: self._truth,
+            interface.NEEDLE_POSE.recorded: self._tracked,
+            interface.TIP_SETPOINT.recorded: self._setpoints,
+        }
+        self._arrived: dict[str, dict[int, int]] = {interface.NEEDLE_POSE.name: {}, interface.PREDICTED_THREAD.name: {}}
+        self._states: dict[int, tuple[int, float]] = {}
+        self._saturated: list[bool] = []
+        self.instants: list[FrameResult] = []
+
+    def add(self, topic: str, time: int, message: Any) -> None:
+        """Add one message that arrived at a time [ns]."""
+        self._threads.add(topic, message)
+        if not hasattr(message, "header"):
+            return
+        stamp = nanoseconds(message.header.stamp)
+        if topic in self._poses:
+            pose = message.pose.pose if topic == interface.NEEDLE_POSE.recorded else message.pose
+            self._poses[topic][stamp] = np.array(planar_pose(pose))
+        elif topic == interface.TRACKER_STATE.recorded:
+            self._states[stamp] = (message.state, message.processing_time)
+        elif topic == interface.CURRENTS.recorded:
+            self._saturated.append(bool(message.saturated))
+        if topic.lstrip("/") in self._arrived:
+            self._arrived[topic.lstrip("/")].setdefault(stamp, time)
+
+    def summary(self, setup: str) -> LoopSummary:
+        """Return the figures.
+
+        Raises:
+            GraphError: there is no frame with a pose and its truth.
+        """
+        first, last = (min(self._setpoints), max(self._setpoints)) if self._setpoints else (0, 0)
+        if self._setpoints and self._threads.health.get("path_follower") != "done":
+            last = max(self._truth, default=last)  # who steers is silent while the needle is lost
+        frames = {stamp for stamp in self._truth if first <= stamp <= last}
+        both = sorted(self._tracked.keys() & frames)
+        if not both:
+            said = "; ".join(f"{name}: {text}" for name, text in sorted(self._threads.health.items()))
+            raise GraphError(f"the needle was tracked in no frame; {said}")
+        self.instants = self._threads.frames(first, last)
+        metrics = self._threads.metrics(frames=self.instants)
+        errors = metrics.errors()
+        apart = np.array([self._tracked[stamp] - self._truth[stamp] for stamp in both])
+        tail = np.hypot(apart[:, 0], apart[:, 1])
+        heading = np.abs(np.angle(np.exp(1j * apart[:, 2])))
+        off = np.array([np.linalg.norm(self._tip(s) - self._setpoints[s][:2]) for s in both if s in self._setpoints])
+        states = [(state, taken) for stamp, (state, taken) in self._states.items() if stamp in frames]
+        return LoopSummary(
+            setup=setup,
+            duration=(last - first) * 1e-9,
+            frames=len(frames),
+            skipped=max(0, round((last - first) * 1e-9 * self._rate) + 1 - len(frames)),
+            tracked=len(both),
+            lost=sum(state != TRACKED for state, _ in states),
+            wrong=int(np.sum((tail > WRONG_TAIL) | (heading > WRONG_HEADING))),
+            predicted=len(self.instants),
+            saturated=float(np.mean(self._saturated or [False])),
+            tail_error=_rms(tail),
+            heading_error=_rms(heading),
+            path_error=_rms(off),
+            path_error_greatest=float(off.max(initial=0.0)),
+            processing=Percentiles.of([taken for _, taken in states]),
+            step_time=metrics.percentiles("step_time"),
+            latency={name: self._latency(name) for name in self._arrived},
+            error_truth=errors["truth"],
+            error_seen=errors["seen"],
+            seen_share=metrics.mean("seen_share"),
+            stretch=metrics.maximum("strain"),
+        )
+
+    def _tip(self, stamp: int) -> Points:
+        """Return where the needle's true tip was."""
+        x, y, heading = self._truth[stamp]
+        points, _ = needle_axis(np.array([x, y]), heading, self._needle, self._curvature, np.ones(1))
+        return np.asarray(points[0])
+
+    def _latency(self, name: str) -> Percentiles | None:
+        return Percentiles.of(
+            [(time - stamp) * 1e-9 for stamp, time in self._arrived[name].items() if stamp in self._setpoints]
+        )
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.barrier import BUILT_IN
-from magnetosuture_thread.evaluation.frames import FrameResult, Observation
-from magnetosuture_thread.evaluation.series import MARGIN, ErrorMap, TimeSeries, WorstFrame, WorstFrames
+from magnetosuture_thread.evaluation.frames import (
+    MARGIN,
+    Array,
+    ErrorMap,
+    FrameResult,
+    Observation,
+    TimeSeries,
+    WorstFrame,
+    WorstFrames,
+)
 from magnetosuture_thread.geometry.polyline import Points
-
-Array = NDArray[np.float64]
+from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
@@ -42,6 +50,11 @@ class Percentiles:
         return cls(float(np.median(kept)), float(np.percentile(kept, 99)), float(kept.max()))
 
 
+def finite_or_none(value: Any) -> Any:
+    """Return None for a number that is not finite, anything else as it is: what goes into JSON."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def error_figures(errors: ArrayLike) -> dict[str, float] | None:
     """Return count, mean, median, p99 and maximum of errors in %; None if there are none."""
     given = np.asarray(errors, dtype=np.float64)
@@ -49,6 +62,31 @@ def error_figures(errors: ArrayLike) -> dict[str, float] | None:
     if percentiles is None:
         return None
     return {"count": int(np.isfinite(given).sum()), "mean": float(np.nanmean(given)), **asdict(percentiles)}
+
+
+def stage_latencies(
+    published: Mapping[str, Mapping[int, float]], arrived: Mapping[str, Mapping[int, float]], applied: Set[int]
+) -> dict[str, Percentiles | None]:
+    """Return the latency of each stage of the graph [s].
+
+    Args:
+        published: of each input topic, when the message of a stamp was published [s].
+        arrived: of each output topic, when the first message of a stamp arrived [s].
+        applied: stamps of the commands that were followed; the watchdog's zeros answer no command.
+    """
+    camera = {stamp: at for channel in CAMERA.values() for stamp, at in published.get(channel.name, {}).items()}
+    commands = {stamp: at for stamp, at in published.get(NEEDLE_COMMAND.name, {}).items() if stamp in applied}
+    poses, predictions = arrived.get(NEEDLE_POSE.name, {}), arrived.get(PREDICTED_THREAD.name, {})
+    stages: dict[str, tuple[Mapping[int, float], Mapping[int, float]]] = {
+        "frame to needle pose": (camera, poses),
+        "pose to prediction": (poses, predictions),
+        "frame to prediction": (camera, predictions),
+        "command to currents": (commands, arrived.get(CURRENTS.name, {})),
+    }
+    return {
+        stage: Percentiles.of([after[stamp] - before[stamp] for stamp in after if stamp in before])
+        for stage, (before, after) in stages.items()
+    }
 
 
 def target_points(curves: Sequence[Points], length: float, segments: int) -> tuple[Array, Array]:
@@ -161,7 +199,7 @@ class MinimumMargin:
 
 
 class RunMetrics:
-    """Accumulates the figures of a run.
+    """Accumulates errors, margins and times of a run.
 
     Of each frame only numbers are kept, and of a few frames the threads: memory grows by 130 bytes a frame.
 
@@ -201,7 +239,7 @@ class RunMetrics:
         self._first: FrameResult | None = None
 
     def observe(self, observation: Observation) -> None:
-        """Take what one frame, or one recorded pose, says."""
+        """Count a frame, or a recorded pose, and whether its needle was found."""
         time = self._time(observation.stamp)
         self.observed.add(time, {"processing": observation.processing})
         self.tracked += observation.found
@@ -215,7 +253,7 @@ class RunMetrics:
         self._found = observation.found
 
     def add(self, frame: FrameResult) -> None:
-        """Take what was predicted of a frame; its errors are set when they are worked out."""
+        """Add the prediction of a frame; its errors are set when they are computed."""
         if frame.margins is not None:
             for row in frame.margins.minima:
                 held = self._minimum.get(row.barrier)
@@ -277,13 +315,11 @@ class RunMetrics:
 
     def maximum(self, column: str) -> float:
         """Return the greatest value of a column; nan if there is none."""
-        values = self.series.column(column)
-        return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
+        return float(np.nanmax(self.series.column(column))) if self.series.has(column) else math.nan
 
     def mean(self, column: str) -> float:
         """Return the mean of a column; nan if there is none."""
-        values = self.series.column(column)
-        return float(np.nanmean(values)) if np.isfinite(values).any() else math.nan
+        return float(np.nanmean(self.series.column(column))) if self.series.has(column) else math.nan
 
     def compare(self) -> None:
         """Compare the frames that have come with their targets, and keep of them only numbers."""
@@ -292,40 +328,27 @@ class RunMetrics:
             return
         self._first = self._first or frames[0]
         vertices = np.stack([frame.vertices for frame in frames])
-        rows: list[dict[str, float]] = [
-            {"strain": f.strain, "residual": f.residual, "step_time": f.step_time} for f in frames
-        ]
+        rows = [{"strain": f.strain, "residual": f.residual, "step_time": f.step_time} for f in frames]
         for target in TARGETS:
-            self._compare_with(target, frames, vertices, rows)
+            curves = [frame.target_curve(target) for frame in frames]
+            means, errors, shares = prediction_errors(vertices, curves, self._length)
+            for index, (frame, row, mean) in enumerate(zip(frames, rows, means.tolist(), strict=True)):
+                if target == "seen":
+                    row["seen_share"] = float(shares[index])
+                if target not in self.targets:
+                    continue
+                row[f"error_{target}"] = frame.errors[target] = mean
+                if frame.recorded is not None:
+                    error = prediction_error_percent(frame.recorded, curves[index], self._length)
+                    row[f"recorded_error_{target}"] = error
+                if math.isfinite(mean):
+                    time = self._time(frame.stamp)
+                    self._maps[target].add(time, errors[index].copy())
+                    self._worst[target].add(time, mean, frame)
         for frame, row in zip(frames, rows, strict=True):
             if frame.margins is not None:
                 row |= {f"{MARGIN}{least.barrier}": float(least.clearance[0]) for least in frame.margins.minima}
-            row["seen_share"] = frame.seen_share
             self._series.add(self._time(frame.stamp), row)
-
-    def _compare_with(
-        self, target: str, frames: Sequence[FrameResult], vertices: Points, rows: Sequence[dict[str, float]]
-    ) -> None:
-        curves = [frame.truth if target == "truth" else frame.seen for frame in frames]
-        means, errors, shares = prediction_errors(vertices, curves, self._length)
-        if target == "seen":
-            for frame, share in zip(frames, shares.tolist(), strict=True):
-                frame.seen_share = share
-        if target not in self.targets:
-            return
-        for index, (frame, row, mean) in enumerate(zip(frames, rows, means.tolist(), strict=True)):
-            row[f"error_{target}"] = mean
-            if frame.recorded is not None:
-                error = prediction_error_percent(frame.recorded, curves[index], self._length)
-                row[f"recorded_error_{target}"] = error
-            if target == "truth":
-                frame.error_truth = mean
-            else:
-                frame.error_seen = mean
-            if math.isfinite(mean):
-                time = self._time(frame.stamp)
-                self._maps[target].add(time, errors[index].copy())
-                self._worst[target].add(time, mean, frame)
 
     def _time(self, stamp: int) -> float:
         return (stamp - self._start) * 1e-9

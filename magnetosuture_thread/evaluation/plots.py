@@ -1,14 +1,10 @@
-"""The picture of a replayed bag, and what all plots share: colours, axes, and a frame with the threads in it."""
+"""Plots of replayed bags and evaluated trajectories, and what all plots share: colours, axes, threads in a frame."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
-
-import matplotlib
-
-matplotlib.use("Agg")
 
 import numpy as np
 from matplotlib import patheffects
@@ -19,18 +15,24 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.frames import FrameResult, TimeSeries
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.evaluation.series import TimeSeries
+from magnetosuture_thread.evaluation.reference_scores import CaseResult
+from magnetosuture_thread.evaluation.scene_plot import shape_patch
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.margins import SOLID
 
 INK, FAINT = "#22303c", "#7b8794"
-SEEN, TRUTH = "#0f6fc6", "#8a6d00"
+SEEN, TRUTH, PREDICTED = "#0f6fc6", "#8a6d00", "#d1495b"
+WIDE = {"color": SEEN, "alpha": 0.35, "solid_capstyle": "round"}  # where a thread was, beside what is predicted
+OBSTACLE = "#e9d8d3"
 MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", ["#c8102e", "#f28c28", "#1f9d55"])
 FULL_CLEARANCE_MM = 1.0
 CLOSE_UP = 2e-3  # m; half of the side of what is magnified
+INSTANTS = 6  # of a trajectory
+BARS = (0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)  # m
 
 
 def draw_summary(
@@ -60,13 +62,8 @@ def draw_summary(
     line = _draw_frame(scene, frame, view, chosen, obstacles)
     _draw_close_up(scene, frame, view, chosen, obstacles)
     _draw_colours(figure, line)
-    figure.text(
-        0.015,
-        0.905,
-        f"frame at {at:.2f} s, where the prediction is farthest from what is seen",
-        fontsize=9.5,
-        color=INK,
-    )
+    words = f"frame at {at:.2f} s, where the prediction is farthest from what is seen"
+    figure.text(0.015, 0.905, words, fontsize=9.5, color=INK)
     plots = figure.subplots(
         3, 1, sharex=True, gridspec_kw={"left": 0.51, "right": 0.985, "top": 0.87, "bottom": 0.085, "hspace": 0.33}
     )
@@ -101,12 +98,7 @@ def _draw_frame(
     middle, half = view.to_pixels(np.zeros(2)), 0.5 * min(height, width)
     axes.set_xlim(max(-0.5, middle[0] - half), min(width - 0.5, middle[0] + half))
     axes.set_ylim(height - 0.5, -0.5)
-    for side in axes.spines.values():
-        side.set_visible(False)
-    bar = 5e-3 / view.metres_per_pixel
-    left, low = axes.get_xlim()[0] + 14.0, height - 16.0
-    axes.plot([left, left + bar], [low, low], color="white", linewidth=3.0, solid_capstyle="butt")
-    axes.text(left + 0.5 * bar, low - 7.0, "5 mm", color="white", fontsize=8.5, ha="center")
+    draw_scale_bar(axes, view, 0.15)
     return line
 
 
@@ -118,10 +110,12 @@ def draw_threads(
     obstacles: Sequence[Obstacle],
     magnified: float,
 ) -> LineCollection:
-    """Draw frame, obstacles, seen and predicted thread."""
+    """Draw frame, obstacles, measured and predicted thread, without axes."""
     axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
     axes.set_xticks([])
     axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_visible(False)
     for obstacle in obstacles:
         if isinstance(obstacle, Disc):
             centre = view.to_pixels(np.asarray(obstacle.centre))
@@ -131,9 +125,11 @@ def draw_threads(
             for ring in obstacle.rings:
                 corners = view.to_pixels(np.vstack([ring, ring[:1]]))
                 axes.plot(corners[:, 0], corners[:, 1], color=INK, linewidth=0.9)
-    if len(chosen.seen) > 1:
-        seen = view.to_pixels(chosen.seen)
-        axes.plot(seen[:, 0], seen[:, 1], color=SEEN, linewidth=5.0 * magnified, alpha=0.45, solid_capstyle="round")
+    if len(chosen.measured) > 1:
+        measured = view.to_pixels(chosen.measured)
+        axes.plot(
+            measured[:, 0], measured[:, 1], color=SEEN, linewidth=5.0 * magnified, alpha=0.45, solid_capstyle="round"
+        )
     vertices = view.to_pixels(chosen.vertices)
     clearance = chosen.clearance
     segments = np.stack([vertices[:-1], vertices[1:]], axis=1)
@@ -162,13 +158,12 @@ def _draw_close_up(
     middles = [np.array([left + (x + 0.19) * (right - left), bottom + (y + 0.19) * (top - bottom)]) for x, y in corners]
     room = [np.linalg.norm(everything - middle, axis=1).min() for middle in middles]
     x, y = corners[int(np.argmax(room))]
-    inset = scene.inset_axes(
-        (x + 0.01 * (x == 0.0) - 0.01 * (x > 0), y + 0.01 * (y == 0.0) - 0.01 * (y > 0), 0.38, 0.38)
-    )
+    x, y = (at + (0.01 if at == 0.0 else -0.01) for at in (x, y))
+    inset = scene.inset_axes((x, y, 0.38, 0.38))
     draw_threads(inset, frame, view, chosen, obstacles, magnified=1.8)
-    inset.set_xlim(centre[0] - half, centre[0] + half)
-    inset.set_ylim(centre[1] + half, centre[1] - half)
+    look_at(inset, centre, half)
     for side in inset.spines.values():
+        side.set_visible(True)
         side.set_color(INK)
         side.set_linewidth(0.8)
     box = (centre[0] - half, centre[1] - half, 2.0 * half, 2.0 * half)
@@ -193,6 +188,27 @@ def _draw_heading(axes: Axes, view: DishView, chosen: FrameResult) -> None:
     outline = [patheffects.withStroke(linewidth=3.0, foreground="white")]
     style: dict[str, Any] = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.3, "path_effects": outline}
     axes.annotate("", xy=tuple(tail + ahead), xytext=tuple(tail), arrowprops=style)
+
+
+def look_at(axes: Axes, centre: NDArray[np.float64], half: float) -> None:
+    """Show a square of a picture, by its middle and half of its side [px]."""
+    axes.set_xlim(centre[0] - half, centre[0] + half)
+    axes.set_ylim(centre[1] + half, centre[1] - half)
+
+
+def draw_scale_bar(axes: Axes, view: DishView, share: float) -> None:
+    """Draw a scale bar of a round length, at most a share of the picture's width."""
+    left, right = axes.get_xlim()
+    low, high = axes.get_ylim()
+    fitting = [bar for bar in BARS if bar / view.metres_per_pixel <= share * (right - left)]
+    bar = fitting[-1] if fitting else BARS[0]
+    x, y = left + 0.04 * (right - left), low + 0.04 * (high - low)
+    axes.plot([x, x + bar / view.metres_per_pixel], [y, y], color="white", linewidth=6.0, solid_capstyle="butt")
+    axes.plot([x, x + bar / view.metres_per_pixel], [y, y], color=INK, linewidth=3.0, solid_capstyle="butt")
+    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
+    axes.text(
+        x, y + 0.015 * (high - low), f"{1e3 * bar:g} mm", color=INK, fontsize=11, ha="left", va="bottom", bbox=box
+    )
 
 
 def _draw_error(axes: Axes, series: TimeSeries) -> None:
@@ -224,6 +240,73 @@ def _draw_strain(axes: Axes, series: TimeSeries) -> None:
     axes.set_ylim(values.min() / 3.0, values.max() * 3.0)
     axes.plot(series.times, values, color=INK, linewidth=1.2)
     axes.set_title("greatest stretch or compression of a segment [%]", fontsize=9.5, color=INK, loc="left")
+
+
+def draw_case(path: Path, case: CaseResult, formulation: str) -> None:
+    """Write the picture of one evaluated trajectory (.png): the thread at some instants, and the error over time."""
+    figure = Figure(figsize=(11.0, 5.6), dpi=130, facecolor="white")
+    scene, error = figure.subplots(
+        1, 2, gridspec_kw={"width_ratios": [1.25, 1.0], "left": 0.06, "right": 0.985, "top": 0.83, "bottom": 0.1}
+    )
+    reference, score, worst = case.reference, case.score, int(case.error_percent.argmax())
+    figure.text(0.02, 0.945, f"{reference.name}, formulation {formulation}", fontsize=13, color=INK, weight="bold")
+    words = (
+        f"mean error {score.mean_error_percent:.3f} % of the length, greatest {score.max_error_percent:.3f} %; "
+        f"n = {case.vertices.shape[1] - 1}; the reference is simulated, by another method"
+    )
+    figure.text(0.02, 0.9, words, fontsize=9.5, color=INK)
+    chosen = sorted({*np.linspace(0, len(reference.times) - 1, INSTANTS).astype(int).tolist(), worst})
+    draw_instants(
+        scene,
+        reference.tails,
+        reference.discs,
+        [
+            ("reference", {**WIDE, "linewidth": 5.0}),
+            ("predicted", {"color": PREDICTED, "marker": "o", "markersize": 1.6}),
+        ],
+        [(f"{reference.times[k]:.0f} s", (reference.threads[k], case.vertices[k])) for k in chosen],
+    )
+    error.plot(reference.times, case.error_percent, color=PREDICTED, linewidth=1.3)
+    error.plot(reference.times[worst], case.error_percent[worst], "o", color=INK, markersize=4)
+    error.set_ylim(0.0, 1.15 * max(float(case.error_percent.max()), 1e-6))
+    error.set_xlim(reference.times[0], reference.times[-1])
+    error.set_xlabel("time [s]", color=INK)
+    error.set_title("mean distance of the nodes [% of the length]", fontsize=9.5, color=INK, loc="left")
+    tidy(error)
+    figure.savefig(path)
+
+
+def draw_instants(
+    axes: Axes,
+    tails: Points,
+    obstacles: Sequence[Obstacle],
+    styles: Sequence[tuple[str, dict[str, Any]]],
+    instants: Iterable[tuple[str, Sequence[Points]]],
+) -> None:
+    """Draw the needle's way, obstacles, and threads at some instants, in millimetres.
+
+    Args:
+        axes: to draw in.
+        tails: the needle's tail over time, shape (T, 2) [m].
+        obstacles: discs and polygons [m].
+        styles: name and line of each thread of an instant.
+        instants: label, empty for none, and threads from the needle's tail on, each of shape (m, 2) [m].
+    """
+    axes.plot(*(1e3 * tails.T), color=FAINT, linewidth=0.7, alpha=0.6)
+    for shape in obstacles:
+        if isinstance(shape, Disc | Polygon):
+            axes.add_patch(shape_patch(shape, facecolor=OBSTACLE, edgecolor=INK, linewidth=0.8))
+    for index, (label, threads) in enumerate(instants):
+        for (name, style), points in zip(styles, threads, strict=True):
+            axes.plot(*(1e3 * points.T), label=name if index == 0 else None, **{"linewidth": 1.0, **style})
+        tail = 1e3 * threads[0][0]
+        axes.plot(*tail, "o", color=INK, markersize=4, label="needle's tail" if index == 0 else None)
+        axes.annotate(label, tail, xytext=(5, 4), textcoords="offset points", fontsize=8, color=INK)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [mm]", color=INK)
+    axes.set_ylabel("y [mm]", color=INK)
+    axes.legend(loc="best", fontsize=8.5, frameon=True, framealpha=0.8, edgecolor="none")
+    tidy(axes)
 
 
 def tidy(axes: Axes) -> None:

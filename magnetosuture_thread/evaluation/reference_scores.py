@@ -138,8 +138,8 @@ def score(
         formulation: its name.
         solver: its name.
         segments: n, of all cases; without it each case has the paper's.
-        progress: is told the share done.
-        keep: is given each case's result.
+        progress: called with the share done, 0 to 1.
+        keep: called with each case's result.
 
     Raises:
         BagError: a file is no reference trajectory.
@@ -184,9 +184,9 @@ def score_each(
 
     Args:
         paths: the trajectories.
-        one: scores one of them, and is given what it tells the share done to.
-        progress: is told the share of all that is done.
-        keep: is given each case's result.
+        one: scores one of them; its last argument is called with the share done.
+        progress: called with the share of all that is done.
+        keep: called with each case's result.
 
     Raises:
         BagError: a file is no reference trajectory.
@@ -240,7 +240,7 @@ def run_case(
         diameter: of the thread [m].
         step: goes to a sample, given by its index; this alone is timed.
         figures: reads what a step gave.
-        progress: is told the share done.
+        progress: called with the share done, 0 to 1.
 
     Source: reference set, "How a prediction is scored". Deviation: none.
     """

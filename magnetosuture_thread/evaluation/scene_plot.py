@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -86,15 +83,8 @@ def shape_patch(geometry: Disc | Polygon, **style: Any) -> Circle | PathPatch:
 def _draw_names(axes: Axes, scene: Scene) -> None:
     """Draw the names; one that stands beside its shape with a line to it."""
     ground = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
-    style: dict[str, Any] = {
-        "bbox": ground,
-        "ha": "center",
-        "va": "center",
-        "fontsize": 9.5,
-        "color": INK,
-        "parse_math": False,
-    }
-    texts = [axes.text(0.0, 0.0, shape.name, zorder=5, **style) for shape in scene.shapes]
+    style: dict[str, Any] = {"bbox": ground, "ha": "center", "va": "center", "fontsize": 9.5, "parse_math": False}
+    texts = [axes.text(0.0, 0.0, shape.name, zorder=5, color=INK, **style) for shape in scene.shapes]
     to_metres = axes.transData.inverted()
     boxes = [to_metres.transform_bbox(text.get_window_extent()) for text in texts]
     places = label_positions(scene, [(1e-3 * float(box.width), 1e-3 * float(box.height)) for box in boxes])

@@ -10,15 +10,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from magnetosuture_thread.calibration.parameters import chosen
-from magnetosuture_thread.calibration.passage import Passage, passage_of
-from magnetosuture_thread.calibration.picture import draw_calibration
+from magnetosuture_thread.calibration.output import to_yaml
+from magnetosuture_thread.calibration.parameters import choose_parameters
+from magnetosuture_thread.calibration.plot import draw_calibration
 from magnetosuture_thread.calibration.pool import pool
 from magnetosuture_thread.calibration.replays import Best
 from magnetosuture_thread.calibration.result import CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate as fit
-from magnetosuture_thread.calibration.search import unfinished
-from magnetosuture_thread.calibration.yaml_text import to_yaml
+from magnetosuture_thread.calibration.search import unfinished_result
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.jobs.output import whole_file
 from magnetosuture_thread.jobs.replay_inputs import (

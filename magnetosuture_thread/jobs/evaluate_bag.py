@@ -23,7 +23,7 @@ from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
 from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures, LiveFigures
 from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, ReportPicture, draw_worst_frame
-from magnetosuture_thread.evaluation.series import WorstFrame
+from magnetosuture_thread.evaluation.tables import Row, row_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import CURRENTS, GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD

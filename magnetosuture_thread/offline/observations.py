@@ -183,7 +183,7 @@ class ObservationReader(Iterator[Observation]):
         seen = parts.get(_SEEN, {}).get(sight.stamp, _NOTHING)
         if not len(truth) and not len(seen):
             return sight
-        seen = seen if self.source == "poses" else sight.seen
+        seen = seen if self.source == "poses" else sight.measured
         return Observation(sight.stamp, sight.tail, sight.heading, seen, truth, sight.reason, sight.processing)
 
     def _pose(self, record: RecordedMessage) -> Observation:

@@ -127,9 +127,9 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
             _change(session, given)
         if not sight.found:
             continue
-        if len(sight.seen):
+        if len(sight.measured):
             began = time.perf_counter()
-            for outcome in session.on_measured_thread(sight.stamp, sight.seen):
+            for outcome in session.on_measured_thread(sight.stamp, sight.measured):
                 yield step(waiting.get(outcome.stamp, sight), outcome, began)
                 began = time.perf_counter()
         began = time.perf_counter()

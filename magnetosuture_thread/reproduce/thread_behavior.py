@@ -15,8 +15,8 @@ from rich.table import Table
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.closed_loop import LoopSummary
 from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.graph_outputs import LoopSummary
 from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
@@ -89,14 +89,14 @@ def thread_behavior(
 
             log(setup.name)
             simulate(str(setup.path), folder / setup.name, log=log, progress=advance)
-            runs.append(_judged(folder / setup.name, setup))
+            runs.append(_evaluated(folder / setup.name, setup))
         figures = [run.summary.to_json() for run in runs]
         (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         draw_behavior(folder / "behaviour.png", runs)
     return runs
 
 
-def _judged(path: Path, setup: Setup) -> BehaviorRun:
+def _evaluated(path: Path, setup: Setup) -> BehaviorRun:
     """Return a run's figures and the frames to show."""
     bag = Bag(path)
     collector = measure_loop(bag, setup)
@@ -180,8 +180,8 @@ def _draw_row(figure: Figure, run: BehaviorRun, bottom: float, height: float) ->
     plot = figure.add_axes((0.725, bottom + 0.055, 0.262, height - 0.06))
     times = np.array([(instant.stamp - began) * 1e-9 for instant in run.instants])
     for label, colour, errors in (
-        ("against the seen centreline", SEEN, [instant.error_seen for instant in run.instants]),
-        ("against the truth", TRUTH, [instant.error_truth for instant in run.instants]),
+        ("against the seen centreline", SEEN, [instant.errors["seen"] for instant in run.instants]),
+        ("against the truth", TRUTH, [instant.errors["truth"] for instant in run.instants]),
     ):
         mean = float(np.nanmean(errors))
         plot.plot(times, errors, color=colour, linewidth=1.2, label=f"{label}, mean {mean:.2f}")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.parameters import with_stiffness_over_drag
-from magnetosuture_thread.calibration.passage import Passage, passage_of
+from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.model.predictor import NeedlePose
@@ -68,8 +68,8 @@ def noisy(sights: tuple[Observation, ...], noise: float, seed: int = 1) -> Itera
         turn = noise / 7e-3 * rng.standard_normal()
         x, y = sight.heading
         heading = np.array([x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn)])
-        seen = np.vstack([tail, sight.seen[1:] + noise * rng.standard_normal((len(sight.seen) - 1, 2))])
-        yield replace(sight, tail=tail, heading=heading, seen=seen)
+        seen = np.vstack([tail, sight.measured[1:] + noise * rng.standard_normal((len(sight.measured) - 1, 2))])
+        yield replace(sight, tail=tail, heading=heading, measured=seen)
 
 
 def model_run(
@@ -90,10 +90,10 @@ def model_run(
 
 def rig_passage(
     ratio: float, noise: float = 0.0, phase: float = 0.0, clamped: bool = False, name: str = "run"
-) -> Passage:
+) -> RecordedRun:
     """Return a run of the rig as a passage."""
     sights = rig_run(ratio, phase=phase, clamped=clamped)
-    return passage_of(name, noisy(sights, noise) if noise else sights, SETTINGS)
+    return read_run(name, noisy(sights, noise) if noise else sights, SETTINGS)
 
 
 def stiff(ratio: float, settings: ThreadModelSettings = SETTINGS) -> ThreadModelSettings:

@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 
+from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table, to_yaml
 from magnetosuture_thread.calibration.parameters import (
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,
-    chosen,
+    choose_parameters,
     known_settings,
     stiffness_over_drag,
     with_stiffness_over_drag,
@@ -24,8 +25,6 @@ from magnetosuture_thread.calibration.result import (
     CalibrationResult,
     Estimate,
 )
-from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
-from magnetosuture_thread.calibration.yaml_text import to_yaml
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import load_setup
@@ -58,11 +57,14 @@ def test_only_the_ratio_of_stiffness_and_drag_counts():
 
 
 def test_names_of_settings_are_checked():
-    assert chosen("rod", ["attachment"]) == ((), True)
-    assert [parameter.name for parameter in chosen("rod", ["attachment_offset"])[0]] == ["offset along", "offset left"]
+    assert choose_parameters("rod", ["attachment"]) == ((), True)
+    assert [parameter.name for parameter in choose_parameters("rod", ["attachment_offset"])[0]] == [
+        "offset along",
+        "offset left",
+    ]
     assert known_settings("paper") == ("paper_damping", "paper_stiffness_weight")
     with pytest.raises(ConfigurationError, match="did you mean drag_anisotropy"):
-        chosen("rod", ["drag_anisotopy"])
+        choose_parameters("rod", ["drag_anisotopy"])
 
 
 def found(**changes: Any) -> CalibrationResult:

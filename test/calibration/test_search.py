@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from magnetosuture_thread.calibration.fit import local_minima
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
-from magnetosuture_thread.calibration.passage import passage_of
-from magnetosuture_thread.calibration.replays import Best
+from magnetosuture_thread.calibration.recorded_run import read_run
+from magnetosuture_thread.calibration.residuals import BestSettings
 from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, CalibrationResult, Estimate
-from magnetosuture_thread.calibration.search import calibrate, unfinished
-from magnetosuture_thread.calibration.starts import local_minima
+from magnetosuture_thread.calibration.search import calibrate, unfinished_result
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from test.calibration.runs import SETTINGS, SILK, model_run, noisy, rig_passage, rig_run, stiff
@@ -77,7 +77,7 @@ def test_the_attachment_can_be_asked_for_alone():
 @pytest.mark.parametrize("noise", [0.0, 4e-5])
 def test_of_silk_the_stiffness_cannot_be_told(noise: float):
     sights = model_run(SILK, 8.0, scale=0.04, period=40.0)
-    passage = passage_of("silk", noisy(sights, noise) if noise else sights, SILK)
+    passage = read_run("silk", noisy(sights, noise) if noise else sights, SILK)
     found, _ = calibrate([passage], SILK, ["elastic_modulus", "drag_anisotropy"])
     stiffness = of(found, "stiffness over drag")
     assert stiffness.status == FIXED
@@ -89,7 +89,7 @@ def test_of_silk_the_stiffness_cannot_be_told(noise: float):
 def test_what_the_set_up_says_gives_way_where_it_predicts_worse_though_it_cannot_be_told():
     sights = model_run(SILK, 8.0, scale=0.012, period=12.0)
     found, _ = calibrate(
-        [passage_of("silk", sights, SILK)], stiff(100.0 * stiffness_over_drag(SILK), SILK), ["elastic_modulus"]
+        [read_run("silk", sights, SILK)], stiff(100.0 * stiffness_over_drag(SILK), SILK), ["elastic_modulus"]
     )
     stiffness = of(found, "stiffness over drag")
     assert stiffness.status == "stand-in"
@@ -99,7 +99,7 @@ def test_what_the_set_up_says_gives_way_where_it_predicts_worse_though_it_cannot
 
 def test_what_the_model_itself_made_is_found_exactly():
     true = replace(stiff(2.0 * TRUE), drag_anisotropy=0.65, rest_curvature=20.0)
-    passage = passage_of("run", model_run(true), SETTINGS)
+    passage = read_run("run", model_run(true), SETTINGS)
     found, _ = calibrate([passage], SETTINGS, ["elastic_modulus", "drag_anisotropy", "rest_curvature"])
     assert of(found, "stiffness over drag").value == pytest.approx(2.0 * TRUE, rel=0.02)
     assert of(found, "drag anisotropy").value == pytest.approx(0.65, rel=0.02)
@@ -109,7 +109,7 @@ def test_what_the_model_itself_made_is_found_exactly():
 
 def test_the_paper_s_numbers_are_fitted_too():
     settings = replace(SETTINGS, formulation="paper", paper_damping=0.999)
-    found, _ = calibrate([passage_of("run", rig_run(TRUE, 4.5), settings)], settings, ["paper_damping"])
+    found, _ = calibrate([read_run("run", rig_run(TRUE, 4.5), settings)], settings, ["paper_damping"])
     assert [estimate.setting for estimate in found.estimates] == ["paper_damping"]
     assert found.scores[0].after < found.scores[0].before - 1.0
 
@@ -118,7 +118,7 @@ def test_an_interrupted_search_has_its_best():
     class InterruptError(Exception):
         pass
 
-    best, passage = Best(), rig_passage(TRUE)
+    best, passage = BestSettings(), rig_passage(TRUE)
 
     def stop(share: float) -> None:
         if best.replays > 18:
@@ -126,7 +126,7 @@ def test_an_interrupted_search_has_its_best():
 
     with pytest.raises(InterruptError):
         calibrate([passage], stiff(5.0 * TRUE), best=best, progress=stop)
-    found, fits = unfinished([passage], stiff(5.0 * TRUE), best)
+    found, fits = unfinished_result([passage], stiff(5.0 * TRUE), best)
     assert not found.finished
     assert found.error < found.scores[0].before
     assert found.error == pytest.approx(best.error)

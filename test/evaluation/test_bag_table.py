@@ -10,7 +10,9 @@ import math
 import pytest
 from rich.console import Console
 
-from magnetosuture_thread.evaluation.bag_table import (
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles
+from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures
+from magnetosuture_thread.evaluation.tables import (
     COLUMNS,
     TIMES,
     Row,
@@ -20,8 +22,6 @@ from magnetosuture_thread.evaluation.bag_table import (
     table_csv,
     table_json,
 )
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles
-from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures
 
 ERROR = {"count": 9, "mean": 0.1 + 0.2, "median": 0.2, "p99": 0.5, "maximum": 0.75}
 FIGURES = BagFigures(
@@ -31,7 +31,7 @@ FIGURES = BagFigures(
     error={"truth": ERROR, "seen": None},
     recorded_error={"truth": ERROR},
     target="truth",
-    seen_share=1.0,
+    measured_share=1.0,
     strain=math.nan,
     residual=1e-9,
     minimum={"obstacle": MinimumMargin("obstacle", -2e-6, 7, 0, 1.5)},

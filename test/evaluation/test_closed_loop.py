@@ -8,7 +8,7 @@ from types import SimpleNamespace as Fake
 import pytest
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.evaluation.closed_loop import LoopCollector
+from magnetosuture_thread.evaluation.graph_outputs import LoopCollector
 
 LENGTH = 0.007
 

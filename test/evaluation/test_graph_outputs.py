@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, ReplaySummary, stage_latencies
-from magnetosuture_thread.evaluation.metrics import Percentiles, error_figures
+from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, ReplaySummary
+from magnetosuture_thread.evaluation.metrics import Percentiles, error_figures, stage_latencies
 from magnetosuture_thread.evaluation.tables import summary_table
 
 
@@ -71,9 +71,9 @@ def test_messages_of_one_stamp_are_put_together():
     collector.add("/thread/margins", margins(9 * 10**9, -7.0, valid=False))
     metrics, instants = collector.metrics(start=10**9), collector.frames()
     assert [instant.stamp for instant in instants] == [10**9, 2 * 10**9, 3 * 10**9]
-    assert [instant.error_seen for instant in instants] == pytest.approx([1.0] * 3)
-    assert instants[1].error_truth == pytest.approx(2.0)
-    assert np.isnan(instants[0].error_truth)
+    assert [instant.errors["seen"] for instant in instants] == pytest.approx([1.0] * 3)
+    assert instants[1].errors["truth"] == pytest.approx(2.0)
+    assert np.isnan(instants[0].errors["truth"])
     assert instants[0].strain == pytest.approx(0.002)
     assert instants[0].clearance.tolist() == [np.inf, np.inf, np.inf, 0.5, np.inf]
     assert metrics.contact_frames == 1
@@ -87,7 +87,7 @@ def test_a_command_counts_as_driven_only_if_it_was_followed():
     collector = GraphCollector(length=1.0)
     collector.add("/coils/currents", Message(header=header(7), command=header(5).stamp, stop=""))
     collector.add("/coils/currents", Message(header=header(8), command=header(6).stamp, stop="no command for 0.2 s"))
-    assert collector.driven == {5}
+    assert collector.applied == {5}
 
 
 def test_the_last_word_of_every_node_is_kept():
@@ -101,7 +101,7 @@ def test_the_last_word_of_every_node_is_kept():
 def test_latencies_pair_stamps():
     published = {"camera/image_raw/compressed": {1: 0.0, 2: 1.0}, "needle/servo_cv": {1: 0.5}}
     arrived = {"needle/measured_cp": {1: 0.01, 2: 1.03}, "thread/predicted": {2: 1.04}, "coils/currents": {7: 0.1}}
-    found = stage_latencies(published, arrived, driven={1})
+    found = stage_latencies(published, arrived, applied={1})
     pose, step = found["frame to needle pose"], found["pose to prediction"]
     assert pose is not None
     assert step is not None

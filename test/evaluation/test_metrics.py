@@ -120,7 +120,7 @@ def test_a_prediction_of_another_number_of_nodes_is_compared_too():
     line = np.column_stack([-np.linspace(0.0, 1.0, 9), np.zeros(9)])
     for k, nodes in enumerate((5, 5, 9)):
         vertices = np.column_stack([-np.linspace(0.0, 1.0, nodes), np.full(nodes, 0.01 * nodes)])
-        run.add(FrameResult(k, vertices, seen=line if nodes == 5 else np.empty((0, 2)), truth=line))
+        run.add(FrameResult(k, vertices, measured=line if nodes == 5 else np.empty((0, 2)), ground_truth=line))
     assert run.series.column("error_truth") == pytest.approx([5.0, 5.0, 9.0])
 
 

@@ -26,7 +26,7 @@ def run(clearance: float) -> RunMetrics:
     margins = Margins((BarrierMargins("obstacle", nodes, obstacles, distances, distances),))
     for k in (1, 2):
         seen = NODES + np.array([0.0, 0.0004 * k])
-        frame = FrameResult(k * 10**9, NODES, strain=1e-6, margins=margins, seen=seen, tail=NODES[0], heading=0.0)
+        frame = FrameResult(k * 10**9, NODES, strain=1e-6, margins=margins, measured=seen, tail=NODES[0], heading=0.0)
         metrics.add(frame)
     return metrics
 

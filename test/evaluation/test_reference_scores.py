@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.case_plot import draw_case
+from magnetosuture_thread.evaluation.plots import draw_case
 from magnetosuture_thread.evaluation.reference import read_reference
 from magnetosuture_thread.evaluation.reference_scores import (
     CaseResult,

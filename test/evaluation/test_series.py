@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.evaluation.series import TimeSeries, thinned, with_gaps
+from magnetosuture_thread.evaluation.frames import TimeSeries
+from magnetosuture_thread.evaluation.report.page import thinned, with_gaps
 
 
 def test_what_is_not_named_is_nan():

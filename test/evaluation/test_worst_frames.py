@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.evaluation.frames import FrameResult
-from magnetosuture_thread.evaluation.series import BIN, WorstFrames
+from magnetosuture_thread.evaluation.frames import BIN, FrameResult, WorstFrames
 
 
 def test_they_are_the_worst_first_and_apart():

@@ -81,11 +81,11 @@ def test_sights_of_poses_hold_what_was_recorded(pose_bag: Path, straight_pull: R
         tail, _, thread = straight_pull.at(k / 30.0)
         assert np.linalg.norm(sight.tail - tail) < 6e-5
         assert np.linalg.norm(sight.heading) == pytest.approx(1.0, abs=1e-12)
-        assert sight.seen.shape == (64, 2)
-        assert np.array_equal(sight.seen[0], sight.tail)
-        assert np.abs(sight.seen[-1] - thread[-1]).max() < 6e-5
-        assert sight.truth.shape == (51, 2)
-        assert np.allclose(sight.truth[0], tail, atol=1e-12)
+        assert sight.measured.shape == (64, 2)
+        assert np.array_equal(sight.measured[0], sight.tail)
+        assert np.abs(sight.measured[-1] - thread[-1]).max() < 6e-5
+        assert sight.ground_truth.shape == (51, 2)
+        assert np.allclose(sight.ground_truth[0], tail, atol=1e-12)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
 
@@ -98,8 +98,8 @@ def test_sights_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_p
     assert [bool(s.reason) for s in seen] == [True] * 2 + [False] * 28
     for k, sight in enumerate(seen[2:], 2):
         assert np.linalg.norm(sight.tail - straight_pull.at(k / 30.0)[0]) < 1e-4
-        assert sight.seen.shape == (64, 2)
-        assert sight.truth.shape == (51, 2)
+        assert sight.measured.shape == (64, 2)
+        assert sight.ground_truth.shape == (51, 2)
         assert sight.processing > 0.0
 
 
@@ -255,7 +255,7 @@ def test_poses_may_wait_for_their_thread(pose_bag: Path):
     """The thread is seen late: poses before are answered, and not predicted."""
     recording = Recording(Bag(pose_bag))
     seen = list(read_observations(recording, SETUP))
-    late = [replace(s, seen=np.empty((0, 2))) if k < 5 else s for k, s in enumerate(seen)]
+    late = [replace(s, measured=np.empty((0, 2))) if k < 5 else s for k, s in enumerate(seen)]
     steps = list(predictions(late, SETUP.model, SETUP.scene))
     assert [step.outcome.waiting for step in steps] == [True] * 5 + [False] * 25
     assert steps[5].outcome.stamp == steps[5].sight.stamp == seen[5].stamp

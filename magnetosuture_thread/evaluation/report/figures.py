@@ -1,4 +1,4 @@
-"""The figures of one evaluated bag, and the facts about it."""
+"""The figures of one evaluated bag, the facts about it, and the headlines that grade them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
+from magnetosuture_thread.model.margins import SOLID
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
+GOOD, MIDDLING, BAD, NONE = "good", "middling", "bad", "none"
+CLOSE, FAIR = 1.0, 5.0  # % of the length
+EXACT = 1e-3  # of a segment's length: what the solvers' tolerance leaves
+TOUCH = 1e-6  # m; a node this deep in an obstacle still counts as touching it
+
+AGAINST = {"truth": "the truth", "seen": "the seen centreline"}
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class BagFigures:
         error: prediction error by `truth` and `seen`: count, mean, median, p99, maximum [% of length]; None for none.
         recorded_error: the same of the predictions that the bag holds; empty without any.
         target: what the worst frames are compared with, `truth` or `seen`; empty if nothing could be scored.
-        seen_share: part of the thread's length that is seen, mean over the predicted frames.
+        measured_share: part of the thread's length that is measured, mean over the predicted frames.
         strain: greatest absolute strain of a segment.
         residual: greatest scaled residual of a solve.
         minimum: minimum margin of each kind.
@@ -54,7 +61,7 @@ class BagFigures:
     error: Mapping[str, Mapping[str, float] | None]
     recorded_error: Mapping[str, Mapping[str, float] | None]
     target: str
-    seen_share: float
+    measured_share: float
     strain: float
     residual: float
     minimum: Mapping[str, MinimumMargin]
@@ -80,7 +87,7 @@ class BagFigures:
             error=metrics.errors(),
             recorded_error=metrics.errors("recorded_error"),
             target=metrics.target,
-            seen_share=metrics.mean("seen_share"),
+            measured_share=metrics.mean("seen_share"),
             strain=metrics.maximum("strain"),
             residual=metrics.maximum("residual"),
             minimum=metrics.minimum_margins,
@@ -135,3 +142,163 @@ class BagDetails:
     settings: tuple[tuple[str, str, str], ...] = ()
     remarks: tuple[str, ...] = ()
     software: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Headline:
+    """One figure of the page's head.
+
+    Attributes:
+        name: of the figure.
+        value: with its unit.
+        detail: more of it.
+        grade: `good`, `middling`, `bad` or `none`.
+        assessment: in plain words.
+    """
+
+    name: str
+    value: str
+    detail: str
+    grade: str
+    assessment: str
+
+
+def headlines(about: BagDetails, figures: BagFigures) -> list[Headline]:
+    """Return the figures of the page's head, in their order."""
+    return [
+        *(_error(about, figures, target) for target in AGAINST if target in figures.error),
+        _frames(figures),
+        _margin(about, figures),
+        _strain(figures),
+        _duration("model step", figures.step_time, figures.interval, "one step of the thread model"),
+        *(
+            [_duration("tracker", figures.processing, figures.interval, "one camera frame")]
+            if figures.processing
+            else []
+        ),
+        _latency(figures),
+    ]
+
+
+def _grade(value: float, *grades: tuple[float, str, str]) -> tuple[str, str]:
+    """Return grade and words of the first upper limit that a value keeps."""
+    return next((grade, words) for limit, grade, words in grades if value <= limit)
+
+
+def _error(about: BagDetails, figures: BagFigures, target: str) -> Headline:
+    name = f"error against {AGAINST[target]}"
+    found = figures.error[target]
+    if found is None:
+        missing = "not in this bag" if target == "truth" else "no frame shows half of the thread"
+        return Headline(name, "none", missing, NONE, "not scored")
+    grades = ((CLOSE, GOOD, "close"), (FAIR, MIDDLING, "off, but usable"), (math.inf, BAD, "far off"))
+    millimetres = format_number(10.0 * found["mean"] * about.length)
+    detail = f"mean over {_frames_of(found['count'])}; {millimetres} mm. Greatest {format_number(found['maximum'])} %"
+    return Headline(name, f"{format_number(found['mean'])} %", detail, *_grade(found["mean"], *grades))
+
+
+def _frames_of(count: float) -> str:
+    return "1 frame" if count == 1 else f"{count:.0f} frames"
+
+
+def _frames(figures: BagFigures) -> Headline:
+    share = figures.predicted / figures.frames if figures.frames else 0.0
+    grades = ((-0.95, GOOD, "nearly all"), (-0.5, MIDDLING, "with gaps"), (0.0, BAD, "few"))
+    detail = f"{100.0 * share:.1f} %; needle found in {figures.tracked}"
+    return Headline("frames predicted", f"{figures.predicted} of {figures.frames}", detail, *_grade(-share, *grades))
+
+
+def _margin(about: BagDetails, figures: BagFigures) -> Headline:
+    """Return the least margin: of something solid where all barriers hold, else the one that is broken most."""
+    minima = figures.minimum.values()
+    if not minima:
+        return Headline("least margin", "none", "no prediction converged", NONE, "not known")
+    broken = [least.kind.replace("_", " ") for least in minima if not _holds(about, least)]
+    worst = min(minima, key=lambda least: least.clearance - _min_clearance(about, least))
+    if not broken:
+        worst = min((least for least in minima if least.kind in SOLID), key=lambda m: m.clearance, default=worst)
+    touching = f"; touches in {_frames_of(figures.contact_frames)}" if figures.contact_frames else ""
+    name = f"least margin, {worst.kind.replace('_', ' ')}"
+    detail = f"at {worst.time:.2f} s, node {worst.node}{touching}"
+    grade, words = (BAD, f"broken: {', '.join(broken)}") if broken else (GOOD, "every barrier holds")
+    return Headline(name, micrometres(worst.clearance), detail, grade, words)
+
+
+def _min_clearance(about: BagDetails, least: MinimumMargin) -> float:
+    """Return what a margin may be at the least, within the solvers' tolerance [m]."""
+    return -TOUCH if least.kind in SOLID else -EXACT * about.length / max(about.segments, 1)
+
+
+def _holds(about: BagDetails, least: MinimumMargin) -> bool:
+    return least.clearance >= _min_clearance(about, least)
+
+
+def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
+    """Return in words whether a barrier held."""
+    if not _holds(about, margin):
+        return "broken"
+    return "holds" if margin.clearance >= -1e-9 else "holds within the tolerance"
+
+
+def _strain(figures: BagFigures) -> Headline:
+    name, detail = "greatest stretch", "of a segment, either way"
+    if not math.isfinite(figures.strain):
+        return Headline(name, "none", detail, NONE, "not known")
+    grades = (
+        (EXACT, GOOD, "inextensible"),
+        (10.0 * EXACT, MIDDLING, "more than 0.1 %"),
+        (math.inf, BAD, "more than 1 %"),
+    )
+    return Headline(name, f"{format_number(100.0 * figures.strain)} %", detail, *_grade(figures.strain, *grades))
+
+
+def _duration(name: str, found: Percentiles | None, interval: float, detail: str) -> Headline:
+    if found is None:
+        return Headline(f"{name}, median", "none", detail, NONE, "not known")
+    grade, words = NONE, "frame rate not known"
+    if math.isfinite(interval) and interval > 0.0:
+        grade, words = _grade(
+            found.p99 / interval,
+            (0.5, GOOD, f"keeps up with {1.0 / interval:.3g} frames/s"),
+            (1.0, MIDDLING, "just keeps up"),
+            (math.inf, MIDDLING, "slower than the frames, on this machine"),
+        )
+    detail = f"{detail}; 99th percentile {milliseconds(found.p99)}"
+    return Headline(f"{name}, median", milliseconds(found.median), detail, grade, words)
+
+
+def _latency(figures: BagFigures) -> Headline:
+    name, live = "latency, frame to prediction", figures.live
+    found = live.latency.get("frame to prediction")
+    if found is None:
+        return Headline(name, "none", "measured only where the running graph was recorded", NONE, live.remark)
+    detail = f"median; 99th percentile {milliseconds(found.p99)}"
+    soon = found.p99 <= 2.0 * figures.interval
+    grade, words = (GOOD, "within two frames") if soon else (MIDDLING, "longer than two frames")
+    return Headline(name, milliseconds(found.median), detail, grade, words)
+
+
+def format_number(value: float) -> str:
+    """Return a number with three figures, never in powers of ten unless it is very small or large."""
+    if not math.isfinite(value):
+        return "none"
+    if value == 0.0:
+        return "0"
+    size = math.floor(math.log10(abs(value)))
+    if not -5 <= size < 6:
+        return f"{value:.1e}"
+    return f"{value:.{max(0, 2 - size)}f}"
+
+
+def milliseconds(seconds: float) -> str:
+    """Return a time in ms."""
+    return f"{format_number(1e3 * seconds)} ms"
+
+
+def micrometres(metres: float) -> str:
+    """Return a margin in the unit that suits it; what is 0 within the solvers' tolerance is written so."""
+    if abs(metres) <= 1e-9:
+        return "0 µm"
+    if abs(metres) >= 1e-4:
+        return f"{format_number(1e3 * metres)} mm"
+    return f"{format_number(1e6 * metres)} µm"

@@ -7,22 +7,19 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
-from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.frames import WorstFrame
 from magnetosuture_thread.evaluation.metrics import node_errors, target_points
-from magnetosuture_thread.evaluation.plots import INK, TRUTH, draw_threads
-from magnetosuture_thread.evaluation.report.headlines import AGAINST, format_number
-from magnetosuture_thread.evaluation.series import WorstFrame
+from magnetosuture_thread.evaluation.plots import INK, TRUTH, draw_scale_bar, draw_threads, look_at
+from magnetosuture_thread.evaluation.report.figures import AGAINST, format_number
 from magnetosuture_thread.geometry.camera import DishView
 
 PLAN = 620  # px; side of a plan
 DISH_SHARE = 0.94  # of a plan's side
 CLOSE_UP = 0.08  # of the thread's length: half of the side of what is magnified
-BARS = (0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)  # m
 OUTSIDE = "#d5d9dd"  # of what the picture is cut from
 QUALITY = 84  # of the JPEG
 
@@ -47,13 +44,13 @@ class ReportPicture:
     Attributes:
         worst: what is shown.
         source: the picture as a data URI.
-        words: what it shows, for who does not see it.
+        alt_text: what it shows, in words.
         is_plan: whether it is a plan and no camera frame.
     """
 
     worst: WorstFrame
     source: str
-    words: str
+    alt_text: str
     is_plan: bool
 
 
@@ -78,31 +75,33 @@ def draw_worst_frame(
     """
     shown = photo or _plan(dish_diameter)
     frame = worst.frame
-    curve = frame.truth if target == "truth" else frame.seen
-    targets = target_points([curve], length, len(frame.vertices) - 1)[0][0]
+    targets = target_points([frame.target_curve(target)], length, len(frame.vertices) - 1)[0][0]
     errors = node_errors(frame.vertices, targets, length)
     node = int(np.nanargmax(errors)) + 1
     figure = Figure(figsize=(12.0, 5.95), dpi=100, facecolor="#888e94")
     scene, close = (figure.add_axes((left, 0.0, 0.4985, 1.0)) for left in (0.0, 0.5015))
     ends = np.vstack([frame.vertices[node], targets[node - 1]])
     half = max(CLOSE_UP * length, 0.0075 * length * float(np.nanmax(errors)))
+    middle = shown.view.to_pixels(np.zeros(2))
     for axes, magnified in ((scene, 1.0), (close, 1.8)):
         axes.set_facecolor(OUTSIDE)
         draw_threads(axes, shown.image, shown.view, frame, frame.obstacles, magnified)
-        _draw_truth(axes, shown.view, frame, magnified)
+        if len(frame.ground_truth) > 1:
+            points = shown.view.to_pixels(frame.ground_truth).T
+            axes.plot(*points, color=TRUTH, linewidth=1.3 * magnified, linestyle=(0, (4, 2.5)))
         if photo is None:
-            _draw_rim(axes, shown.view, dish_diameter)
-        for spine in axes.spines.values():
-            spine.set_visible(False)
+            radius = 0.5 * dish_diameter / shown.view.metres_per_pixel
+            axes.add_patch(Circle(tuple(middle), radius, fill=False, color=INK, linewidth=1.6))
     height, width = shown.image.shape[:2]
-    middle, radius = shown.view.to_pixels(np.zeros(2)), 0.5 * min(height, width)
-    _look_at(scene, np.clip(middle, radius - 0.5, [width - radius - 0.5, height - radius - 0.5]), radius)
+    half_side = 0.5 * min(height, width)
+    look_at(scene, np.clip(middle, half_side - 0.5, [width - half_side - 0.5, height - half_side - 0.5]), half_side)
     at = shown.view.to_pixels(ends.mean(axis=0))
-    _look_at(close, at, half / shown.view.metres_per_pixel)
+    look_at(close, at, half / shown.view.metres_per_pixel)
     side = 2.0 * half / shown.view.metres_per_pixel
-    scene.add_patch(_box(at, side))
+    corner = (at[0] - 0.5 * side, at[1] - 0.5 * side)
+    scene.add_patch(Rectangle(corner, side, side, fill=False, color=INK, linewidth=1.0, linestyle=(0, (3, 2))))
     for axes, share in ((scene, 0.25), (close, 0.4)):
-        _draw_bar(axes, shown.view, share)
+        draw_scale_bar(axes, shown.view, share)
     marked = shown.view.to_pixels(ends)
     close.plot(marked[:, 0], marked[:, 1], color="#c8102e", linewidth=1.6)
     kind = "Plan of the dish" if photo is None else "Simulated camera frame" if simulated else "Camera frame"
@@ -121,43 +120,6 @@ def _plan(dish_diameter: float) -> Photo:
     middle = 0.5 * (PLAN - 1.0)
     view = DishView((middle, middle), dish_diameter / (DISH_SHARE * PLAN))
     return Photo(np.full((PLAN, PLAN), 244, np.uint8), view)
-
-
-def _draw_truth(axes: Axes, view: DishView, frame: FrameResult, magnified: float) -> None:
-    if len(frame.truth) > 1:
-        truth = view.to_pixels(frame.truth)
-        axes.plot(truth[:, 0], truth[:, 1], color=TRUTH, linewidth=1.3 * magnified, linestyle=(0, (4, 2.5)))
-
-
-def _draw_rim(axes: Axes, view: DishView, dish_diameter: float) -> None:
-    centre = view.to_pixels(np.zeros(2))
-    radius = 0.5 * dish_diameter / view.metres_per_pixel
-    axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, color=INK, linewidth=1.6))
-
-
-def _look_at(axes: Axes, centre: NDArray[np.float64], half: float) -> None:
-    axes.set_xlim(centre[0] - half, centre[0] + half)
-    axes.set_ylim(centre[1] + half, centre[1] - half)
-
-
-def _box(centre: NDArray[np.float64], side: float) -> Rectangle:
-    corner = (centre[0] - 0.5 * side, centre[1] - 0.5 * side)
-    return Rectangle(corner, side, side, fill=False, color=INK, linewidth=1.0, linestyle=(0, (3, 2)))
-
-
-def _draw_bar(axes: Axes, view: DishView, share: float) -> None:
-    """Draw a scale bar of a round length, at most a share of the picture's width."""
-    left, right = axes.get_xlim()
-    low, high = axes.get_ylim()
-    fitting = [bar for bar in BARS if bar / view.metres_per_pixel <= share * (right - left)]
-    bar = fitting[-1] if fitting else BARS[0]
-    x, y = left + 0.04 * (right - left), low + 0.04 * (high - low)
-    axes.plot([x, x + bar / view.metres_per_pixel], [y, y], color="white", linewidth=6.0, solid_capstyle="butt")
-    axes.plot([x, x + bar / view.metres_per_pixel], [y, y], color=INK, linewidth=3.0, solid_capstyle="butt")
-    box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
-    axes.text(
-        x, y + 0.015 * (high - low), f"{1e3 * bar:g} mm", color=INK, fontsize=11, ha="left", va="bottom", bbox=box
-    )
 
 
 def _as_uri(figure: Figure) -> str:

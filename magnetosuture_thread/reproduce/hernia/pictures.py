@@ -16,8 +16,7 @@ from magnetosuture_thread.evaluation.plots import FAINT, INK, tidy
 from magnetosuture_thread.evaluation.scene_plot import shape_patch
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.friction import Friction, FrictionState, friction_colour
-from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredInstant
-from magnetosuture_thread.reproduce.hernia.steering import HerniaRun
+from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, SteeredInstant
 from magnetosuture_thread.scene import Scene
 
 FLOOR, RIM = "#f4f1ec", "#c9c3ba"
@@ -147,30 +146,28 @@ def draw_hernia_dish(axes: Axes, scene: Scene) -> None:
     axes.set_axis_off()
 
 
-def draw_thread(axes: Axes, instant: SteeredInstant, scale: float = 1.0) -> None:
+def draw_thread(axes: Axes, instant: SteeredInstant) -> None:
     """Draw the thread in the colour of its friction, and the needle as a point with what is asked of it."""
     points, friction = 1e3 * instant.prediction.positions, instant.margins.friction
     colour = friction_colour(friction)
-    axes.plot(points[:, 0], points[:, 1], color="white", linewidth=4.0 * scale, solid_capstyle="round", alpha=0.8)
-    axes.plot(points[:, 0], points[:, 1], color=colour, linewidth=2.0 * scale, solid_capstyle="round")
-    axes.plot(points[1:, 0], points[1:, 1], "o", color=colour, markersize=2.4 * scale, markeredgewidth=0.0)
+    axes.plot(points[:, 0], points[:, 1], color="white", linewidth=4.0, solid_capstyle="round", alpha=0.8)
+    axes.plot(points[:, 0], points[:, 1], color=colour, linewidth=2.0, solid_capstyle="round")
+    axes.plot(points[1:, 0], points[1:, 1], "o", color=colour, markersize=2.4, markeredgewidth=0.0)
     if friction.nodes:
         under = points[list(friction.nodes)]
-        axes.plot(
-            *under.T, "o", color=colour, markersize=4.6 * scale, markeredgecolor="white", markeredgewidth=0.7 * scale
-        )
+        axes.plot(*under.T, "o", color=colour, markersize=4.6, markeredgecolor="white", markeredgewidth=0.7)
     x, y = points[0]
     if instant.command is not None:
         for velocity, style in ((instant.command.commanded, (0, (1.5, 1.2))), (instant.command.filtered, "solid")):
             if velocity.any():
                 dx, dy = REACH * 1e3 * velocity
-                arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1 * scale, "linestyle": style}
+                arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "linestyle": style}
                 axes.annotate("", xy=(x + dx, y + dy), xytext=(x, y), arrowprops=arrow)
-    axes.plot([x], [y], "o", color=INK, markersize=5.0 * scale, markeredgecolor="white", markeredgewidth=0.8 * scale)
+    axes.plot([x], [y], "o", color=INK, markersize=5.0, markeredgecolor="white", markeredgewidth=0.8)
 
 
 def caption(instant: SteeredInstant) -> str:
-    """Say an instant for a person."""
+    """Return the state of friction at an instant in words."""
     friction = instant.margins.friction
     count = f"{len(friction.nodes)} node{'s' if len(friction.nodes) != 1 else ''}"
     return {

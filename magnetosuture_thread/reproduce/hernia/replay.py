@@ -17,7 +17,12 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.reproduce.hernia.pictures import draw_animation, draw_hernia
-from magnetosuture_thread.reproduce.hernia.steering import HerniaSummary, Steering, point_filter, replay_steering
+from magnetosuture_thread.reproduce.hernia.steering import (
+    HerniaSummary,
+    RecordedCommands,
+    point_filter,
+    replay_steering,
+)
 from magnetosuture_thread.setups import Setup, read_setup
 
 START_POINTS = 200  # of the centreline at the start
@@ -74,7 +79,7 @@ def replay_hernia(
     return summary
 
 
-def read_steering(bag: Bag) -> Steering:
+def read_steering(bag: Bag) -> RecordedCommands:
     """Return what an operator asked for in a bag, by the stamps.
 
     Raises:
@@ -91,7 +96,7 @@ def read_steering(bag: Bag) -> Steering:
         raise BagError(bag.path, f"holds no message on {OPERATOR_COMMAND.recorded}")
     if not (np.diff(times) >= 0.0).all():
         raise BagError(bag.path, f"has stamps on {OPERATOR_COMMAND.recorded} that do not rise")
-    return Steering(times, np.array(velocities))
+    return RecordedCommands(times, np.array(velocities))
 
 
 def start_centreline(setup: Setup) -> np.ndarray:
@@ -123,5 +128,5 @@ def hernia_lines(summary: HerniaSummary) -> list[str]:
         f"deepest node in an obstacle {summary.deepest:.1e} m, middle of a chord {1e6 * summary.chord_deepest:.0f} um, "
         f"greatest stretch {100.0 * summary.stretch:.4f} %",
         f"a step takes {1e3 * summary.median_step:.2f} ms (99th percentile {1e3 * summary.high_step:.2f}): "
-        f"{summary.room:.0f} times faster than its period",
+        f"{summary.real_time_factor:.0f} times faster than its period",
     ]

@@ -1,20 +1,27 @@
-"""A recorded steering, replayed in the model: every instant, and the figures of the whole run."""
+"""A thread that is steered in the model alone: the needle is a point, and goes as fast as the filter lets it.
+
+The loop itself, recorded commands replayed in it, and the figures of such a run.
+"""
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredInstant, SteeredThread
-from magnetosuture_thread.safety import NeedleSafetyFilter
+from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
 
 RATE = 33.0  # Hz, of the paper's simulation
@@ -22,11 +29,94 @@ COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil
 SHOWN = (0.0, 12.0, 17.0, 27.0, 35.0, 55.0)  # s; the six instants of the paper's figure
 FIRST_NODES = 5  # whose barriers the paper plots
 _MAX_DISTANCE = 1.0  # m; farther than any obstacle of a dish
+MAX_COMMAND = 1.0  # m/s; what commands more was meant in another unit
+_AHEAD = np.array([1.0, 0.0])  # a point has no heading, and a thread that turns freely asks for none
 
 
 @dataclass(frozen=True)
-class Steering:
-    """What an operator asked for.
+class SteeredInstant:
+    """A steered thread at one instant.
+
+    Attributes:
+        time: since the start [s].
+        prediction: of the thread.
+        margins: of the prediction.
+        command: that led here, filtered; None at the start.
+        took: wall-clock time of the whole step, filter, prediction and margins [s].
+    """
+
+    time: float
+    prediction: Prediction
+    margins: Margins
+    command: FilteredCommand | None
+    took: float
+
+
+class SteeredThread:
+    """The loop of an operator, the needle's filter and the thread, without a rig.
+
+        u_0 = filter(beta^count v_0),    x_0 <- x_0 + dt u_0,    then the thread's step
+
+    Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback". Deviation: the friction by which
+    v_0 is slowed is that of the thread where it is now, as in the source; the thread's step sees the needle where it
+    has moved to.
+
+    Args:
+        settings: of the thread among its obstacles.
+        centreline: where the thread lies at the start, from the needle on, shape (m, 2) [m].
+        needle: the filter of a needle that is a point.
+
+    Raises:
+        ConfigurationError: an obstacle cannot be used.
+        InvalidInputError: the thread cannot begin there.
+    """
+
+    def __init__(self, settings: ThreadModelSettings, centreline: Points, needle: NeedleSafetyFilter) -> None:
+        self._session = ThreadSession(replace(settings, initial_shape="measured"), needle.scene)
+        self._needle = needle
+        self._stamp = 0
+        self._tail = np.asarray(centreline[0], dtype=np.float64)
+        for _ in self._session.on_measured_thread(0, centreline):
+            pass
+        self.now = self._advance(None, 0.0)
+
+    def step(self, interval: float, commanded: NDArray[np.float64]) -> SteeredInstant:
+        """Move the needle as it is commanded, as far as it may, and let the thread follow.
+
+        Args:
+            interval: dt [s].
+            commanded: v_0, shape (2,) [m/s].
+
+        Raises:
+            InvalidInputError: the velocity is not finite, or beyond 1 m/s.
+            SolverError: a program had no solution, or its linearisation did not converge.
+        """
+        began = time.perf_counter()
+        if not (np.isfinite(commanded).all() and math.hypot(*commanded.tolist()) <= MAX_COMMAND):
+            expected = f"finite numbers, at most {MAX_COMMAND:g} m/s"
+            raise InvalidInputError("needle velocity", commanded.tolist(), expected)
+        slowdown = self.now.margins.friction.slowdown
+        command = self._needle.filter(commanded, self._tail, _AHEAD, slowdown=slowdown)
+        self._tail = self._tail + interval * command.filtered
+        self._stamp += round(interval * 1e9)
+        self.now = self._advance(command, began)
+        return self.now
+
+    def _advance(self, command: FilteredCommand | None, began: float) -> SteeredInstant:
+        outcome = self._session.on_pose(self._stamp, NeedlePose(self._stamp * 1e-9, self._tail, _AHEAD))
+        if outcome.problem is not None:
+            raise outcome.problem
+        prediction, margins = outcome.prediction, outcome.margins
+        assert prediction is not None
+        if margins is None:
+            raise SolverError(prediction.solver, prediction.status, prediction.residual, 0.0)
+        took = time.perf_counter() - began if command is not None else 0.0
+        return SteeredInstant(self._stamp * 1e-9, prediction, margins, command, took)
+
+
+@dataclass(frozen=True)
+class RecordedCommands:
+    """Velocity commands that an operator gave.
 
     Attributes:
         times: of each command, rising, shape (m,) [s].
@@ -84,13 +174,14 @@ class HerniaSummary:
     instants: tuple[dict[str, Any], ...]
 
     @property
-    def room(self) -> float:
+    def real_time_factor(self) -> float:
         """How many times the median step fits into its period."""
         return 1.0 / (self.rate * self.median_step)
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures, as JSON has them."""
-        return {**asdict(self), "room": self.room, "simulated": "the thread model alone, the needle a point"}
+        simulated = "the thread model alone, the needle a point"
+        return {**asdict(self), "room": self.real_time_factor, "simulated": simulated}
 
 
 @dataclass(frozen=True)
@@ -160,7 +251,7 @@ def point_filter(scene: Scene, keep_out: float, approach_rate: float) -> NeedleS
 def replay_steering(
     settings: ThreadModelSettings,
     centreline: Points,
-    steering: Steering,
+    commands: RecordedCommands,
     needle: NeedleSafetyFilter,
     progress: Callable[[float], None] = lambda share: None,
 ) -> HerniaRun:
@@ -169,7 +260,7 @@ def replay_steering(
     Args:
         settings: of thread and obstacles.
         centreline: where the thread lies at the start, from the needle on, shape (m, 2) [m].
-        steering: what was asked for.
+        commands: of the operator.
         needle: see `point_filter`.
         progress: called with the share done, 0 to 1.
 
@@ -179,7 +270,7 @@ def replay_steering(
         SolverError: a step had no solution.
     """
     around = Workspace(needle.scene.obstacles, _MAX_DISTANCE)
-    instants = list(_steps(SteeredThread(settings, centreline, needle), steering, progress))
+    instants = list(_steps(SteeredThread(settings, centreline, needle), commands, progress))
     radius, obstacles = 0.5 * settings.thread().diameter, len(around.shapes)
     barriers = np.array(
         [_distances(around, instant.prediction.positions[1 : 1 + FIRST_NODES], obstacles) for instant in instants]
@@ -189,11 +280,13 @@ def replay_steering(
     return HerniaRun(settings, needle.scene, instants, barriers - radius, depths)
 
 
-def _steps(thread: SteeredThread, steering: Steering, progress: Callable[[float], None]) -> Iterator[SteeredInstant]:
+def _steps(
+    thread: SteeredThread, commands: RecordedCommands, progress: Callable[[float], None]
+) -> Iterator[SteeredInstant]:
     yield thread.now
-    count = math.ceil((steering.duration + COMMAND_TIMEOUT) * RATE)
+    count = math.ceil((commands.duration + COMMAND_TIMEOUT) * RATE)
     for k in range(count):
-        yield thread.step(1.0 / RATE, steering.at(k / RATE))
+        yield thread.step(1.0 / RATE, commands.at(k / RATE))
         progress((k + 1) / count)
 
 

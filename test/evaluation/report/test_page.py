@@ -22,11 +22,9 @@ from matplotlib.image import imread
 
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
-from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures
-from magnetosuture_thread.evaluation.report.headlines import headlines
-from magnetosuture_thread.evaluation.report.page import write_page
+from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures, headlines
+from magnetosuture_thread.evaluation.report.page import page_data, write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, draw_worst_frame
-from magnetosuture_thread.evaluation.report.plots import page_data
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.margins import BarrierMargins, Margins
 
@@ -224,7 +222,7 @@ def test_a_picture_shows_frame_or_plan_and_says_what(view, with_frame: bool):
     assert image.shape == (595, 1200, 3)
     assert np.median(image) == pytest.approx(90 if with_frame else 244, abs=3)
     assert picture.is_plan != with_frame
-    assert picture.words.startswith("Camera frame at 9.97 s" if with_frame else "Plan of the dish at 9.97 s")
+    assert picture.alt_text.startswith("Camera frame at 9.97 s" if with_frame else "Plan of the dish at 9.97 s")
     assert len(data) < 300_000
 
 
@@ -292,10 +290,10 @@ def test_the_head_shows_the_margin_that_is_broken():
     broken = MinimumMargin("connectivity", -1e-4, 3, -1, 0.2)
     figures = replace(BagFigures.of(metrics), minimum={"connectivity": broken, "obstacle": holds})
     tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
-    assert (tile.name, tile.verdict) == ("least margin, connectivity", "broken: connectivity")
+    assert (tile.name, tile.assessment) == ("least margin, connectivity", "broken: connectivity")
     figures = replace(figures, minimum={"connectivity": replace(broken, clearance=0.0), "obstacle": holds})
     tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
-    assert (tile.name, tile.verdict) == ("least margin, obstacle", "every barrier holds")
+    assert (tile.name, tile.assessment) == ("least margin, obstacle", "every barrier holds")
 
 
 def test_one_frame_is_not_frames():
@@ -310,7 +308,7 @@ def test_a_rendered_frame_is_said_to_be_one(view):
         draw_worst_frame(worst, photo, target="truth", length=LENGTH, dish_diameter=0.035, simulated=simulated)
         for simulated in (True, False)
     ]
-    assert drawn_as[0].words.startswith("Simulated camera frame")
+    assert drawn_as[0].alt_text.startswith("Simulated camera frame")
     assert drawn_as[0].source != drawn_as[1].source
 
 

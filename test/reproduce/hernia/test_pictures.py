@@ -11,7 +11,7 @@ from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.reproduce.hernia.pictures import draw_animation, draw_hernia
-from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, Steering, point_filter, replay_steering
+from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, RecordedCommands, point_filter, replay_steering
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 
@@ -22,7 +22,7 @@ def run() -> HerniaRun:
     times = np.arange(60) / 20.0
     posts = tuple(SceneShape(f"post_{k}", "tissue", Disc((0.004, y), 0.001)) for k, y in enumerate((0.0018, -0.0018)))
     needle = point_filter(Scene(Dish(0.05), posts), 5e-4, 10.0)
-    return replay_steering(settings, line, Steering(times, np.tile([3e-3, 0.0], (60, 1))), needle)
+    return replay_steering(settings, line, RecordedCommands(times, np.tile([3e-3, 0.0], (60, 1))), needle)
 
 
 def test_picture_and_animation_show_the_run(tmp_path: Path):

@@ -10,8 +10,13 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.friction import FrictionState
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.reproduce.hernia.steered_thread import SteeredThread
-from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, Steering, point_filter, replay_steering
+from magnetosuture_thread.reproduce.hernia.steering import (
+    HerniaRun,
+    RecordedCommands,
+    SteeredThread,
+    point_filter,
+    replay_steering,
+)
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 # A gate of two discs with 1.6 mm between them, 4 mm ahead of the needle.
@@ -27,10 +32,10 @@ NEEDLE = point_filter(Scene(Dish(0.06), POSTS), 3e-4, 10.0)
 LINE = np.column_stack([-np.linspace(0.0, 0.019, 50), np.zeros(50)])
 
 
-def steering(*parts: tuple[float, float, float]) -> Steering:
+def steering(*parts: tuple[float, float, float]) -> RecordedCommands:
     """Return commands at 20 Hz: for each part a duration [s] and a velocity [m/s]."""
     velocities = [(x, y) for duration, x, y in parts for _ in range(round(20 * duration))]
-    return Steering(np.arange(len(velocities)) / 20.0, np.array(velocities))
+    return RecordedCommands(np.arange(len(velocities)) / 20.0, np.array(velocities))
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +83,7 @@ def test_the_barriers_are_those_of_the_first_nodes(through: HerniaRun):
 
 
 def test_a_command_holds_for_a_tenth_of_a_second():
-    given = Steering(np.array([1.0, 2.0]), np.array([[1.0, 0.0], [0.0, 2.0]]))
+    given = RecordedCommands(np.array([1.0, 2.0]), np.array([[1.0, 0.0], [0.0, 2.0]]))
     found = [given.at(time).tolist() for time in (0.9, 1.0, 1.1, 1.11, 2.05, 2.2)]
     assert found == [[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 2.0], [0.0, 0.0]]
 

@@ -6,27 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from numpy.typing import NDArray
 
-from magnetosuture_thread.calibration.replays import across
+from magnetosuture_thread.calibration.residuals import across_residuals
 from magnetosuture_thread.calibration.result import FIXED, BagFit, CalibrationResult, Estimate
-from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, tidy
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.evaluation.plots import FAINT, INK, INSTANTS, PREDICTED, WIDE, draw_instants, tidy
 from magnetosuture_thread.geometry.polyline import Points
 
-INSTANTS = 6
-AFTER = "#d1495b"
 BEFORE = "#b4bcc4"
 MIN_SHOWN = 1e-3  # % of length
-OBSTACLE = "#e9d8d3"
 CLOSE = 0.06  # of the length, within which a second instant gets no label
 
 
@@ -45,8 +37,7 @@ def draw_calibration(path: Path, calibration: CalibrationResult, fits: Sequence[
     title = f"{calibration.settings.material}, formulation {calibration.settings.formulation}: calibrated{state}"
     figure.text(0.02, 0.957, title, fontsize=14, color=INK, weight="bold")
     figure.text(0.02, 0.928, _summary(calibration), fontsize=10, color=INK)
-    scene = figure.add_axes((0.04, 0.075, 0.43, 0.80))
-    _draw_scene(scene, calibration, fits[worst])
+    _draw_scene(figure.add_axes((0.04, 0.075, 0.43, 0.80)), calibration, fits[worst])
     _draw_time(figure.add_axes((0.53, 0.655, 0.455, 0.225)), calibration, fits)
     _draw_along(figure.add_axes((0.53, 0.375, 0.455, 0.19)), calibration, fits)
     _draw_parameters(figure, calibration, (0.53, 0.045, 0.455, 0.25))
@@ -70,62 +61,47 @@ def _summary(calibration: CalibrationResult) -> str:
 
 def _draw_scene(axes: Axes, calibration: CalibrationResult, fit: BagFit) -> None:
     """Draw the thread as it was, as the set-up has it and as calibrated, at instants evenly over the bag."""
-    passage = fit.passage
-    whole = np.flatnonzero(passage.known.mean(axis=1) >= np.quantile(passage.known.mean(axis=1), 0.5))
+    run, length = fit.run, calibration.settings.thread_length
+    whole = np.flatnonzero(run.known.mean(axis=1) >= np.quantile(run.known.mean(axis=1), 0.5))
     chosen = whole[np.linspace(0, len(whole) - 1, min(INSTANTS, len(whole))).astype(int)]
-    for shape in passage.scene.obstacles if passage.scene is not None else ():
-        if isinstance(shape, Disc):
-            centre, radius = (1e3 * shape.centre[0], 1e3 * shape.centre[1]), 1e3 * shape.radius
-            axes.add_patch(Circle(centre, radius, facecolor=OBSTACLE, edgecolor=INK, linewidth=0.8))
-    axes.plot(1e3 * passage.tails[:, 0], 1e3 * passage.tails[:, 1], color=FAINT, linewidth=0.7, alpha=0.5)
-    names = {"seen": "seen by the camera", "truth": "the truth"}
+    styles = [
+        ("seen by the camera" if run.against == "seen" else "the truth", {**WIDE, "linewidth": 6.0}),
+        ("as the set-up has it", {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2))}),
+        ("calibrated", {"color": PREDICTED, "linewidth": 1.4}),
+    ]
     labelled: list[Points] = []
-    for index, k in enumerate(chosen):
-        tail = passage.tails[passage.frames[k]]
-        target = 1e3 * np.vstack([tail, passage.targets[k]])
-        labels = (names[passage.against], "as the set-up has it", "calibrated") if index == 0 else (None,) * 3
-        wide: dict[str, Any] = {"color": SEEN, "linewidth": 6.0, "alpha": 0.35, "solid_capstyle": "round"}
-        axes.plot(target[:, 0], target[:, 1], label=labels[0], **wide)
-        before, after = 1e3 * fit.before[k], 1e3 * fit.after[k]
-        axes.plot(before[:, 0], before[:, 1], color=INK, linewidth=0.9, linestyle=(0, (4, 2)), label=labels[1])
-        axes.plot(after[:, 0], after[:, 1], color=AFTER, linewidth=1.4, label=labels[2])
-        axes.plot(1e3 * tail[0], 1e3 * tail[1], "o", color=INK, markersize=4)
-        if all(float(np.linalg.norm(tail - other)) > CLOSE * calibration.settings.thread_length for other in labelled):
+    instants = []
+    for k in chosen:
+        tail, label = run.tails[run.frames[k]], ""
+        if all(float(np.linalg.norm(tail - other)) > CLOSE * length for other in labelled):
             labelled.append(tail)
-            text = f"{passage.times[k]:.0f} s"
-            axes.annotate(text, 1e3 * tail, xytext=(5, 4), textcoords="offset points", fontsize=8, color=INK)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x [mm]", color=INK)
-    axes.set_ylabel("y [mm]", color=INK)
-    score = next(score for score in calibration.scores if score.name == passage.name)
-    title = f"{Path(passage.name).name}, the bag with the greatest error: {score.after:.2f} %"
-    if len(calibration.scores) == 1:
-        title = Path(passage.name).name
-    axes.set_title(title, fontsize=10, color=INK, loc="left")
-    axes.legend(loc="best", fontsize=8.5, frameon=True, framealpha=0.8, edgecolor="none")
-    tidy(axes)
+            label = f"{run.times[k]:.0f} s"
+        instants.append((label, (np.vstack([tail, run.targets[k]]), fit.before[k], fit.after[k])))
+    draw_instants(axes, run.tails, run.scene.obstacles if run.scene is not None else (), styles, instants)
+    name = Path(run.name).name
+    if len(calibration.scores) > 1:
+        score = next(score for score in calibration.scores if score.name == run.name)
+        name += f", the bag with the greatest error: {score.after:.2f} %"
+    axes.set_title(name, fontsize=10, color=INK, loc="left")
 
 
 def _draw_time(axes: Axes, calibration: CalibrationResult, fits: Sequence[BagFit]) -> None:
     """Draw the prediction error over time, one bag after the other."""
     length, begin = calibration.settings.thread_length, 0.0
-    lowest, highest = np.inf, 0.0
+    style: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "fontsize": 7.5, "color": FAINT, "va": "top"}
+    shown = []
     for index, fit in enumerate(fits):
-        times = begin + fit.passage.times
-        for vertices, colour, label in ((fit.before, BEFORE, "before"), (fit.after, AFTER, "after")):
-            error = np.maximum(fit.error(vertices, length), MIN_SHOWN)
-            axes.plot(times, error, color=colour, linewidth=1.3, label=label if index == 0 else None)
-            lowest, highest = min(lowest, float(error.min())), max(highest, float(error.max()))
-        begin += fit.passage.duration
-        if index < len(fits) - 1:
+        if index:
             axes.axvline(begin, color=FAINT, linewidth=0.8, linestyle=(0, (2, 2)))
-    begin = 0.0
-    for fit in fits if len(fits) > 1 else ():
-        name = Path(fit.passage.name).name
-        axes.text(begin, 1.0, f" {name}", transform=axes.get_xaxis_transform(), fontsize=7.5, color=FAINT, va="top")
-        begin += fit.passage.duration
-    _percent_axis(axes, lowest, highest)
-    axes.set_xlim(0.0, sum(fit.passage.duration for fit in fits))
+        if len(fits) > 1:
+            axes.text(begin, 1.0, f" {Path(fit.run.name).name}", **style)
+        for vertices, colour, label in ((fit.before, BEFORE, "before"), (fit.after, PREDICTED, "after")):
+            error = np.maximum(fit.error(vertices, length), MIN_SHOWN)
+            axes.plot(begin + fit.run.times, error, color=colour, linewidth=1.3, label=None if index else label)
+            shown.append(error)
+        begin += fit.run.duration
+    _percent_axis(axes, np.concatenate(shown))
+    axes.set_xlim(0.0, begin)
     axes.set_xlabel("time [s]", color=INK, labelpad=1)
     axes.set_title("prediction error [% of the length]", fontsize=9.5, color=INK, loc="left")
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize=8.5, frameon=False, ncols=2)
@@ -134,26 +110,23 @@ def _draw_time(axes: Axes, calibration: CalibrationResult, fits: Sequence[BagFit
 def _draw_along(axes: Axes, calibration: CalibrationResult, fits: Sequence[BagFit]) -> None:
     """Draw the distance across the thread from needle to end, mean over all bags and frames."""
     length = calibration.settings.thread_length
-    lowest, highest = np.inf, 0.0
-    for kind, colour in (("before", BEFORE), ("after", AFTER)):
-        total, count = 0.0, 0
-        for fit in fits:
-            size = np.abs(across(getattr(fit, kind), fit.passage, length))
-            total, count = total + size.sum(axis=0), count + fit.passage.known.sum(axis=0)
-        mean = np.maximum(100.0 * total / np.maximum(count, 1), MIN_SHOWN)
-        mean = np.where(count > 0, mean, np.nan)
+    count = sum(fit.run.known.sum(axis=0) for fit in fits)
+    shown = []
+    for kind, colour in (("before", BEFORE), ("after", PREDICTED)):
+        total = sum(np.abs(across_residuals(getattr(fit, kind), fit.run, length)).sum(axis=0) for fit in fits)
+        mean = np.where(count > 0, np.maximum(100.0 * total / np.maximum(count, 1), MIN_SHOWN), np.nan)
         at = 1e3 * length * np.arange(1, len(mean) + 1) / len(mean)
         axes.plot(at, mean, color=colour, linewidth=1.3, marker="o", markersize=2.0)
-        lowest, highest = min(lowest, float(np.nanmin(mean))), max(highest, float(np.nanmax(mean)))
-    _percent_axis(axes, lowest, highest)
+        shown.append(mean)
+    _percent_axis(axes, np.concatenate(shown))
     axes.set_xlim(0.0, 1e3 * length)
     axes.set_xlabel("along the thread, from the needle [mm]", color=INK, labelpad=1)
     axes.set_title("mean distance across the thread [% of the length]", fontsize=9.5, color=INK, loc="left")
 
 
-def _percent_axis(axes: Axes, lowest: float, highest: float) -> None:
+def _percent_axis(axes: Axes, values: NDArray[np.float64]) -> None:
     axes.set_yscale("log")
-    axes.set_ylim(lowest / 1.3, highest * 1.4)
+    axes.set_ylim(float(np.nanmin(values)) / 1.3, float(np.nanmax(values)) * 1.4)
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, place: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
@@ -163,21 +136,12 @@ def _percent_axis(axes: Axes, lowest: float, highest: float) -> None:
 def _draw_parameters(figure: Figure, calibration: CalibrationResult, box: tuple[float, float, float, float]) -> None:
     """Draw a scale for each parameter: fitted value with its interval, and what the set-up says."""
     left, low, width, height = box
-    figure.text(
-        left,
-        low + height,
-        "parameters with 95 % intervals; the tick is what the set-up says",
-        fontsize=9.5,
-        color=INK,
-        va="bottom",
-    )
-    rows = list(calibration.estimates)
-    attachment = calibration.attachment
-    count = max(1, len(rows) + (attachment is not None))
-    step = min(height / count, 0.062)
+    title = "parameters with 95 % intervals; the tick is what the set-up says"
+    figure.text(left, low + height, title, fontsize=9.5, color=INK, va="bottom")
+    rows, attachment = calibration.estimates, calibration.attachment
+    step = min(height / max(1, len(rows) + (attachment is not None)), 0.062)
     for index, estimate in enumerate(rows):
-        top = low + height - (index + 1) * step
-        _draw_parameter(figure, estimate, (left, top, width, step))
+        _draw_parameter(figure, estimate, (left, low + height - (index + 1) * step, width, step))
     if attachment is not None:
         top = low + height - (len(rows) + 0.38) * step
         figure.text(left, top, "attachment", fontsize=8.5, color=INK, va="center")
@@ -192,24 +156,23 @@ def _draw_parameter(figure: Figure, estimate: Estimate, box: tuple[float, float,
     left, low, width, height = box
     fixed = estimate.status == FIXED
     scale, unit = {"m": (1e3, "mm"), "m^4/s": (1.0, "m⁴/s")}.get(estimate.unit, (1.0, estimate.unit))
-    value, start, first, last = (
-        scale * number for number in (estimate.value, estimate.start, estimate.low, estimate.high)
-    )
+    numbers = (estimate.value, estimate.start, estimate.low, estimate.high)
+    value, start, first, last = (scale * number for number in numbers)
     figure.text(left, low + 0.62 * height, estimate.name, fontsize=8.5, color=INK, va="center")
     words = "cannot be told" if fixed else f"{value:.3g} {unit}".rstrip() + (" ?" if estimate.reason else "")
-    colour = FAINT if estimate.reason else AFTER
+    colour = FAINT if estimate.reason else PREDICTED
     figure.text(left + width, low + 0.62 * height, words, fontsize=8.5, color=FAINT if fixed else INK, **_RIGHT)
     axes = figure.add_axes((left + 0.115, low + 0.42 * height, width - 0.225, 0.36 * height))
     shown = [number for number in (value, start, first, last) if np.isfinite(number)]
+    least, greatest = min(shown), max(shown)
     if estimate.logarithmic:
         axes.set_xscale("log")
-        room = max(max(shown) / min(shown), 1.01) ** 0.12
-        axes.set_xlim(min(shown) / room, max(shown) * room)
-        axes.set_xticks([min(shown), max(shown)], [f"{end:.3g}" for end in (min(shown), max(shown))])
+        room = max(greatest / least, 1.01) ** 0.12
+        axes.set_xlim(least / room, greatest * room)
+        axes.set_xticks([least, greatest], [f"{end:.3g}" for end in (least, greatest)])
     else:
-        least = min(shown)
-        room = 0.15 * (max(shown) - least) or 1e-9
-        axes.set_xlim(least - room, max(shown) + room)
+        room = 0.15 * (greatest - least) or 1e-9
+        axes.set_xlim(least - room, greatest + room)
         axes.xaxis.set_major_locator(MaxNLocator(3))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda number, place: f"{number:.3g}"))
     axes.xaxis.set_minor_locator(NullLocator())

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.calibration.fit import FitSolution, scale_of
-from magnetosuture_thread.calibration.identifiability import assess_identifiability
+from magnetosuture_thread.calibration.fit import FitSolution, robust_scale
+from magnetosuture_thread.calibration.identifiability import CHAIN, assess_identifiability, estimate_uncertainty
 from magnetosuture_thread.calibration.parameters import DRAG_ANISOTROPY, REST_CURVATURE, STIFFNESS_OVER_DRAG
-from magnetosuture_thread.calibration.passage import Passage
-from magnetosuture_thread.calibration.uncertainty import CHAIN, uncertainty_of
+from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from test.calibration.runs import SETTINGS, rig_passage
 
 PASSAGE = rig_passage(1.3e-9)
@@ -32,7 +31,7 @@ def random(seed: int, *shape: int) -> Array:
     return np.random.default_rng(seed).standard_normal(shape)
 
 
-def names(solution: FitSolution, passages: list[Passage]) -> list[str]:
+def names(solution: FitSolution, passages: list[RecordedRun]) -> list[str]:
     """Return why each number cannot be identified."""
     return [verdict.reason for verdict in assess_identifiability(solution, passages)]
 
@@ -42,7 +41,7 @@ def test_of_white_noise_the_interval_is_that_of_least_squares():
     gram = np.linalg.inv(jacobian.reshape(-1, 3).T @ jacobian.reshape(-1, 3))
     halves = []
     for seed in range(100, 140):
-        spread = uncertainty_of(solved(jacobian, noise * random(seed, *SHAPE)), [PASSAGE], range(3))
+        spread = estimate_uncertainty(solved(jacobian, noise * random(seed, *SHAPE)), [PASSAGE], range(3))
         halves.append(spread.half - CHAIN / spread.effect)
     student = 2.262  # of nine degrees of freedom
     assert np.mean(halves, axis=0) == pytest.approx(student * noise * np.sqrt(np.diag(gram)), rel=0.2)
@@ -55,7 +54,7 @@ def test_residuals_that_stay_for_long_widen_the_interval():
         white = random(100 + index, *SHAPE)
         slow = math.sqrt(2.0) * np.sin(2.0 * math.pi * PASSAGE.times / 3.0 + index)[:, None] * np.ones(SHAPE)
         spreads = [
-            uncertainty_of(solved(jacobian, 1e-3 * residuals), [PASSAGE], range(3)) for residuals in (white, slow)
+            estimate_uncertainty(solved(jacobian, 1e-3 * residuals), [PASSAGE], range(3)) for residuals in (white, slow)
         ]
         halves.append([(spread.half - CHAIN / spread.effect).mean() for spread in spreads])
     narrow, wide = np.mean(halves, axis=0)
@@ -68,8 +67,8 @@ def test_bags_that_disagree_widen_the_interval():
     bags = FitSolution(
         SETTINGS, PARAMETERS[:1], X[:1], [s * 1e-3 * np.ones(SHAPE) for s in signs], [jacobian] * 4, math.inf, 0.0
     )
-    alone = uncertainty_of(solved(np.repeat(jacobian, 3, axis=2), 1e-6 * np.ones(SHAPE)), [PASSAGE], [0])
-    assert uncertainty_of(bags, passages, [0]).half[0] > 2.0 * alone.half[0]
+    alone = estimate_uncertainty(solved(np.repeat(jacobian, 3, axis=2), 1e-6 * np.ones(SHAPE)), [PASSAGE], [0])
+    assert estimate_uncertainty(bags, passages, [0]).half[0] > 2.0 * alone.half[0]
 
 
 def test_what_all_is_well_with_is_identified():
@@ -116,5 +115,5 @@ def test_of_a_thread_that_bends_on_a_small_part_only_the_stiffness_is_not_known(
 def test_the_scale_of_outliers():
     residuals = 2e-3 * random(4, *SHAPE)
     residuals[:3] = 0.5  # a frame or two that were tracked wrongly
-    assert scale_of([residuals]) == pytest.approx(6e-3, rel=0.1)
-    assert scale_of([np.zeros(SHAPE)]) == 1e-3
+    assert robust_scale([residuals]) == pytest.approx(6e-3, rel=0.1)
+    assert robust_scale([np.zeros(SHAPE)]) == 1e-3

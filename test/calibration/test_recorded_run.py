@@ -8,8 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.calibration.passage import MAX_FRAMES, SETTLING, passage_of
-from magnetosuture_thread.calibration.replays import across, apart, frame_errors, replay_with_parameters
+from magnetosuture_thread.calibration.recorded_run import MAX_FRAMES, SETTLING, read_run
+from magnetosuture_thread.calibration.residuals import (
+    across_residuals,
+    frame_errors,
+    offset_residuals,
+    replay_with_parameters,
+)
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import prediction_error_percent
@@ -22,13 +27,13 @@ SIGHTS = rig_run(TRUE)
 def still(sight: Observation, shift: float) -> Observation:
     """Return the first sight at another time, the needle moved on by so much [m]."""
     first, by = SIGHTS[0], np.array([shift, 0.0])
-    return replace(sight, tail=first.tail + by, heading=first.heading, seen=first.seen + by)
+    return replace(sight, tail=first.tail + by, heading=first.heading, measured=first.measured + by)
 
 
 def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on():
-    hidden = [replace(sight, seen=np.empty((0, 2))) if k < 5 else sight for k, sight in enumerate(SIGHTS)]
+    hidden = [replace(sight, measured=np.empty((0, 2))) if k < 5 else sight for k, sight in enumerate(SIGHTS)]
     lost = [Observation(sight.stamp, reason="glare") if k == 50 else sight for k, sight in enumerate(hidden)]
-    passage = passage_of("bag", lost, SETTINGS)
+    passage = read_run("bag", lost, SETTINGS)
     assert passage.stamps[0] == SIGHTS[5].stamp
     assert SIGHTS[50].stamp not in passage.stamps
     assert passage.times[0] == pytest.approx(SETTLING, abs=0.1)
@@ -41,13 +46,13 @@ def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on(
 
 def test_after_a_gap_it_begins_anew_from_the_thread_as_seen():
     gap = [sight for k, sight in enumerate(SIGHTS) if not 40 <= k < 50]
-    passage = passage_of("bag", gap, SETTINGS)
+    passage = read_run("bag", gap, SETTINGS)
     assert passage.legs == (0, 40)
-    assert np.array_equal(passage.initials[1], SIGHTS[50].seen)
+    assert np.array_equal(passage.initials[1], SIGHTS[50].measured)
     times = (passage.stamps[passage.frames] - SIGHTS[50].stamp) * 1e-9
     assert not ((times >= 0.0) & (times < SETTLING)).any()
     model = stiff(TRUE)
-    whole, parts = (passage_of("bag", sights, SETTINGS) for sights in (SIGHTS, gap))
+    whole, parts = (read_run("bag", sights, SETTINGS) for sights in (SIGHTS, gap))
     last = [
         frame_errors(replay_with_parameters(passage, model), passage.targets, LENGTH)[-1] for passage in (whole, parts)
     ]
@@ -55,32 +60,32 @@ def test_after_a_gap_it_begins_anew_from_the_thread_as_seen():
 
 
 def test_what_is_not_seen_is_not_known():
-    part = [replace(sight, seen=sight.seen[:40]) for sight in SIGHTS]
-    passage = passage_of("bag", part, SETTINGS)
+    part = [replace(sight, measured=sight.measured[:40]) for sight in SIGHTS]
+    passage = read_run("bag", part, SETTINGS)
     seen = 39.0 / 63.0 * SETTINGS.segments
     assert (passage.known.sum(axis=1) == int(seen)).all()
     vertices = replay_with_parameters(passage, SETTINGS)
-    assert not across(vertices, passage, LENGTH)[~passage.known].any()
+    assert not across_residuals(vertices, passage, LENGTH)[~passage.known].any()
 
 
 def test_errors_are_those_of_the_score():
-    passage = passage_of("bag", SIGHTS, SETTINGS)
+    passage = read_run("bag", SIGHTS, SETTINGS)
     vertices = replay_with_parameters(passage, SETTINGS)
     found = frame_errors(vertices, passage.targets, LENGTH)
     for slot in (0, 30, -1):
-        curve = SIGHTS[int(passage.frames[slot])].seen
+        curve = SIGHTS[int(passage.frames[slot])].measured
         assert found[slot] == pytest.approx(prediction_error_percent(vertices[slot], curve, LENGTH), rel=1e-6)
-    both = apart(vertices, passage, LENGTH).reshape(len(found), 2, -1)
+    both = offset_residuals(vertices, passage, LENGTH).reshape(len(found), 2, -1)
     assert 100.0 * np.hypot(both[:, 0], both[:, 1])[passage.known].mean() == pytest.approx(found.mean())
-    assert (np.abs(across(vertices, passage, LENGTH)) <= np.hypot(both[:, 0], both[:, 1]) + 1e-12).all()
+    assert (np.abs(across_residuals(vertices, passage, LENGTH)) <= np.hypot(both[:, 0], both[:, 1]) + 1e-12).all()
 
 
 def test_a_thread_that_cannot_start_is_as_wrong_as_can_be():
-    passage = passage_of("bag", SIGHTS, SETTINGS)
+    passage = read_run("bag", SIGHTS, SETTINGS)
     passage = replace(passage, initials=(passage.initials[0] + 0.01,))
     vertices = replay_with_parameters(passage, SETTINGS)
     assert np.isnan(vertices).all()
-    assert (across(vertices, passage, LENGTH)[passage.known] == 1.0).all()
+    assert (across_residuals(vertices, passage, LENGTH)[passage.known] == 1.0).all()
     assert frame_errors(vertices, passage.targets, LENGTH) == pytest.approx(100.0)
 
 
@@ -88,11 +93,15 @@ def test_a_thread_that_cannot_start_is_as_wrong_as_can_be():
     ("sights", "against", "words"),
     [
         ([Observation(sight.stamp, reason="dark") for sight in SIGHTS], "seen", "no needle"),
-        ([replace(sight, seen=np.empty((0, 2))) for sight in SIGHTS], "seen", "no thread"),
-        ([replace(sight, truth=np.empty((0, 2))) for sight in SIGHTS], "truth", "no truth"),
+        ([replace(sight, measured=np.empty((0, 2))) for sight in SIGHTS], "seen", "no thread"),
+        ([replace(sight, ground_truth=np.empty((0, 2))) for sight in SIGHTS], "truth", "no truth"),
         (SIGHTS[:40], "seen", "too short"),
-        ([replace(s, seen=s.seen[:20]) if k else s for k, s in enumerate(SIGHTS)], "seen", "half of the thread"),
-        ([replace(sight, seen=sight.seen[:20]) for sight in SIGHTS], "seen", "never shows half"),
+        (
+            [replace(s, measured=s.measured[:20]) if k else s for k, s in enumerate(SIGHTS)],
+            "seen",
+            "half of the thread",
+        ),
+        ([replace(sight, measured=sight.measured[:20]) for sight in SIGHTS], "seen", "never shows half"),
         ([still(sight, 0.0) for sight in SIGHTS], "seen", "nothing moves"),
         ([still(sight, 1e-5 * k) for k, sight in enumerate(SIGHTS)], "seen", "too slow"),
         ([], "seen", "no needle"),
@@ -100,10 +109,10 @@ def test_a_thread_that_cannot_start_is_as_wrong_as_can_be():
 )
 def test_bags_of_no_use_are_refused_in_words(sights: Sequence[Observation], against: str, words: str):
     with pytest.raises(BagError, match=words) as refused:
-        passage_of("a bag", sights, SETTINGS, against)
+        read_run("a bag", sights, SETTINGS, against)
     assert str(refused.value).startswith("a bag: ")
 
 
 def test_two_runs_in_one_bag_are_refused():
     with pytest.raises(InvalidInputError, match="before the last"):
-        passage_of("a bag", [*SIGHTS, *SIGHTS], SETTINGS)
+        read_run("a bag", [*SIGHTS, *SIGHTS], SETTINGS)
