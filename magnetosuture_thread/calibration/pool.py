@@ -14,7 +14,7 @@ from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
 
 
 @contextmanager
-def pool(passages: Sequence[Passage], workers: int) -> Iterator[Run]:
+def pool(passages: Sequence[RecordedRun], workers: int) -> Iterator[RunTasks]:
     """Give a function that runs tasks, here or in processes of their own; see `WorkerPool`.
 
     Args:
@@ -38,7 +38,7 @@ def pool(passages: Sequence[Passage], workers: int) -> Iterator[Run]:
 
 
 def _replay(
-    passages: Sequence[Passage], task: Task, log: Callable[[str], None], progress: Callable[[float], None]
+    passages: Sequence[RecordedRun], task: Task, log: Callable[[str], None], progress: Callable[[float], None]
 ) -> Points:
     index, settings = task
-    return attempt(passages[index], settings)
+    return replay_with_parameters(passages[index], settings)

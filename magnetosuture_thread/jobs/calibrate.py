@@ -14,7 +14,8 @@ from magnetosuture_thread.calibration.output import to_yaml
 from magnetosuture_thread.calibration.parameters import choose_parameters
 from magnetosuture_thread.calibration.plot import draw_calibration
 from magnetosuture_thread.calibration.pool import pool
-from magnetosuture_thread.calibration.replays import Best
+from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
+from magnetosuture_thread.calibration.residuals import BestSettings
 from magnetosuture_thread.calibration.result import CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate as fit
 from magnetosuture_thread.calibration.search import unfinished_result
@@ -78,7 +79,7 @@ def calibrate_bags(
         ConfigurationError: the setup, the material or a parameter cannot be used.
         InvalidInputError: the bags are of different threads.
     """
-    passages: list[Passage] = []
+    passages: list[RecordedRun] = []
     own: list[Setup] = []
     settings: ThreadModelSettings | None = None
     for index, path in enumerate(bags):
@@ -88,7 +89,7 @@ def calibrate_bags(
 
         with open_bag(path, log, **selection) as given:
             its = settings_of(given.setup, material, formulation)
-            chosen(its.formulation, parameters)  # refuses wrong names before the bag is read
+            choose_parameters(its.formulation, parameters)  # refuses wrong names before the bag is read
             own.append(_own_setup(given) or given.setup)
             _check_same_thread(bags, own)
             if settings is not None and its != settings:
@@ -98,21 +99,21 @@ def calibrate_bags(
             measured = read_observations(given.recording, given.setup, source=given.source, progress=advance)
             simulated = given.recording.notes.get("simulated", "")
             try:
-                passages.append(passage_of(str(path), measured, its, against, simulated, given.setup.scene))
+                passages.append(read_run(str(path), measured, its, against, simulated, given.setup.scene))
             except BagError:
                 if problem := measured.thread_problem():
                     raise BagError(path, problem) from None
                 raise
         advance(1.0)
     assert settings is not None
-    best = Best()
+    best = BestSettings()
     try:
         with pool(passages, min(workers, os.cpu_count() or 1)) as run:
             calibration, fits = fit(
                 passages,
                 settings,
                 parameters,
-                run=run,
+                run_tasks=run,
                 best=best,
                 progress=lambda share: progress(READING_SHARE + (1.0 - READING_SHARE) * share),
                 log=log,
@@ -121,7 +122,7 @@ def calibrate_bags(
         if best.settings is None:
             raise
         log("interrupted; writing the best so far")
-        calibration, fits = unfinished(passages, settings, best)
+        calibration, fits = unfinished_result(passages, settings, best)
     with whole_file(output) as partial:
         partial.write_text(to_yaml(calibration), encoding="utf-8")
     if json_file is not None:

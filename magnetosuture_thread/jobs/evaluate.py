@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from magnetosuture_thread.bags.bag_folder import STORAGE_SUFFIXES, find_bag_files
 from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
-from magnetosuture_thread.evaluation.bag_table import Row, failed_row, table_csv, table_json
+from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
 from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag, printable_path
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress

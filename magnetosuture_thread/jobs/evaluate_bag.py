@@ -17,8 +17,7 @@ from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.evaluation.bag_table import Row, row_of
-from magnetosuture_thread.evaluation.frames import FrameResult, Observation
+from magnetosuture_thread.evaluation.frames import FrameResult, Observation, WorstFrame
 from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
 from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures, LiveFigures
 from magnetosuture_thread.evaluation.report.page import write_page

@@ -13,7 +13,8 @@ from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary, stage_latencies
+from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
+from magnetosuture_thread.evaluation.metrics import stage_latencies
 from magnetosuture_thread.interface import (
     CAMERA,
     CAMERA_INFO,

@@ -94,7 +94,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
     Ctrl-C ends it at any moment: the best so far is written, marked as such and without intervals, and the exit code
     is 130. Before there is any, nothing is written, and it is 1.
     """
-    from magnetosuture_thread.calibration.table import bag_table, calibration_lines, parameter_table
+    from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table
     from magnetosuture_thread.jobs.calibrate import calibrate_bags
 
     console = make_console()

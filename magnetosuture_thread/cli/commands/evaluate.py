@@ -108,7 +108,7 @@ def _refuse(options: argparse.Namespace, names: Sequence[str], why: str) -> None
 
 
 def _evaluate_bags(options: argparse.Namespace) -> int:
-    from magnetosuture_thread.evaluation.bag_table import bags_table
+    from magnetosuture_thread.evaluation.tables import bags_table
     from magnetosuture_thread.jobs.evaluate import evaluate_bags
 
     if options.output is None:
