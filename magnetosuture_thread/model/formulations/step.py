@@ -1,24 +1,40 @@
-"""One step of the thread: what goes in, what comes out, and the rows that every formulation shares."""
+"""One step of the thread: what goes in, what comes out, and what every formulation shares."""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import BarrierRows
+from magnetosuture_thread.barrier import Barrier, BarrierRows, CompiledBarrier
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import WorkspaceData
+from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
-from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
+from magnetosuture_thread.model.barriers import ObstacleAvoidance, WallAvoidance
+from magnetosuture_thread.model.program import (
+    SPAN,
+    ChainProgram,
+    Residuals,
+    Solution,
+    Solver,
+    Vector,
+    WideRows,
+    residuals_of,
+)
+from magnetosuture_thread.model.thread import Thread
 
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
 CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
+DISTANCE_TOLERANCE = 1e-7  # m; a row that is met but for this much of its nodes' way holds
+UNMET_COMPLIANCE = 1e-7  # compliance of a hard row that has to be met from outside; something else may hold against it
 
 
 @dataclass(frozen=True)
@@ -83,40 +99,6 @@ class StepResult:
     residuals: Residuals
     solves: int
     converged: bool
-
-
-class Formulation(Protocol):
-    """A way of writing one step of the thread as a quadratic program.
-
-    Attributes:
-        name: of the formulation.
-        dimension: 2 or 3.
-        added: the barriers that a user has added.
-    """
-
-    name: str
-    dimension: int
-    added: AddedBarriers
-
-    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
-        """Move the prescribed nodes and let the thread follow for one interval [s].
-
-        Raises:
-            SolverError: a solution's residual is above the tolerance.
-        """
-        ...
-
-    def warm_up(self) -> None:
-        """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
-        ...
-
-    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
-        """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
-        ...
-
-    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
-        ...
 
 
 class StepBuffers(NamedTuple):
@@ -187,7 +169,7 @@ class StepBuffers(NamedTuple):
             np.zeros(nodes),
         )
 
-    def with_room(self) -> StepBuffers:
+    def enlarged(self) -> StepBuffers:
         """Return buffers for twice as many contacts, with the same chords and multipliers."""
         nodes, dimension = self.linear.shape
         rows = len(self.first) - len(self.node)
@@ -202,27 +184,21 @@ class StepBuffers(NamedTuple):
         self.multipliers[:] = 0.0
         self.push[:] = 0.0
 
-    def program(self, count: int, known: NDArray[np.bool_]) -> ChainProgram:
-        """Return the program with the first rows."""
-        return ChainProgram(
-            self.blocks,
-            self.couplings,
-            self.linear,
-            known,
-            self.first[:count],
-            self.gradient[:count],
-            self.lower[:count],
-            self.upper[:count],
-            self.compliance[:count],
-        )
 
-
-def warmed(solver: Solver, buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> Solution:
-    """Return a solution of the buffers's last program as a general solver gets it, its residuals worked out here."""
-    program = buffers.program(rows, known)
-    solution = solver.solve(program, np.zeros_like(buffers.linear), np.zeros(rows))
-    residuals_of(program, solution.velocities, solution.multipliers)
-    return solution
+@compiled
+def program_of(buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> ChainProgram:
+    """Return the program of the first rows."""
+    return ChainProgram(
+        buffers.blocks,
+        buffers.couplings,
+        buffers.linear,
+        known,
+        buffers.first[:rows],
+        buffers.gradient[:rows],
+        buffers.lower[:rows],
+        buffers.upper[:rows],
+        buffers.compliance[:rows],
+    )
 
 
 @compiled
@@ -286,11 +262,13 @@ def contact_rows(
 
 
 @compiled
-def keep_contact_multipliers(node: NDArray[np.int64], multipliers: Vector, push: Vector) -> None:
-    """Keep the multipliers of the contact rows, the largest of each node, for the next guess."""
-    push[:] = 0.0
-    for c in range(len(multipliers)):
-        push[node[c]] = max(push[node[c]], multipliers[c])
+def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
+    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node."""
+    buffers.multipliers[: len(multipliers)] = multipliers
+    buffers.push[:] = 0.0
+    for r in range(rows, len(multipliers)):
+        node = buffers.node[r - rows]
+        buffers.push[node] = max(buffers.push[node], multipliers[r])
 
 
 @compiled
@@ -304,3 +282,220 @@ def move_prescribed(
             moved[nodes[k], a] = ends[k, a] / unit
         known[nodes[k]] = True
     return moved, known
+
+
+@dataclass(frozen=True)
+class LinearRows:
+    """Linearised rows of all added barriers, in units of the segment length.
+
+    Attributes:
+        nodes: the nodes of each row, padded by repeating the last with gradient 0, shape (r, k).
+        gradient: a_r at these nodes, a unit vector over all of them, shape (r, k, d).
+        lower: of a_r' u, shape (r,).
+        compliance: shape (r,).
+        off: how far the hard rows are from being met over what is allowed; 1 or less if they hold.
+    """
+
+    nodes: NDArray[np.int64]
+    gradient: NDArray[np.float64]
+    lower: Vector
+    compliance: Vector
+    off: float
+
+    def joined(self, program: ChainProgram) -> tuple[ChainProgram, WideRows | None]:
+        """Return a program with the rows that fit into its band at its end, and the others."""
+        count, nodes = len(self.lower), len(program.linear)
+        low, high = self.nodes.min(axis=1, initial=nodes), self.nodes.max(axis=1, initial=0)
+        narrow = high - low < SPAN
+        first = np.minimum(low, nodes - SPAN)[narrow]
+        gradient = np.zeros((len(first), SPAN, program.linear.shape[1]))
+        row = np.arange(len(first))[:, None]
+        np.add.at(gradient, (row, self.nodes[narrow] - first[:, None]), self.gradient[narrow])
+        program = program._replace(
+            first=np.concatenate([program.first, first]),
+            gradient=np.concatenate([program.gradient, gradient]),
+            lower=np.concatenate([program.lower, self.lower[narrow]]),
+            upper=np.concatenate([program.upper, np.full(len(first), np.inf)]),
+            compliance=np.concatenate([program.compliance, self.compliance[narrow]]),
+        )
+        if len(first) == count:
+            return program, None
+        rest = ~narrow
+        return program, WideRows(self.nodes[rest], self.gradient[rest], self.lower[rest], self.compliance[rest])
+
+
+class AddedBarriers:
+    """The barriers that a user has added to a formulation, over one step after the other.
+
+    Args:
+        barriers: in the order in which margins list them.
+        segment_length: D [m].
+    """
+
+    def __init__(self, barriers: Sequence[Barrier], segment_length: float) -> None:
+        self._barriers, self._unit = tuple(barriers), segment_length
+        self._before: list[Vector | None] = [None] * len(self._barriers)
+
+    def __bool__(self) -> bool:
+        """Return whether there are any."""
+        return bool(self._barriers)
+
+    def rows(self, positions: Points) -> list[BarrierRows]:
+        """Return the rows of each barrier at positions of shape (n + 1, d) [m]."""
+        return [barrier.rows(positions) for barrier in self._barriers]
+
+    def set_time(self, time: float) -> None:
+        """Take the time at which the rows are asked for next [s]."""
+        for barrier in self._barriers:
+            barrier.set_time(time)
+
+    def begin(self, positions: Points, time: float, interval: float) -> None:
+        """Begin a step: keep h(x) of the barriers whose gain does not let it fall to 0 within it.
+
+        Args:
+            positions: of all nodes before the step, shape (n + 1, d) [m].
+            time: at the end of the step [s].
+            interval: dt [s].
+        """
+        self.set_time(time - interval)
+        for index, barrier in enumerate(self._barriers):
+            slow = barrier.gain * interval < 1.0
+            self._before[index] = np.asarray(barrier.value(positions), dtype=np.float64) if slow else None
+        self.set_time(time)
+
+    def linearised(self, about: Points, start: Points, known: NDArray[np.bool_], interval: float) -> LinearRows:
+        """Return the rows of all barriers about a predicted end point.
+
+            a' u >= ((1 - alpha dt) h(x) - h(y) - grad h(y)' (start - y)) / (|grad h| dt),    a = grad h / |grad h|
+
+        A row that no unknown can change is left out.
+
+        Args:
+            about: y, shape (n + 1, d) [D].
+            start: where the nodes are once those of a known motion have moved, shape (n + 1, d) [D].
+            known: those of a known motion, shape (n + 1,).
+            interval: dt [s].
+        """
+        found = [self._of(barrier, before, about, start, known, interval) for barrier, before in self._pairs()]
+        width = max((rows.nodes.shape[1] for rows in found), default=1)
+        padded = [np.pad(rows.nodes, ((0, 0), (0, width - rows.nodes.shape[1])), mode="edge") for rows in found]
+        zeros = [np.pad(rows.gradient, ((0, 0), (0, width - rows.nodes.shape[1]), (0, 0))) for rows in found]
+        return LinearRows(
+            np.concatenate(padded),
+            np.concatenate(zeros),
+            np.concatenate([rows.lower for rows in found]),
+            np.concatenate([rows.compliance for rows in found]),
+            max(rows.off for rows in found),
+        )
+
+    def _pairs(self) -> list[tuple[Barrier, Vector | None]]:
+        return list(zip(self._barriers, self._before, strict=True))
+
+    def _of(
+        self,
+        barrier: Barrier,
+        before: Vector | None,
+        about: Points,
+        start: Points,
+        known: NDArray[np.bool_],
+        interval: float,
+    ) -> LinearRows:
+        rows = barrier.rows(about * self._unit)
+        gradient = np.where(known[rows.nodes][:, :, None], 0.0, rows.gradient)
+        slope = np.sqrt(np.einsum("rkd,rkd->r", gradient, gradient))
+        free = slope > 0.0
+        nodes, gradient, slope = rows.nodes[free], gradient[free], slope[free]
+        wanted = np.zeros(len(slope))
+        # A barrier whose number of rows changes with time decays as fast as a step allows.
+        if before is not None and before.shape == rows.value.shape:
+            wanted = (1.0 - barrier.gain * interval) * before[free]
+        missing = (wanted - rows.value[free]) / slope  # m
+        gradient = gradient / slope[:, None, None]
+        moved = np.einsum("rkd,rkd->r", gradient, (start - about)[nodes])
+        lower = (missing / self._unit - moved) / interval
+        soft = 1.0 / barrier.slack_weight
+        compliance = np.where(lower > 0.0, max(soft, UNMET_COMPLIANCE), soft)
+        off = float(missing.max(initial=0.0)) / DISTANCE_TOLERANCE if math.isinf(barrier.slack_weight) else 0.0
+        return LinearRows(nodes.astype(np.int64), gradient, lower, compliance, off)
+
+
+class Formulation(ABC):
+    """A way of writing one step of the thread as a quadratic program.
+
+    Args:
+        thread: the thread.
+        workspace: obstacles and wall [m]; their reach is that of the margins.
+        solver: solves the program.
+        tolerance: the largest residual with which a solution is accepted.
+        barriers: what a user adds to the built-in ones.
+        rows: number of the program's rows besides those of contacts and added barriers.
+
+    Attributes:
+        name: of the formulation.
+        dimension: 2 or 3.
+        added: the barriers that a user has added.
+    """
+
+    name: str
+
+    def __init__(
+        self,
+        thread: Thread,
+        workspace: Workspace,
+        solver: Solver,
+        tolerance: float,
+        barriers: Sequence[Barrier],
+        rows: int,
+    ) -> None:
+        nodes, self.dimension = thread.segments + 1, workspace.dimension
+        self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
+        self._radius, reach = 0.5 * thread.diameter, ROW_REACH * thread.segment_length
+        self._near = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius)
+        self.added = AddedBarriers(barriers, thread.segment_length)
+        self._rows, self._buffers = rows, StepBuffers.of(nodes, self.dimension, rows, 2 * nodes)
+
+    @abstractmethod
+    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
+        """Move the prescribed nodes and let the thread follow for one interval [s].
+
+        Raises:
+            SolverError: a solution's residual is above the tolerance.
+        """
+
+    def warm_up(self) -> None:
+        """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
+        nodes = self._thread.segments + 1
+        program = program_of(self._buffers, np.zeros(nodes, dtype=np.bool_), self._rows)
+        solution = self._solver.solve(program, np.zeros((nodes, self.dimension)), np.zeros(self._rows))
+        residuals_of(program, solution.velocities, solution.multipliers)
+        self._buffers.forget()
+
+    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
+        """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
+        return np.full(self._thread.segments, self._thread.segment_length)
+
+    @abstractmethod
+    def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
+        """Return the built-in barriers of the thread itself, obstacles and wall aside, at these positions."""
+
+    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
+        """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
+        contacts = self._workspace.near(positions)
+        return [
+            *(barrier.rows(positions) for barrier in self.segment_barriers(positions, heading)),
+            ObstacleAvoidance(self._workspace, self._radius).rows_of(contacts),
+            WallAvoidance(self._workspace, self._radius).rows_of(contacts),
+        ]
+
+    def _solve(self, contacts: int, known: NDArray[np.bool_], velocities: Points, added: LinearRows | None) -> Solution:
+        """Return the solution of the program in the buffers, with the rows of added barriers."""
+        count, wide = self._rows + contacts, None
+        program, guess = program_of(self._buffers, known, count), self._buffers.multipliers[:count]
+        if added is not None:
+            program, wide = added.joined(program)
+            guess = np.concatenate([guess, np.zeros(len(added.lower))])
+        solution = self._solver.solve(program, velocities, guess, wide)
+        if not solution.residuals.largest <= self._tolerance:
+            self._buffers.forget()
+            raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
+        return solution
