@@ -13,9 +13,8 @@ if TYPE_CHECKING:
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
     from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
     from magnetosuture_thread.model.margins import BarrierMargins, Margins
-    from magnetosuture_thread.model.medium import Medium
     from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
-    from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+    from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
     from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
     from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
@@ -24,9 +23,8 @@ _HOME = {
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
     "model.margins": ("BarrierMargins", "Margins"),
-    "model.medium": ("Medium",),
     "model.predictor": ("NeedlePose", "Prediction", "ThreadPredictor"),
-    "model.thread": ("MATERIALS", "Attachment", "Material", "Thread"),
+    "model.thread": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
     "safety": ("FilteredCommand", "NeedleSafetyFilter"),
     "scene": ("Dish", "Scene", "SceneShape", "read_scene"),
 }

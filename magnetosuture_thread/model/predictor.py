@@ -14,13 +14,19 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.factory import make_formulation, make_solver, workspace_of
-from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
+from magnetosuture_thread.model.formulations import (
+    Formulation,
+    PaperOptions,
+    PrescribedMotion,
+    StepResult,
+    ThreadState,
+    make_formulation,
+)
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
-from magnetosuture_thread.model.resampling import resample_state
+from magnetosuture_thread.model.solvers import make_solver
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.scene import Scene
 
@@ -117,7 +123,8 @@ class ThreadPredictor:
         thread: the thread.
 
     Raises:
-        ConfigurationError: a name is unknown, a barrier or a shape cannot be used.
+        ConfigurationError: a name is unknown, a barrier or a shape cannot be used, or the segments do not resolve the
+            scene: a shape is narrower than one of them, or the dish than four.
         InvalidInputError: a fixed node is none of the thread's.
     """
 
@@ -139,7 +146,13 @@ class ThreadPredictor:
     ) -> None:
         for node in fixed_nodes:
             _check_node("fixed node", node, thread)
-        workspace = scene if isinstance(scene, Workspace) else workspace_of(scene, margin_range)
+        workspace, self._scene_version = Workspace((), margin_range), ""
+        if isinstance(scene, Workspace):
+            workspace = scene
+        elif scene is not None:
+            _check_scene(thread, scene)
+            workspace = Workspace(scene.obstacles, margin_range, wall_radius=scene.dish.radius)
+            self._scene_version = scene.version
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)
             formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
@@ -149,7 +162,6 @@ class ThreadPredictor:
         self._most_substeps = max_substeps
         self._fixed = tuple(sorted(set(fixed_nodes)))
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
-        self._scene_version = scene.version if isinstance(scene, Scene) else ""
         self._pose: NeedlePose | None = None
         self._state: ThreadState | None = None
 
@@ -276,7 +288,7 @@ class ThreadPredictor:
     def follow_on(self, other: ThreadPredictor) -> None:
         """Go on from where another predictor's thread is, and as it moves, if it has started."""
         self._pose = other._pose
-        self._state = resample_state(other._state, other.thread, self.thread) if other._state is not None else None
+        self._state = other._state.resampled(other.thread, self.thread) if other._state is not None else None
 
     def step(self, pose: NeedlePose, prescribed: Mapping[int, Points] | None = None) -> Prediction:
         """Follow the needle to its next pose.
@@ -395,3 +407,25 @@ def _between(first: Points, second: Points, part: float) -> Points:
         square += value * value
     size = math.sqrt(square)
     return np.array([value / size for value in mixed]) if size > 1e-6 else second
+
+
+def _check_scene(thread: Thread, scene: Scene) -> None:
+    """Refuse a scene that the segments of a thread do not resolve.
+
+    A segment could lie across a shape that is smaller, with both of its nodes outside; in a dish that is narrower
+    than two segments, no chain can turn.
+
+    Raises:
+        ConfigurationError: the shape that is too small, or the dish.
+    """
+    radius = 0.5 * thread.segment_length
+    if not scene.dish.radius > 2.0 * radius:
+        expected = f"more than {4.0 * radius:g} m, two segments of thread_model"
+        raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
+    for shape in scene.shapes:
+        name, expected = f"scene.{shape.name}", f"of at least {radius:g} m, half of a segment of thread_model"
+        if isinstance(shape.geometry, Disc):
+            if shape.geometry.radius < radius:
+                raise ConfigurationError(name, shape.geometry.radius, f"a radius {expected}")
+        elif not shape.geometry.can_contain(radius):
+            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {expected}")

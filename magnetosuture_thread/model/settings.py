@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.factory import FORMULATIONS, SOLVERS, make_solver
-from magnetosuture_thread.model.formulations import PaperOptions
-from magnetosuture_thread.model.friction import FrictionLaw, NodeMotion
-from magnetosuture_thread.model.medium import Medium
+from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
+from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+from magnetosuture_thread.model.solvers import SOLVERS, make_solver
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 
@@ -257,9 +255,8 @@ class ThreadModelSettings(Configuration):
         Raises:
             ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
-        check_scene(self, scene)
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
-        paper = replace(PaperOptions.tuned(weight), damping=self.paper_damping)
+        paper = PaperOptions.tuned(weight)._replace(damping=self.paper_damping)
         predictor = ThreadPredictor(
             self.thread(),
             scene,
@@ -285,29 +282,23 @@ class ThreadModelSettings(Configuration):
         return NodeMotion(self.friction_averaging)
 
 
-def check_scene(settings: ThreadModelSettings, scene: Scene | None) -> None:
-    """Refuse a scene that the segments of a thread do not resolve.
+def parse_material(message: Any) -> dict[str, Any]:
+    """Return the settings, by name, that a ThreadMaterial changes, whoever decoded it.
 
-    A segment could lie across a shape that is smaller, with both of its nodes outside; in a dish that is narrower
-    than two segments, no chain can turn.
-
-    Args:
-        settings: of the thread.
-        scene: dish and obstacles; None for neither.
-
-    Raises:
-        ConfigurationError: the shape that is too small, or the dish.
+    What is 0, not a number or empty stays as it is; but a material that is named brings its own diameter, modulus
+    and weight of the stiffness. The message has the units of the settings.
     """
-    if scene is None:
-        return
-    least = 0.5 * settings.thread_length / settings.segments
-    if not scene.dish.radius > 2.0 * least:
-        words = f"more than {4.0 * least:g} m, two segments of {settings.GROUP}"
-        raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, words)
-    for shape in scene.shapes:
-        name, words = f"scene.{shape.name}", f"of at least {least:g} m, half of a segment of {settings.GROUP}"
-        if isinstance(shape.geometry, Disc):
-            if shape.geometry.radius < least:
-                raise ConfigurationError(name, shape.geometry.radius, f"a radius {words}")
-        elif not shape.geometry.can_contain(least):
-            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {words}")
+    values: dict[str, Any] = {}
+    if message.name:
+        values = {"material": message.name, "diameter": 0.0, "elastic_modulus": 0.0, "paper_stiffness_weight": 0.0}
+    for name in ("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"):
+        number = getattr(message, name)
+        if number != 0.0 and not math.isnan(number):
+            values[name] = number
+    if len(message.rest_curvature):
+        values["rest_curvature"] = float(message.rest_curvature[0])
+    if message.attachment:
+        values["attachment"] = message.attachment
+    if len(message.attachment_offset):
+        values["attachment_offset"] = [float(part) for part in message.attachment_offset]
+    return values

@@ -16,7 +16,7 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.model.barriers import ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.program import (
     SPAN,
@@ -55,6 +55,23 @@ class ThreadState:
     def at_rest(cls, positions: Points) -> ThreadState:
         """Return a thread that does not move."""
         return cls(positions, np.zeros_like(positions))
+
+    def resampled(self, before: Thread, thread: Thread) -> ThreadState:
+        """Return the state of a thread that takes another's place: it lies where that lay and moves as that moved.
+
+        A longer one goes on straight at its end. Where segments and length are the same, nothing changes.
+
+        Args:
+            before: the thread that this is the state of.
+            thread: the thread that takes its place.
+        """
+        if (thread.segments, thread.length) == (before.segments, before.length):
+            return self
+        positions = chain_along(self.positions, thread.segments, thread.segment_length)
+        at = thread.segment_length * np.arange(thread.segments + 1)
+        nodes = before.segment_length * np.arange(before.segments + 1)
+        velocities = np.column_stack([np.interp(at, nodes, along) for along in self.velocities.T])
+        return ThreadState(positions, velocities, self.interval)
 
 
 @dataclass(frozen=True)
