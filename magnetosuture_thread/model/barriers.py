@@ -129,14 +129,14 @@ def _distance_rows(
     positions: Points, apart: int, max_distance: float | NDArray[np.float64], name: str, sign: float
 ) -> BarrierRows:
     """Return the rows of `distance_barrier`, or of its negative, with their gradient at the two nodes they touch."""
-    count, first = len(positions) - apart, np.arange(len(positions) - apart)
-    bound, value, gradient = np.empty(count), np.empty(count), np.empty((count, 3, positions.shape[1]))
-    bound[:] = max_distance
+    count = len(positions) - apart
+    bound, value, gradient = np.full(count, max_distance), np.empty(count), np.empty((count, 3, positions.shape[1]))
     distance_barrier(np.ascontiguousarray(positions), apart, bound, value, gradient)
-    column = first - np.minimum(first, len(positions) - 3)
-    touched = np.stack([gradient[first, column], gradient[first, column + apart]], axis=1)
+    touched = gradient[:, ::apart][:, :2]
+    if apart == 1:
+        touched[-1] = gradient[-1, 1:]  # the last three nodes begin one before this row's
     clearance = sign * (bound - np.sqrt(np.einsum("rd,rd->r", touched[:, 0], touched[:, 0])))
-    nodes = np.column_stack([first, first + apart])
+    nodes = np.arange(count)[:, None] + np.array([0, apart])
     return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), sign * value, sign * touched, clearance)
 
 

@@ -174,14 +174,11 @@ class ThreadModelSettings(Configuration):
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
         if self.friction_threshold > self.margin_range:
-            expected = f"at most {self.GROUP}.margin_range, {self.margin_range:g} m"
-            raise ConfigurationError(f"{self.GROUP}.friction_threshold", self.friction_threshold, expected)
-        diameter = self._material().diameter
-        if self.thread_length / self.segments <= diameter:
+            raise self.refused("friction_threshold", f"at most {self.GROUP}.margin_range, {self.margin_range:g} m")
+        diameter, segments = self._material().diameter, self.segments
+        if self.thread_length / segments <= diameter:
             most = math.ceil(self.thread_length / diameter) - 1
-            raise ConfigurationError(
-                f"{self.GROUP}.segments", self.segments, f"at most {most}, so that a segment is longer than thick"
-            )
+            raise self.refused("segments", f"at most {most}, so that a segment is longer than thick")
         for name, pair, words in (
             ("attachment_offset", self.attachment_offset, "along and to the left"),
             ("gravity", self.gravity, "x and y"),
@@ -192,26 +189,21 @@ class ThreadModelSettings(Configuration):
             try:
                 make_solver(self.solver, self.residual_tolerance)
             except ConfigurationError as error:
-                raise ConfigurationError(f"{self.GROUP}.solver", self.solver, error.expectation) from None
+                raise self.refused("solver", error.expectation) from None
         if self.formulation == "paper" and self.medium != "liquid":
-            raise ConfigurationError(
-                f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
-            )
-        turn = abs(self.rest_curvature) * self.thread_length / self.segments
-        if turn > MAX_REST_ANGLE:
-            sharpest = MAX_REST_ANGLE * self.segments / self.thread_length
-            words = f"at most {sharpest:.0f} 1/m with {self.segments} segments, which turn by half a radian then"
-            raise ConfigurationError(f"{self.GROUP}.rest_curvature", self.rest_curvature, words)
+            raise self.refused("medium", "liquid, as the formulation paper has no inertia")
+        if abs(self.rest_curvature) * self.thread_length / segments > MAX_REST_ANGLE:
+            limit = MAX_REST_ANGLE * segments / self.thread_length
+            words = f"at most {limit:.0f} 1/m with {segments} segments, which turn by half a radian then"
+            raise self.refused("rest_curvature", words)
         for about in configuration_fields(type(self)):
             other = OF_MEDIUM.get(about.name, self.medium)
             if other != self.medium and getattr(self, about.name) != about.default:
-                name, value = f"{self.GROUP}.{about.name}", getattr(self, about.name)
-                raise ConfigurationError(
-                    name, value, f"{about.default}, its default: it counts for medium: {other} only"
-                )
+                words = f"{about.default}, its default: it counts for medium: {other} only"
+                raise self.refused(about.name, words)
         for node in self.fixed_nodes:
-            if node > self.segments:
-                raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {self.segments}")
+            if node > segments:
+                raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {segments}")
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]
