@@ -125,19 +125,40 @@ def distance_barrier(
         value[i] = 0.5 * (max_distance[i] ** 2 - square)
 
 
+@compiled
+def _write_distance_rows(
+    positions: Points,
+    apart: int,
+    bound: NDArray[np.float64],
+    sign: float,
+    nodes: NDArray[np.intp],
+    rows: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> None:
+    """Write the rows of `_distance_rows`: value and clearance, shape (2, m), and the gradient at the two nodes."""
+    count, dimension = len(bound), positions.shape[1]
+    three = np.empty((count, 3, dimension))
+    distance_barrier(positions, apart, bound, rows[0], three)
+    for i in range(count):
+        nodes[i, 0], nodes[i, 1] = i, i + apart
+        shift, square = i - min(i, len(positions) - 3), 0.0
+        for a in range(dimension):
+            gradient[i, 0, a], gradient[i, 1, a] = sign * three[i, shift, a], sign * three[i, shift + apart, a]
+            square += three[i, shift, a] * three[i, shift, a]
+        rows[0, i] *= sign
+        rows[1, i] = sign * (bound[i] - np.sqrt(square))
+
+
 def _distance_rows(
     positions: Points, apart: int, max_distance: float | NDArray[np.float64], name: str, sign: float
 ) -> BarrierRows:
     """Return the rows of `distance_barrier`, or of its negative, with their gradient at the two nodes they touch."""
-    count = len(positions) - apart
-    bound, value, gradient = np.full(count, max_distance), np.empty(count), np.empty((count, 3, positions.shape[1]))
-    distance_barrier(np.ascontiguousarray(positions), apart, bound, value, gradient)
-    touched = gradient[:, ::apart][:, :2]
-    if apart == 1:
-        touched[-1] = gradient[-1, 1:]  # the last three nodes begin one before this row's
-    clearance = sign * (bound - np.sqrt(np.einsum("rd,rd->r", touched[:, 0], touched[:, 0])))
-    nodes = np.arange(count)[:, None] + np.array([0, apart])
-    return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), sign * value, sign * touched, clearance)
+    count, dimension = len(positions) - apart, positions.shape[1]
+    bound, nodes = np.empty(count), np.empty((count, 2), dtype=np.intp)
+    rows, gradient = np.empty((2, count)), np.empty((count, 2, dimension))
+    bound[:] = max_distance
+    _write_distance_rows(np.ascontiguousarray(positions), apart, bound, sign, nodes, rows, gradient)
+    return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), rows[0], gradient, rows[1])
 
 
 @dataclass(frozen=True)
@@ -158,7 +179,7 @@ class _ContactBarrier(CompiledBarrier):
 
     def rows_of(self, contacts: Contacts) -> BarrierRows:
         """Return the same rows from what is known to be near."""
-        chosen = contacts.nearest & ((contacts.obstacle == DISH_WALL) == (self.name == WALL))
+        chosen = np.flatnonzero(contacts.nearest & ((contacts.obstacle == DISH_WALL) == (self.name == WALL)))
         signed, normal = contacts.distance[chosen], contacts.normal[chosen]
         value, gradient = self._function(signed, normal)
         node, obstacle = contacts.node[chosen][:, None], contacts.obstacle[chosen]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Workspace
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.model.formulations import (
     Formulation,
@@ -27,7 +27,7 @@ from magnetosuture_thread.model.formulations import (
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
 from magnetosuture_thread.model.solvers import make_solver
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread, check_scene, direction_between
 from magnetosuture_thread.scene import Scene
 
 MAX_COORDINATE = 10.0  # m; nothing that a dish could hold is farther away
@@ -150,7 +150,7 @@ class ThreadPredictor:
         if isinstance(scene, Workspace):
             workspace = scene
         elif scene is not None:
-            _check_scene(thread, scene)
+            check_scene(thread, scene)
             workspace = Workspace(scene.obstacles, margin_range, wall_radius=scene.dish.radius)
             self._scene_version = scene.version
         if isinstance(formulation, str):
@@ -331,7 +331,7 @@ class ThreadPredictor:
         residuals, worst, converged = Residuals(0.0, 0.0, 0.0), None, True
         for index in range(1, substeps + 1):
             part = index / substeps
-            heading = _between(last.heading, pose.heading, part)
+            heading = direction_between(last.heading, pose.heading, part)
             done = self._formulation.step(
                 state,
                 PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval),
@@ -397,35 +397,3 @@ def check_pose(pose: NeedlePose) -> None:
         )
     if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
         raise InvalidInputError("needle pose heading", heading, "a unit vector")
-
-
-def _between(first: Points, second: Points, part: float) -> Points:
-    """Return the direction between two unit vectors; where they are opposite, the second."""
-    mixed = [(1.0 - part) * a + part * b for a, b in zip(first.tolist(), second.tolist(), strict=True)]
-    square = 0.0
-    for value in mixed:  # `hypot`, and `sum` from Python 3.12 on, round in another way than numpy
-        square += value * value
-    size = math.sqrt(square)
-    return np.array([value / size for value in mixed]) if size > 1e-6 else second
-
-
-def _check_scene(thread: Thread, scene: Scene) -> None:
-    """Refuse a scene that the segments of a thread do not resolve.
-
-    A segment could lie across a shape that is smaller, with both of its nodes outside; in a dish that is narrower
-    than two segments, no chain can turn.
-
-    Raises:
-        ConfigurationError: the shape that is too small, or the dish.
-    """
-    radius = 0.5 * thread.segment_length
-    if not scene.dish.radius > 2.0 * radius:
-        expected = f"more than {4.0 * radius:g} m, two segments of thread_model"
-        raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
-    for shape in scene.shapes:
-        name, expected = f"scene.{shape.name}", f"of at least {radius:g} m, half of a segment of thread_model"
-        if isinstance(shape.geometry, Disc):
-            if shape.geometry.radius < radius:
-                raise ConfigurationError(name, shape.geometry.radius, f"a radius {expected}")
-        elif not shape.geometry.can_contain(radius):
-            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {expected}")

@@ -5,9 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,7 @@ class Thread:
     attachment: Attachment
     rest_curvature: float | tuple[float, ...] = 0.0
 
-    @property
+    @cached_property
     def segment_length(self) -> float:
         """Rest length of a segment, D = L / n [m]."""
         return self.length / self.segments
@@ -193,3 +198,35 @@ class Thread:
             attachment=attachment,
             rest_curvature=rest_curvature,
         )
+
+
+def direction_between(first: NDArray[np.float64], second: NDArray[np.float64], part: float) -> NDArray[np.float64]:
+    """Return the direction between two unit vectors; where they are opposite, the second."""
+    mixed = [(1.0 - part) * a + part * b for a, b in zip(first.tolist(), second.tolist(), strict=True)]
+    square = 0.0
+    for value in mixed:  # `hypot`, and `sum` from Python 3.12 on, round in another way than numpy
+        square += value * value
+    size = math.sqrt(square)
+    return np.array([value / size for value in mixed]) if size > 1e-6 else second
+
+
+def check_scene(thread: Thread, scene: Scene) -> None:
+    """Refuse a scene that the segments of a thread do not resolve.
+
+    A segment could lie across a shape that is smaller, with both of its nodes outside; in a dish that is narrower
+    than two segments, no chain can turn.
+
+    Raises:
+        ConfigurationError: the shape that is too small, or the dish.
+    """
+    radius = 0.5 * thread.segment_length
+    if not scene.dish.radius > 2.0 * radius:
+        expected = f"more than {4.0 * radius:g} m, two segments of thread_model"
+        raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
+    for shape in scene.shapes:
+        name, expected = f"scene.{shape.name}", f"of at least {radius:g} m, half of a segment of thread_model"
+        if isinstance(shape.geometry, Disc):
+            if shape.geometry.radius < radius:
+                raise ConfigurationError(name, shape.geometry.radius, f"a radius {expected}")
+        elif not shape.geometry.can_contain(radius):
+            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {expected}")

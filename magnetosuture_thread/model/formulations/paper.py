@@ -41,10 +41,10 @@ from magnetosuture_thread.model.barriers import (
     squared_barrier,
     stiffness_function,
 )
+from magnetosuture_thread.model.formulations.added_rows import LinearRows
 from magnetosuture_thread.model.formulations.step import (
     DEPTH_TOLERANCE,
     Formulation,
-    LinearRows,
     PrescribedMotion,
     StepBuffers,
     StepResult,

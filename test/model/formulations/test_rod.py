@@ -17,7 +17,7 @@ from magnetosuture_thread.model.formulations import (
     StepResult,
     ThreadState,
 )
-from magnetosuture_thread.model.formulations.rod import MotionBuffers, StepInput, init_step
+from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, StepInput, init_step
 from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, WideRows
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
