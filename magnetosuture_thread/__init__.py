@@ -15,9 +15,8 @@ if TYPE_CHECKING:
     from magnetosuture_thread.jobs.calibrate import calibrate_bags
     from magnetosuture_thread.jobs.replay_offline import replay_offline
     from magnetosuture_thread.model.margins import BarrierMargins, Margins
-    from magnetosuture_thread.model.medium import Medium
     from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
-    from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+    from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
     from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
     from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
@@ -28,9 +27,8 @@ _HOME = {
     "jobs.calibrate": ("calibrate_bags",),
     "jobs.replay_offline": ("replay_offline",),
     "model.margins": ("BarrierMargins", "Margins"),
-    "model.medium": ("Medium",),
     "model.predictor": ("NeedlePose", "Prediction", "ThreadPredictor"),
-    "model.thread": ("MATERIALS", "Attachment", "Material", "Thread"),
+    "model.thread": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
     "safety": ("FilteredCommand", "NeedleSafetyFilter"),
     "scene": ("Dish", "Scene", "SceneShape", "read_scene"),
 }

@@ -93,6 +93,10 @@ class Configuration:
     def check(self) -> None:
         """Raise `ConfigurationError` where fields that are valid apart don't fit together."""
 
+    def refused(self, name: str, expected: str) -> ConfigurationError:
+        """Return the error of a field whose value does not fit the others."""
+        return ConfigurationError(f"{self.GROUP}.{name}", getattr(self, name), expected)
+
 
 @dataclass(frozen=True)
 class ConfigurationField:

@@ -22,8 +22,8 @@ from benchmarks.baselines.xpbd import XpbdRope
 from benchmarks.solver.cases import OBSTACLES, Case, case
 from benchmarks.solver.timing import Captured, Run, Timing, run, time_solves, time_steps, timed
 from magnetosuture_thread.model.program import as_quadratic_program
+from magnetosuture_thread.model.solvers import OsqpSolver
 from magnetosuture_thread.model.solvers.banded import BandedSolver
-from magnetosuture_thread.model.solvers.osqp import OsqpSolver
 
 EXTRA = "pip install 'magnetosuture_thread[peers]'"
 SIMULATORS: dict[str, Callable[[Case], Simulator]] = {

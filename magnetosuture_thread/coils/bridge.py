@@ -12,12 +12,11 @@ from magnetosuture_thread.coils.allocation import Allocation
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.pose_extrapolator import Pose, PoseExtrapolator
-from magnetosuture_thread.coils.prediction_monitor import PredictionMonitor
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.watchdog import CommandWatchdog
+from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
-from magnetosuture_thread.safety.filter import STUCK, held_by
+from magnetosuture_thread.safety.filter import STUCK, rest_reason
 from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
@@ -254,11 +253,11 @@ class CoilBridge:
         )
         if math.hypot(*allocation.velocity) <= STUCK * math.hypot(*filtered.filtered):
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
-            self._blocked, self._blocked_reason = arrival, f"{held_by(names)}: no feasible currents"
+            self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
         self.extrapolator.apply_velocity(allocation.velocity, now, arrival)
-        return self._output(allocation, selected, filtered.filtered, (), True, active, filtered.slowdown)
+        return self._output(selected, (), True, active, filtered.slowdown)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
         """Return the input to follow at a time of the stamps' clock and a monotonic time [s]."""
@@ -311,23 +310,22 @@ class CoilBridge:
         self.extrapolator.apply_velocity(self._velocity, now, arrival)
         publish = arrival - self._stopped <= self._settings.zero_hold
         slowdown = filtered.slowdown if filtered is not None else 1.0
-        return self._output(self._previous, selected, np.zeros(2), reasons, publish, active, slowdown)
+        return self._output(selected, reasons, publish, active, slowdown)
 
     def _output(
         self,
-        allocation: Allocation,
         selected: _SelectedInput,
-        filtered: Vector,
         reasons: tuple[str, ...],
         publish: bool,
         active: tuple[str, ...],
         slowdown: float,
     ) -> BridgeOutput:
+        """Return the result of a step with the currents and the filtered velocity that it has ended with."""
         return BridgeOutput(
             self.coils,
-            allocation,
+            self._previous,
             selected.velocity,
-            filtered,
+            self._velocity,
             reasons,
             publish,
             selected.source,

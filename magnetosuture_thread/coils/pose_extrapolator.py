@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.input_checks import PublisherCounter, check_stamp
+from magnetosuture_thread.coils.watchdog import PublisherCounter, check_stamp
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.safety import NeedleKinematics
 

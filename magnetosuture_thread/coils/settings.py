@@ -21,8 +21,8 @@ from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 
 REACH_RATIO = 0.9  # of the reach to the coils' distance
-MIN_TIMEOUT_PERIODS = 4.0  # of the loop; two of them are the lookahead of the bridge
-MIN_DRIVER_TIMEOUT_PERIODS = 2.0  # of the loop, or drivers would switch off between two steps
+# Of the loop: two of the first four are the lookahead of the bridge; drivers would switch off between two steps.
+MIN_TIMEOUT_PERIODS = {"command_timeout": 4.0, "pose_timeout": 4.0, "driver_timeout": 2.0 * (1.0 - 1e-9)}
 MAX_BLIND_DISTANCE = 0.0125  # m; maximum distance of free motion within the hold time
 
 
@@ -240,29 +240,16 @@ class CoilBridgeSettings(Configuration):
                 name = f"{self.GROUP}.calibration"
                 raise ConfigurationError(name, f"{count} coils in {self.calibration}", f"{known}, as in coil_angles")
         if self.autostart == "armed" and self.driver == "roboclaw":
-            name = f"{self.GROUP}.autostart"
-            raise ConfigurationError(name, self.autostart, "active at most: hardware is armed by an operator")
+            raise self.refused("autostart", "active at most: hardware is armed by an operator")
         if self.keep_out < 0.5 * self.needle_width:
-            expected = f"at least {0.5 * self.needle_width:g} m, half of {self.GROUP}.needle_width"
-            raise ConfigurationError(f"{self.GROUP}.keep_out", self.keep_out, expected)
-        for name in ("command_timeout", "pose_timeout"):
-            if getattr(self, name) * self.rate < MIN_TIMEOUT_PERIODS:
-                expected = (
-                    f"at least {MIN_TIMEOUT_PERIODS / self.rate:g} s, {MIN_TIMEOUT_PERIODS:g} periods of the loop"
-                )
-                raise ConfigurationError(f"{self.GROUP}.{name}", getattr(self, name), expected)
-        if self.driver_timeout * self.rate < MIN_DRIVER_TIMEOUT_PERIODS * (1.0 - 1e-9):
-            expected = _periods_text(MIN_DRIVER_TIMEOUT_PERIODS, self.rate)
-            raise ConfigurationError(f"{self.GROUP}.driver_timeout", self.driver_timeout, expected)
+            raise self.refused("keep_out", f"at least {0.5 * self.needle_width:g} m, half of {self.GROUP}.needle_width")
+        for name, periods in MIN_TIMEOUT_PERIODS.items():
+            if getattr(self, name) * self.rate < periods:
+                raise self.refused(name, f"at least {periods / self.rate:g} s, {periods:g} periods of the loop")
         if self.max_speed * self.hold_time > MAX_BLIND_DISTANCE * (1.0 + 1e-9):
             limit = MAX_BLIND_DISTANCE / self.hold_time
             rule = f"max_speed x (driver_timeout + 1 / rate) may be at most {MAX_BLIND_DISTANCE:g} m"
-            raise ConfigurationError(f"{self.GROUP}.max_speed", self.max_speed, f"at most {limit:.3g} m/s: {rule}")
+            raise self.refused("max_speed", f"at most {limit:.3g} m/s: {rule}")
         # One step may not use more than the whole clearance.
         if self.approach_rate > self.rate:
-            name = f"{self.GROUP}.approach_rate"
-            raise ConfigurationError(name, self.approach_rate, f"at most {self.GROUP}.rate, {self.rate:g} 1/s")
-
-
-def _periods_text(periods: float, rate: float) -> str:
-    return f"at least {periods / rate:g} s, {periods:g} periods of the loop"
+            raise self.refused("approach_rate", f"at most {self.GROUP}.rate, {self.rate:g} 1/s")

@@ -17,10 +17,9 @@ from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajecto
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations import PaperOptions
-from magnetosuture_thread.model.medium import Medium
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.model.program import SOLVED
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Medium, Thread
 
 TOLERANCE = 1e-6  # of the residuals
 CONTACT_RANGE = 3e-3  # m; within this of an obstacle, depths are looked at

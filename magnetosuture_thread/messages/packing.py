@@ -26,8 +26,7 @@ from magnetosuture_thread.messages.cdr import (
     text,
     text_codes,
 )
-from magnetosuture_thread.model.friction import Friction, FrictionState, friction_colour
-from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.margins import Friction, FrictionState, Margins, friction_colour
 from magnetosuture_thread.model.predictor import Prediction
 
 _UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg

@@ -17,8 +17,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import DISH_FRAME, MARGINS, MEASURED_THREAD, NEEDLE_POSE
 from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
-from magnetosuture_thread.model.friction import Friction, FrictionState
-from magnetosuture_thread.model.margins import BarrierMargins, Margins
+from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.model.predictor import NeedlePose
 
 _POSE = struct.Struct("<7d")  # position and quaternion

@@ -1,10 +1,10 @@
 """Model: predicts the thread behind the needle."""
 
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
-from magnetosuture_thread.model.factory import make_formulation, make_solver
-from magnetosuture_thread.model.medium import Medium
+from magnetosuture_thread.model.formulations import make_formulation
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+from magnetosuture_thread.model.solvers import make_solver
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
 
 __all__ = [
     "MATERIALS",

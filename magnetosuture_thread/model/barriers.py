@@ -20,7 +20,7 @@ from magnetosuture_thread.barrier import (
 )
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
-from magnetosuture_thread.geometry.obstacles import Workspace, wall_contact
+from magnetosuture_thread.geometry.obstacles import Contacts, Workspace, wall_contact
 from magnetosuture_thread.geometry.polyline import Points
 
 
@@ -99,16 +99,16 @@ class Compression(CompiledBarrier):
 def distance_barrier(
     positions: Points,
     apart: int,
-    longest: NDArray[np.float64],
+    max_distance: NDArray[np.float64],
     value: NDArray[np.float64],
     gradient: NDArray[np.float64],
 ) -> None:
-    """Write h_i = (longest_i^2 - |x_{i + apart} - x_i|^2) / 2 and its gradient at the nodes i ... i + 2.
+    """Write h_i = (max_distance_i^2 - |x_{i + apart} - x_i|^2) / 2 and its gradient at the nodes i ... i + 2.
 
     Args:
         positions: all nodes, shape (m, d).
         apart: 1 or 2.
-        longest: greatest distance, shape (m - apart,).
+        max_distance: greatest distance, shape (m - apart,).
         value: written, shape (m - apart,).
         gradient: written, at the three nodes from min(i, m - 3) on, shape (m - apart, 3, d).
     """
@@ -122,49 +122,76 @@ def distance_barrier(
             gradient[i, shift, a] = difference
             gradient[i, shift + apart, a] = -difference
             square += difference * difference
-        value[i] = 0.5 * (longest[i] ** 2 - square)
+        value[i] = 0.5 * (max_distance[i] ** 2 - square)
 
 
 @compiled
 def _write_distance_rows(
     positions: Points,
     apart: int,
-    longest: NDArray[np.float64],
+    bound: NDArray[np.float64],
     sign: float,
     nodes: NDArray[np.intp],
-    value: NDArray[np.float64],
+    rows: NDArray[np.float64],
     gradient: NDArray[np.float64],
-    clearance: NDArray[np.float64],
 ) -> None:
-    """Write the rows of `_distance_rows`, with their gradient at the two nodes that they touch."""
-    count, dimension = len(positions) - apart, positions.shape[1]
-    spread = np.empty((count, 3, dimension))
-    distance_barrier(positions, apart, longest, value, spread)
+    """Write the rows of `_distance_rows`: value and clearance, shape (2, m), and the gradient at the two nodes."""
+    count, dimension = len(bound), positions.shape[1]
+    three = np.empty((count, 3, dimension))
+    distance_barrier(positions, apart, bound, rows[0], three)
     for i in range(count):
         nodes[i, 0], nodes[i, 1] = i, i + apart
         shift, square = i - min(i, len(positions) - 3), 0.0
         for a in range(dimension):
-            gradient[i, 0, a] = sign * spread[i, shift, a]
-            gradient[i, 1, a] = sign * spread[i, shift + apart, a]
-            square += spread[i, shift, a] * spread[i, shift, a]
-        value[i] *= sign
-        clearance[i] = sign * (longest[i] - np.sqrt(square))
+            gradient[i, 0, a], gradient[i, 1, a] = sign * three[i, shift, a], sign * three[i, shift + apart, a]
+            square += three[i, shift, a] * three[i, shift, a]
+        rows[0, i] *= sign
+        rows[1, i] = sign * (bound[i] - np.sqrt(square))
 
 
 def _distance_rows(
-    positions: Points, apart: int, longest: float | NDArray[np.float64], name: str, sign: float
+    positions: Points, apart: int, max_distance: float | NDArray[np.float64], name: str, sign: float
 ) -> BarrierRows:
-    positions = np.ascontiguousarray(positions)
+    """Return the rows of `distance_barrier`, or of its negative, with their gradient at the two nodes they touch."""
     count, dimension = len(positions) - apart, positions.shape[1]
     bound, nodes = np.empty(count), np.empty((count, 2), dtype=np.intp)
-    value, gradient, clearance = np.empty(count), np.empty((count, 2, dimension)), np.empty(count)
-    bound[:] = longest
-    _write_distance_rows(positions, apart, bound, sign, nodes, value, gradient, clearance)
-    return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), value, gradient, clearance)
+    rows, gradient = np.empty((2, count)), np.empty((count, 2, dimension))
+    bound[:] = max_distance
+    _write_distance_rows(np.ascontiguousarray(positions), apart, bound, sign, nodes, rows, gradient)
+    return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), rows[0], gradient, rows[1])
 
 
 @dataclass(frozen=True)
-class ObstacleAvoidance(CompiledBarrier):
+class _ContactBarrier(CompiledBarrier):
+    """A barrier of the nodes' signed distance from something solid.
+
+    Attributes:
+        workspace: obstacles and wall, in the unit of the positions.
+        distance: rho, least distance of a node from a surface; the thread's radius.
+    """
+
+    workspace: Workspace
+    distance: float
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
+        return self.rows_of(self.workspace.near(positions))
+
+    def rows_of(self, contacts: Contacts) -> BarrierRows:
+        """Return the same rows from what is known to be near."""
+        chosen = np.flatnonzero(contacts.nearest & ((contacts.obstacle == DISH_WALL) == (self.name == WALL)))
+        signed, normal = contacts.distance[chosen], contacts.normal[chosen]
+        value, gradient = self._function(signed, normal)
+        node, obstacle = contacts.node[chosen][:, None], contacts.obstacle[chosen]
+        return BarrierRows(self.name, node, obstacle, value, gradient[:, None, :], signed - self.distance)
+
+    def _function(self, signed: NDArray[np.float64], normal: Points) -> tuple[NDArray[np.float64], Points]:
+        """Return h and its gradient for signed distances and their gradients."""
+        return signed - self.distance, normal
+
+
+@dataclass(frozen=True)
+class ObstacleAvoidance(_ContactBarrier):
     """Every node, the needle's tail among them, keeps its distance from every obstacle that is near.
 
         h_obs,i,O = sd_O(x_i) - rho,    i = 0 ... n,  O = 1 ... M
@@ -177,33 +204,13 @@ class ObstacleAvoidance(CompiledBarrier):
     the obstacle both have the same safe set; but the paper's gradient vanishes on the surface and points
     inwards below it, so that a node which once got inside is kept there. The signed distance has a unit
     gradient everywhere.
-
-    Attributes:
-        workspace: the obstacles, in the unit of the positions.
-        distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
     name = OBSTACLE
-    workspace: Workspace
-    distance: float
-
-    def rows(self, positions: Points) -> BarrierRows:
-        """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
-        found = self.workspace.near(positions)
-        chosen = found.nearest & (found.obstacle != DISH_WALL)
-        value = found.distance[chosen] - self.distance
-        return BarrierRows(
-            name=self.name,
-            nodes=found.node[chosen][:, None],
-            obstacle=found.obstacle[chosen],
-            value=value,
-            gradient=found.normal[chosen][:, None, :],
-            clearance=value,
-        )
 
 
 @dataclass(frozen=True)
-class SquaredObstacleAvoidance(CompiledBarrier):
+class SquaredObstacleAvoidance(_ContactBarrier):
     """The same margin in the paper's form.
 
         h_obs,i,O = (sd |sd| - rho^2) / 2,    sd = sd_O(x_i)
@@ -213,32 +220,14 @@ class SquaredObstacleAvoidance(CompiledBarrier):
     Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: |x - p|^2
     is signed, negative inside, so that the gradient |sd| n points out of the obstacle on both sides. It
     vanishes on the surface: the formulation `paper` takes `ObstacleAvoidance` for nodes that are too near.
-
-    Attributes:
-        workspace: the obstacles, in the unit of the positions.
-        distance: rho, least distance of a node from a surface; the thread's radius.
     """
 
     name = OBSTACLE
-    workspace: Workspace
-    distance: float
 
-    def rows(self, positions: Points) -> BarrierRows:
-        """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
-        found = self.workspace.near(positions)
-        chosen = found.nearest & (found.obstacle != DISH_WALL)
-        signed = found.distance[chosen]
-        value, slope = np.empty(len(signed)), np.empty(len(signed))
-        for k in range(len(signed)):
-            value[k], slope[k] = squared_barrier(signed[k], self.distance)
-        return BarrierRows(
-            name=self.name,
-            nodes=found.node[chosen][:, None],
-            obstacle=found.obstacle[chosen],
-            value=value,
-            gradient=(slope[:, None] * found.normal[chosen])[:, None, :],
-            clearance=signed - self.distance,
-        )
+    def _function(self, signed: NDArray[np.float64], normal: Points) -> tuple[NDArray[np.float64], Points]:
+        pairs = [squared_barrier(distance, self.distance) for distance in signed.tolist()]
+        value, slope = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+        return value, slope[:, None] * normal
 
 
 @compiled
@@ -248,60 +237,22 @@ def squared_barrier(signed: float, distance: float) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class WallAvoidance(CompiledBarrier):
+class WallAvoidance(_ContactBarrier):
     """Every node, the needle's tail among them, keeps its distance from the wall of the dish.
 
         h_wall,i = R - rho - |x_i|,    i = 0 ... n
 
     about the origin; in space |x_i| is the distance from the axis z. Unit of h: that of the positions. A node
-    farther from the wall than the reach has no row.
+    farther from the wall than the workspace' reach has no row.
 
     Its safe set is a disc, so convex, and h is concave: the half plane  h(y) + grad h(y)' (x - y) >= 0  about any
     point y holds the whole disc, and what else it holds lies outside of the circle by  |x - y|^2 / (2 R)  at most.
     So no row ever forbids what the wall allows, but a step has to take care of what one row leaves.
 
     Source: none. Deviation: the paper has no wall; its dish is larger than its thread is long.
-
-    Attributes:
-        radius: R of the dish, in the unit of the positions; inf for none.
-        distance: rho, least distance of a node from the wall; the thread's radius.
-        reach: greatest distance at which a node has a row.
     """
 
     name = WALL
-    radius: float
-    distance: float
-    reach: float
-
-    def rows(self, positions: Points) -> BarrierRows:
-        """Return a row for each near node, at positions of shape (n + 1, d)."""
-        positions = np.ascontiguousarray(positions)
-        count, dimension = positions.shape
-        nodes, value, gradient = np.empty((count, 1), np.intp), np.empty(count), np.zeros((count, 1, dimension))
-        found = _write_wall_rows(positions, self.radius, self.distance, self.reach, nodes, value, gradient)
-        value = value[:found]
-        return BarrierRows(self.name, nodes[:found], np.full(found, NO_OBSTACLE), value, gradient[:found], value)
-
-
-@compiled
-def _write_wall_rows(
-    positions: Points,
-    radius: float,
-    distance: float,
-    reach: float,
-    nodes: NDArray[np.intp],
-    value: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-) -> int:
-    """Write the rows of `WallAvoidance.rows`; return their number."""
-    count = 0
-    for i in range(len(positions)):
-        away, x, y = wall_contact(positions[i, 0], positions[i, 1], radius)
-        if away <= reach and away < np.inf:
-            nodes[count, 0], value[count] = i, away - distance
-            gradient[count, 0, 0], gradient[count, 0, 1] = x, y
-            count += 1
-    return count
 
 
 @compiled

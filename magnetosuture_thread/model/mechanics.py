@@ -218,7 +218,7 @@ def tension_stiffness(
     heading: Points,
     clamped: bool,
     tension: NDArray[np.float64],
-    least: float,
+    min_tension: float,
     interval: float,
     program: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
@@ -235,7 +235,7 @@ def tension_stiffness(
         heading: unit vector along the needle, used if clamped, shape (d,).
         clamped: whether the thread is clamped to the needle.
         tension: multipliers of the segments, shape (n,) or longer.
-        least: bound for a thread that is pushed, negative: never more than bending makes up for.
+        min_tension: bound for a thread that is pushed, negative: never more than bending makes up for.
         interval: dt [s].
         program: blocks, couplings and q, which are added to.
 
@@ -244,7 +244,7 @@ def tension_stiffness(
     blocks, couplings, linear = program
     nodes, dimension = positions.shape
     for i in range(0 if clamped else 1, nodes - 1):
-        pull = max((tension[i] + (tension[i - 1] if i > 0 else 0.0)) / 24.0, least)
+        pull = max((tension[i] + (tension[i - 1] if i > 0 else 0.0)) / 24.0, min_tension)
         square = 0.0
         for a in range(dimension):
             square += _turn(positions, heading, i, a) ** 2

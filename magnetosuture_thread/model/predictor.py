@@ -16,12 +16,18 @@ from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.factory import make_formulation, make_solver, workspace_of
-from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
+from magnetosuture_thread.model.formulations import (
+    Formulation,
+    PaperOptions,
+    PrescribedMotion,
+    StepResult,
+    ThreadState,
+    make_formulation,
+)
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.program import SOLVED, Residuals
-from magnetosuture_thread.model.resampling import resample_state
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.model.solvers import make_solver
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread, check_scene, direction_between
 from magnetosuture_thread.scene import Scene
 
 MAX_COORDINATE = 10.0  # m; nothing that a dish could hold is farther away
@@ -117,7 +123,8 @@ class ThreadPredictor:
         thread: the thread.
 
     Raises:
-        ConfigurationError: a name is unknown, a barrier or a shape cannot be used.
+        ConfigurationError: a name is unknown, a barrier or a shape cannot be used, or the segments do not resolve the
+            scene: a shape is narrower than one of them, or the dish than four.
         InvalidInputError: a fixed node is none of the thread's.
     """
 
@@ -139,7 +146,13 @@ class ThreadPredictor:
     ) -> None:
         for node in fixed_nodes:
             _check_node("fixed node", node, thread)
-        workspace = scene if isinstance(scene, Workspace) else workspace_of(scene, margin_range)
+        workspace, self._scene_version = Workspace((), margin_range), ""
+        if isinstance(scene, Workspace):
+            workspace = scene
+        elif scene is not None:
+            check_scene(thread, scene)
+            workspace = Workspace(scene.obstacles, margin_range, wall_radius=scene.dish.radius)
+            self._scene_version = scene.version
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)
             formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
@@ -149,7 +162,6 @@ class ThreadPredictor:
         self._most_substeps = max_substeps
         self._fixed = tuple(sorted(set(fixed_nodes)))
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
-        self._scene_version = scene.version if isinstance(scene, Scene) else ""
         self._pose: NeedlePose | None = None
         self._state: ThreadState | None = None
 
@@ -276,7 +288,7 @@ class ThreadPredictor:
     def follow_on(self, other: ThreadPredictor) -> None:
         """Go on from where another predictor's thread is, and as it moves, if it has started."""
         self._pose = other._pose
-        self._state = resample_state(other._state, other.thread, self.thread) if other._state is not None else None
+        self._state = other._state.resampled(other.thread, self.thread) if other._state is not None else None
 
     def step(self, pose: NeedlePose, prescribed: Mapping[int, Points] | None = None) -> Prediction:
         """Follow the needle to its next pose.
@@ -319,7 +331,7 @@ class ThreadPredictor:
         residuals, worst, converged = Residuals(0.0, 0.0, 0.0), None, True
         for index in range(1, substeps + 1):
             part = index / substeps
-            heading = _between(last.heading, pose.heading, part)
+            heading = direction_between(last.heading, pose.heading, part)
             done = self._formulation.step(
                 state,
                 PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval),
@@ -385,13 +397,3 @@ def check_pose(pose: NeedlePose) -> None:
         )
     if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
         raise InvalidInputError("needle pose heading", heading, "a unit vector")
-
-
-def _between(first: Points, second: Points, part: float) -> Points:
-    """Return the direction between two unit vectors; where they are opposite, the second."""
-    mixed = [(1.0 - part) * a + part * b for a, b in zip(first.tolist(), second.tolist(), strict=True)]
-    square = 0.0
-    for value in mixed:  # `hypot`, and `sum` from Python 3.12 on, round in another way than numpy
-        square += value * value
-    size = math.sqrt(square)
-    return np.array([value / size for value in mixed]) if size > 1e-6 else second

@@ -20,6 +20,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
 
@@ -127,11 +128,7 @@ class Solver(Protocol):
     name: str
 
     def solve(
-        self,
-        program: ChainProgram,
-        velocities: NDArray[np.float64],
-        multipliers: Vector,
-        wide: WideRows | None = None,
+        self, program: ChainProgram, velocities: Points, multipliers: Vector, wide: WideRows | None = None
     ) -> Solution:
         """Return the solution with its residuals, whatever it is: the caller judges it.
 

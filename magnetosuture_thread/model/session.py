@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
-from magnetosuture_thread.model.friction import FrictionLaw
-from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.margins import FrictionLaw, Margins
 from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import Thread

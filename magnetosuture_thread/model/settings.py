@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.factory import FORMULATIONS, SOLVERS, make_solver
-from magnetosuture_thread.model.formulations import PaperOptions
-from magnetosuture_thread.model.friction import FrictionLaw, NodeMotion
-from magnetosuture_thread.model.medium import Medium
+from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
+from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Thread
+from magnetosuture_thread.model.solvers import SOLVERS, make_solver
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 
@@ -176,14 +174,11 @@ class ThreadModelSettings(Configuration):
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
         if self.friction_threshold > self.margin_range:
-            expected = f"at most {self.GROUP}.margin_range, {self.margin_range:g} m"
-            raise ConfigurationError(f"{self.GROUP}.friction_threshold", self.friction_threshold, expected)
-        diameter = self._material().diameter
-        if self.thread_length / self.segments <= diameter:
+            raise self.refused("friction_threshold", f"at most {self.GROUP}.margin_range, {self.margin_range:g} m")
+        diameter, segments = self._material().diameter, self.segments
+        if self.thread_length / segments <= diameter:
             most = math.ceil(self.thread_length / diameter) - 1
-            raise ConfigurationError(
-                f"{self.GROUP}.segments", self.segments, f"at most {most}, so that a segment is longer than thick"
-            )
+            raise self.refused("segments", f"at most {most}, so that a segment is longer than thick")
         for name, pair, words in (
             ("attachment_offset", self.attachment_offset, "along and to the left"),
             ("gravity", self.gravity, "x and y"),
@@ -194,26 +189,21 @@ class ThreadModelSettings(Configuration):
             try:
                 make_solver(self.solver, self.residual_tolerance)
             except ConfigurationError as error:
-                raise ConfigurationError(f"{self.GROUP}.solver", self.solver, error.expectation) from None
+                raise self.refused("solver", error.expectation) from None
         if self.formulation == "paper" and self.medium != "liquid":
-            raise ConfigurationError(
-                f"{self.GROUP}.medium", self.medium, "liquid, as the formulation paper has no inertia"
-            )
-        turn = abs(self.rest_curvature) * self.thread_length / self.segments
-        if turn > MAX_REST_ANGLE:
-            sharpest = MAX_REST_ANGLE * self.segments / self.thread_length
-            words = f"at most {sharpest:.0f} 1/m with {self.segments} segments, which turn by half a radian then"
-            raise ConfigurationError(f"{self.GROUP}.rest_curvature", self.rest_curvature, words)
+            raise self.refused("medium", "liquid, as the formulation paper has no inertia")
+        if abs(self.rest_curvature) * self.thread_length / segments > MAX_REST_ANGLE:
+            limit = MAX_REST_ANGLE * segments / self.thread_length
+            words = f"at most {limit:.0f} 1/m with {segments} segments, which turn by half a radian then"
+            raise self.refused("rest_curvature", words)
         for about in configuration_fields(type(self)):
             other = OF_MEDIUM.get(about.name, self.medium)
             if other != self.medium and getattr(self, about.name) != about.default:
-                name, value = f"{self.GROUP}.{about.name}", getattr(self, about.name)
-                raise ConfigurationError(
-                    name, value, f"{about.default}, its default: it counts for medium: {other} only"
-                )
+                words = f"{about.default}, its default: it counts for medium: {other} only"
+                raise self.refused(about.name, words)
         for node in self.fixed_nodes:
-            if node > self.segments:
-                raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {self.segments}")
+            if node > segments:
+                raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {segments}")
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]
@@ -257,9 +247,8 @@ class ThreadModelSettings(Configuration):
         Raises:
             ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
-        check_scene(self, scene)
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
-        paper = replace(PaperOptions.tuned(weight), damping=self.paper_damping)
+        paper = PaperOptions.tuned(weight)._replace(damping=self.paper_damping)
         predictor = ThreadPredictor(
             self.thread(),
             scene,
@@ -285,29 +274,23 @@ class ThreadModelSettings(Configuration):
         return NodeMotion(self.friction_averaging)
 
 
-def check_scene(settings: ThreadModelSettings, scene: Scene | None) -> None:
-    """Refuse a scene that the segments of a thread do not resolve.
+def parse_material(message: Any) -> dict[str, Any]:
+    """Return the settings, by name, that a ThreadMaterial changes, whoever decoded it.
 
-    A segment could lie across a shape that is smaller, with both of its nodes outside; in a dish that is narrower
-    than two segments, no chain can turn.
-
-    Args:
-        settings: of the thread.
-        scene: dish and obstacles; None for neither.
-
-    Raises:
-        ConfigurationError: the shape that is too small, or the dish.
+    What is 0, not a number or empty stays as it is; but a material that is named brings its own diameter, modulus
+    and weight of the stiffness. The message has the units of the settings.
     """
-    if scene is None:
-        return
-    least = 0.5 * settings.thread_length / settings.segments
-    if not scene.dish.radius > 2.0 * least:
-        words = f"more than {4.0 * least:g} m, two segments of {settings.GROUP}"
-        raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, words)
-    for shape in scene.shapes:
-        name, words = f"scene.{shape.name}", f"of at least {least:g} m, half of a segment of {settings.GROUP}"
-        if isinstance(shape.geometry, Disc):
-            if shape.geometry.radius < least:
-                raise ConfigurationError(name, shape.geometry.radius, f"a radius {words}")
-        elif not shape.geometry.can_contain(least):
-            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {words}")
+    values: dict[str, Any] = {}
+    if message.name:
+        values = {"material": message.name, "diameter": 0.0, "elastic_modulus": 0.0, "paper_stiffness_weight": 0.0}
+    for name in ("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"):
+        number = getattr(message, name)
+        if number != 0.0 and not math.isnan(number):
+            values[name] = number
+    if len(message.rest_curvature):
+        values["rest_curvature"] = float(message.rest_curvature[0])
+    if message.attachment:
+        values["attachment"] = message.attachment
+    if len(message.attachment_offset):
+        values["attachment_offset"] = [float(part) for part in message.attachment_offset]
+    return values

@@ -1,15 +1,83 @@
-"""The thread as data: materials, and one thread of a material in a medium."""
+"""Thread, material and medium as data: a viscous liquid, or air with inertia and gravity."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.model.medium import Medium
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.scene import Scene
+
+
+@dataclass(frozen=True)
+class Medium:
+    """What a thread moves in, and what it does to the thread per length.
+
+    The force on a length ds that moves with velocity v and acceleration a is
+
+        -(zeta_perp (I - t t') + zeta_par t t') v ds + mu (g - a) ds
+
+    and bending is damped by a moment of EI tau times the rate of the curvature.
+
+    Attributes:
+        drag_across: zeta_perp, drag per length and speed across the thread [Pa s].
+        drag_along: zeta_par, the same along the thread [Pa s].
+        mass_per_length: mu [kg/m]; 0 where inertia does not matter.
+        gravity: g, one value for each dimension, or none [m/s^2]; it acts on the mass alone.
+        bending_damping: tau [s].
+    """
+
+    drag_across: float
+    drag_along: float
+    mass_per_length: float = 0.0
+    gravity: tuple[float, ...] = ()
+    bending_damping: float = 0.0
+
+    @classmethod
+    def liquid(
+        cls,
+        viscosity: float,
+        length: float,
+        diameter: float,
+        wetted_fraction: float = 0.5,
+        drag_anisotropy: float = 0.5,
+    ) -> Medium:
+        """Return the drag of a slender thread that floats in a viscous liquid, without inertia.
+
+            zeta_perp = f 4 pi mu / ln(2 L / d),    zeta_par = a zeta_perp
+
+        Args:
+            viscosity: mu [Pa s].
+            length: L of the thread [m].
+            diameter: d of the thread [m].
+            wetted_fraction: f, the part of the thread's surface that the liquid touches.
+            drag_anisotropy: a; half to leading order.
+
+        Source: slender-body theory, leading order in 1 / ln(2 L / d). Deviation: none; the paper has no
+        physical drag, only the damping kappa.
+        """
+        drag = wetted_fraction * 4.0 * math.pi * viscosity / math.log(2.0 * length / diameter)
+        return cls(drag_across=drag, drag_along=drag_anisotropy * drag)
+
+    @classmethod
+    def air(
+        cls, mass_per_length: float, gravity: tuple[float, ...], drag: float = 0.0, bending_damping: float = 0.0
+    ) -> Medium:
+        """Return a medium in which inertia and weight matter and the drag is small and the same all ways.
+
+        Args:
+            mass_per_length: mu [kg/m].
+            gravity: g, one value for each dimension [m/s^2].
+            drag: per length and speed [Pa s].
+            bending_damping: tau [s].
+        """
+        return cls(drag, drag, mass_per_length, gravity, bending_damping)
 
 
 @dataclass(frozen=True)
@@ -77,7 +145,7 @@ class Thread:
     attachment: Attachment
     rest_curvature: float | tuple[float, ...] = 0.0
 
-    @property
+    @cached_property
     def segment_length(self) -> float:
         """Rest length of a segment, D = L / n [m]."""
         return self.length / self.segments
@@ -130,3 +198,35 @@ class Thread:
             attachment=attachment,
             rest_curvature=rest_curvature,
         )
+
+
+def direction_between(first: NDArray[np.float64], second: NDArray[np.float64], part: float) -> NDArray[np.float64]:
+    """Return the direction between two unit vectors; where they are opposite, the second."""
+    mixed = [(1.0 - part) * a + part * b for a, b in zip(first.tolist(), second.tolist(), strict=True)]
+    square = 0.0
+    for value in mixed:  # `hypot`, and `sum` from Python 3.12 on, round in another way than numpy
+        square += value * value
+    size = math.sqrt(square)
+    return np.array([value / size for value in mixed]) if size > 1e-6 else second
+
+
+def check_scene(thread: Thread, scene: Scene) -> None:
+    """Refuse a scene that the segments of a thread do not resolve.
+
+    A segment could lie across a shape that is smaller, with both of its nodes outside; in a dish that is narrower
+    than two segments, no chain can turn.
+
+    Raises:
+        ConfigurationError: the shape that is too small, or the dish.
+    """
+    radius = 0.5 * thread.segment_length
+    if not scene.dish.radius > 2.0 * radius:
+        expected = f"more than {4.0 * radius:g} m, two segments of thread_model"
+        raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
+    for shape in scene.shapes:
+        name, expected = f"scene.{shape.name}", f"of at least {radius:g} m, half of a segment of thread_model"
+        if isinstance(shape.geometry, Disc):
+            if shape.geometry.radius < radius:
+                raise ConfigurationError(name, shape.geometry.radius, f"a radius {expected}")
+        elif not shape.geometry.can_contain(radius):
+            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {expected}")

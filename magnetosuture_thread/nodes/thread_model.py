@@ -16,7 +16,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp, time_of
 from magnetosuture_thread.messages.packing import packed_margins, packed_markers, packed_prediction
-from magnetosuture_thread.model.friction import UNKNOWN
+from magnetosuture_thread.model.margins import UNKNOWN
 from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession

@@ -8,9 +8,8 @@ from rclpy.node import Node
 
 from magnetosuture_thread.configuration import configuration_fields
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
-from magnetosuture_thread.model import changes
 from magnetosuture_thread.model.session import ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.model.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import decoded
@@ -43,7 +42,7 @@ class ThreadSettings:
                 raise InvalidInputError(
                     topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}"
                 )
-            self._parameters.set(changes.parse_material(decoded(topics.MATERIAL, data)))
+            self._parameters.set(parse_material(decoded(topics.MATERIAL, data)))
         except MagnetosutureError as error:
             self._health.refuse(error)
 

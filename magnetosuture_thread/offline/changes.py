@@ -6,8 +6,7 @@ from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.interface import MATERIAL, SCENE
 from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.model import changes
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.model.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.scene import Scene
 
 CHANGING = (SCENE, MATERIAL)
@@ -25,5 +24,5 @@ def changed(
     """
     if record.topic == SCENE.recorded:
         return settings, parse_scene_message(record.decode())
-    values = changes.parse_material(record.decode())
+    values = parse_material(record.decode())
     return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values}), scene

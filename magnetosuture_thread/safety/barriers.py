@@ -13,7 +13,7 @@ from magnetosuture_thread.geometry.half_planes import project_onto_half_planes
 from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
 from magnetosuture_thread.geometry.obstacles.search import search_edges
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.safety.certificate import NOTHING, WALL, safe_time
+from magnetosuture_thread.safety.certificate import NOTHING, WALL, PosedNeedle, safe_time
 from magnetosuture_thread.safety.packed_scene import PackedScene, polygon_distance
 
 LEAN, DEPTH = 0.1, 1e-5  # rad and m; so far beyond its bound, a point that slides leaves at this angle
@@ -71,14 +71,10 @@ def measure(
 
 @compiled
 def find_rows(
-    points: Points,
-    ends_only: bool,
+    needle: PosedNeedle,
     reach: float,
-    keep: float,
-    keep_wall: float,
+    band: float,
     scene: PackedScene,
-    distances: NDArray[np.float64],
-    normal: NDArray[np.float64],
     margin: NDArray[np.float64],
     gradient: NDArray[np.float64],
     bend: NDArray[np.float64],
@@ -87,14 +83,10 @@ def find_rows(
     """Write a row for every local minimum of a point's distance to the wall or a shape within reach.
 
     Args:
-        points: that stand for the needle, shape (m, 2) [m].
-        ends_only: see `safe_time`.
+        needle: in its pose.
         reach: greatest margin of a row [m].
-        keep: distance from shapes that the margin is counted from [m].
-        keep_wall: the same from the wall [m].
+        band: by which the margin is counted from farther away than the certificate asks for [m].
         scene: packed.
-        distances: see `measure`.
-        normal: see `measure`.
         margin: h, shape (k,) [m].
         gradient: of h by the point, unit vectors, shape (k, 2).
         bend: second derivative of h along the boundary, shape (k,) [1/m].
@@ -105,11 +97,12 @@ def find_rows(
     """
     nowhere = np.empty(0, np.int32)
     found, ways = np.empty(32), np.empty((32, 2))
+    points, distances, keep, keep_wall = needle.points, needle.distances, needle.keep + band, needle.keep_wall + band
     rows, discs, count = 0, len(scene.discs), len(points)
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
         away = math.hypot(x, y)
-        at_end = not ends_only or i == 0 or i == count - 1
+        at_end = not needle.ends_only or i == 0 or i == count - 1
         if at_end and scene.radius - away - keep_wall <= reach and rows < len(margin) and away > 1e-9:
             margin[rows], bend[rows] = scene.radius - away - keep_wall, -1.0 / away
             gradient[rows, 0], gradient[rows, 1] = -x / away, -y / away
@@ -132,7 +125,7 @@ def find_rows(
                     got = search_edges(x, y, far, scene.edges, base, nowhere, -1, edges, least, found, ways)
                     local = got.rows if got.rows >= 0 else least
             if local == 0 or distance <= 0.0:
-                found[0], ways[0, 0], ways[0, 1], local = distance, normal[i, s, 0], normal[i, s, 1], 1
+                found[0], ways[0, 0], ways[0, 1], local = distance, needle.normal[i, s, 0], needle.normal[i, s, 1], 1
             for k in range(local):
                 if rows >= len(margin):
                     break
@@ -154,16 +147,13 @@ def _projected(
     depth: NDArray[np.float64],
     count: int,
     lean: bool,
-    given: Points,
-    bounds: NDArray[np.float64],
-    work: Points,
 ) -> tuple[bool, float, float]:
     """Return whether there is a velocity but zero within the rows, and the one nearest to (vx, vy).
 
     With `lean`, what is beyond its bound has to leave, within a sector around the way out.
     """
     speed = math.hypot(vx, vy)
-    used = 0
+    given, bounds, work, used = np.empty((2 * count, 2)), np.empty(2 * count), np.empty((2 * count, 3)), 0
     for k in range(count):
         x, y = rows[k, 0], rows[k, 1]
         if lean and depth[k] > 0.0:
@@ -198,30 +188,11 @@ def _all_hold(
 
 
 @compiled
-def _put(
-    added: AddedRows,
-    begin: int,
-    rows: Points,
-    least: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    who: NDArray[np.int64],
-) -> None:
-    """Write the rows of added barriers behind the others."""
-    for j in range(len(added.margin)):
-        k = begin + j
-        rows[k, 0], rows[k, 1] = added.rows[j, 0], added.rows[j, 1]
-        least[k], depth[k] = -added.rate[j] * max(added.margin[j], 0.0), -added.margin[j]
-        who[k, 0], who[k, 1] = 0, added.barrier[j]
-
-
-@compiled
-def _tangent(
-    x: float, y: float, what: int, scene: PackedScene, keep: float, keep_wall: float
-) -> tuple[float, float, float]:
+def _tangent(x: float, y: float, what: int, needle: PosedNeedle, scene: PackedScene) -> tuple[float, float, float]:
     """Return the way out (2) at a point that meets the wall or a shape, and its margin there [m]."""
     if what == WALL:
         away = math.hypot(x, y)
-        return -x / away, -y / away, scene.radius - away - keep_wall
+        return -x / away, -y / away, scene.radius - away - needle.keep_wall
     discs = len(scene.discs)
     for s in range(len(scene.shapes)):
         if scene.shapes[s] != what:
@@ -229,10 +200,10 @@ def _tangent(
         if s < discs:
             qx, qy = x - scene.discs[s, 0], y - scene.discs[s, 1]
             away = max(math.hypot(qx, qy), 1e-12)
-            return qx / away, qy / away, away - scene.discs[s, 2] - keep
+            return qx / away, qy / away, away - scene.discs[s, 2] - needle.keep
         nowhere, none, nor = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
         distance, gx, gy, _ = polygon_distance(x, y, s - discs, -1, scene, nowhere, none, nor)
-        return gx, gy, distance - keep
+        return gx, gy, distance - needle.keep
     return 1.0, 0.0, 0.0
 
 
@@ -240,20 +211,10 @@ def _tangent(
 def nearest_clear(
     vx: float,
     vy: float,
-    points: Points,
-    turning: Points,
-    ends_only: bool,
-    chord_x: float,
-    chord_y: float,
-    turn: float,
-    hold: float,
+    needle: PosedNeedle,
     rate: float,
-    keep: float,
-    keep_wall: float,
     band: float,
     scene: PackedScene,
-    distances: NDArray[np.float64],
-    normal: NDArray[np.float64],
     added: AddedRows,
     touched: NDArray[np.bool_],
 ) -> tuple[float, float]:
@@ -268,47 +229,23 @@ def nearest_clear(
     Args:
         vx: velocity of the tip commanded [m/s].
         vy: velocity of the tip commanded [m/s].
-        points: see `safe_time`, as the others that are not named here.
-        turning: of the points.
-        ends_only: of the wall.
-        chord_x: of the chord.
-        chord_y: of the chord.
-        turn: of the needle.
-        hold: [s].
+        needle: in its pose.
         rate: share of the margin by which a point may approach [1/s].
-        keep: from shapes [m].
-        keep_wall: from the wall [m].
         band: by which the barriers keep farther away than the certificate asks for [m].
         scene: packed.
-        distances: see `measure`.
-        normal: see `measure`.
         added: rows of the barriers that a user has added.
         touched: set for each shape, then each added barrier, then the wall, that changed the velocity.
     """
-    speed = math.hypot(vx, vy)
-    time, what, where = safe_time(
-        points, turning, ends_only, chord_x, chord_y, turn, vx, vy, hold, keep, keep_wall, scene, distances, normal
-    )
+    speed, hold, turning = math.hypot(vx, vy), needle.hold, needle.turning
+    points, chord_x, chord_y = needle.points, needle.chord_x, needle.chord_y
+    time, what, where = safe_time(vx, vy, needle, scene)
     swiftest = 0.0
     for i in range(len(points)):
         swiftest = max(swiftest, math.hypot(turning[i, 0], turning[i, 1]))
     reach = math.hypot(1.0, swiftest) * speed / rate
     margin, gradient, bend = np.empty(MAX_ROWS), np.empty((MAX_ROWS, 2)), np.empty(MAX_ROWS)
     who = np.empty((MAX_ROWS + len(added.margin) + PASSES, 2), np.int64)
-    count = find_rows(
-        points,
-        ends_only,
-        reach,
-        keep + band,
-        keep_wall + band,
-        scene,
-        distances,
-        normal,
-        margin,
-        gradient,
-        bend,
-        who,
-    )
+    count = find_rows(needle, reach, band, scene, margin, gradient, bend, who)
     fixed = count + len(added.margin)
     room = fixed + PASSES
     rows, least, depth = np.empty((room, 2)), np.empty(room), np.empty(room)
@@ -318,24 +255,22 @@ def nearest_clear(
         aside = gradient[k, 0] * turning[i, 0] + gradient[k, 1] * turning[i, 1]
         rows[k, 0], rows[k, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
         least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
-    _put(added, count, rows, least, depth, who)
+    rows[count:fixed], least[count:fixed] = added.rows, -added.rate * np.maximum(added.margin, 0.0)
+    depth[count:fixed], who[count:fixed, 0], who[count:fixed, 1] = -added.margin, 0, added.barrier
     if time >= hold and _all_hold(vx, vy, rows, least, depth, fixed):
         return vx, vy
-    given, bounds, work = np.empty((2 * room, 2)), np.empty(2 * room), np.empty((2 * room, 3))
     bounded = least.copy()
     best, bx, by = speed * speed, 0.0, 0.0  # zero, that always is allowed
     ux, uy, total = vx, vy, fixed
     for attempt in range(PASSES):
-        holds, x, y = _projected(vx, vy, rows, bounded, depth, total, True, given, bounds, work)
+        holds, x, y = _projected(vx, vy, rows, bounded, depth, total, True)
         if not holds:
-            holds, x, y = _projected(vx, vy, rows, bounded, depth, total, False, given, bounds, work)
+            holds, x, y = _projected(vx, vy, rows, bounded, depth, total, False)
         if not holds and attempt > 0:
-            holds, x, y = _projected(vx, vy, rows, least, depth, fixed, False, given, bounds, work)
+            holds, x, y = _projected(vx, vy, rows, least, depth, fixed, False)
         if not holds:
             break
-        time, ended, where = safe_time(
-            points, turning, ends_only, chord_x, chord_y, turn, x, y, hold, keep, keep_wall, scene, distances, normal
-        )
+        time, ended, where = safe_time(x, y, needle, scene)
         share = 1.0 if time >= hold else SURE * time / hold
         off = (share * x - vx) ** 2 + (share * y - vy) ** 2
         if off < best:
@@ -344,7 +279,7 @@ def nearest_clear(
         if share >= 1.0:
             break
         across, forwards = -x * chord_y + y * chord_x, x * chord_x + y * chord_y
-        omega = turn * across
+        omega = needle.turn * across
         # What the motion bends into within the hold.
         for k in range(count):
             i = who[k, 0]
@@ -361,7 +296,7 @@ def nearest_clear(
             way = time * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
             c, s = math.cos(half), math.sin(half)
             dx, dy = way * (c * px - s * py), way * (s * px + c * py)
-            gx, gy, left = _tangent(points[where, 0] + dx, points[where, 1] + dy, ended, scene, keep, keep_wall)
+            gx, gy, left = _tangent(points[where, 0] + dx, points[where, 1] + dy, ended, needle, scene)
             along, aside = gx * chord_x + gy * chord_y, gx * turning[where, 0] + gy * turning[where, 1]
             rows[total, 0], rows[total, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
             bent = 0.5 * hold * omega * (-gx * py + gy * px)

@@ -19,6 +19,7 @@ Source: none; the discs and strips are the Minkowski sum of a polygon's boundary
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,36 @@ INSIDE = 1e-12
 """A point this near to a polygon, or inside of it, goes by the side that it has to leave by [m]."""
 WALL, NOTHING = -1, -2
 """In the place of a shape's index."""
+
+
+class PosedNeedle(NamedTuple):
+    """The needle in one pose, what it keeps from, and how far everything is from it, for compiled code.
+
+    Attributes:
+        points: that stand for the needle, shape (m, 2) [m].
+        turning: velocity of each for a tip velocity of 1 m/s across the chord, shape (m, 2).
+        ends_only: whether the first and the last point are the ones nearest to the wall, as of a straight needle.
+        chord_x: unit vector along the chord.
+        chord_y: unit vector along the chord.
+        turn: rate of turning for that velocity [rad/m].
+        hold: for which a motion has to keep clear [s].
+        keep: least distance of a point from shapes [m].
+        keep_wall: least distance of a point from the wall [m].
+        distances: signed distance of each point from each disc, then polygon, shape (m, s) [m].
+        normal: its gradient, shape (m, s, 2).
+    """
+
+    points: Points
+    turning: Points
+    ends_only: bool
+    chord_x: float
+    chord_y: float
+    turn: float
+    hold: float
+    keep: float
+    keep_wall: float
+    distances: NDArray[np.float64]
+    normal: NDArray[np.float64]
 
 
 @compiled
@@ -67,22 +98,22 @@ def crossings(square: float, linear: float, constant: float, omega: float) -> tu
 
 @compiled
 def circle_exit(
-    qx: float, qy: float, room: float, radius: float, vx: float, vy: float, omega: float, outside: bool
+    qx: float, qy: float, gap: float, radius: float, vx: float, vy: float, omega: float, outside: bool
 ) -> float:
-    """Return when a point that is off a circle by `room` > 0 meets it, inf for never [s].
+    """Return when a point that is off a circle by `gap` > 0 meets it, inf for never [s].
 
     Args:
         qx: of the point from the circle's centre [m].
         qy: of the point from the circle's centre [m].
-        room: to the circle, with the point's distance from the centre exact [m].
+        gap: to the circle, with the point's distance from the centre exact [m].
         radius: of the circle [m].
         vx: velocity of the point now [m/s].
         vy: velocity of the point now [m/s].
         omega: by which that velocity turns [rad/s].
         outside: whether the point is outside of the circle.
     """
-    away = radius + room if outside else radius - room
-    c = room * (away + radius)  # the difference of the squares without a difference
+    away = radius + gap if outside else radius - gap
+    c = gap * (away + radius)  # the difference of the squares without a difference
     a = qx * vx + qy * vy
     b = -qx * vy + qy * vx  # q . (v turned to the left)
     square = vx * vx + vy * vy + omega * b
@@ -136,25 +167,16 @@ def _strip_time(
 
 @compiled
 def _polygon_time(
-    x: float,
-    y: float,
-    vx: float,
-    vy: float,
-    omega: float,
-    distance: float,
-    gx: float,
-    gy: float,
-    polygon: int,
-    keep: float,
-    limit: float,
-    scene: PackedScene,
+    needle: PosedNeedle, i: int, s: int, vx: float, vy: float, omega: float, limit: float, scene: PackedScene
 ) -> float:
     """Return when a point gets nearer to a polygon than `keep`, or than it is if that is nearer; `limit` for later [s].
 
     A point inside must leave by the nearest side: it goes no deeper than it is, and by at most `keep` beyond it.
     """
-    best = limit
+    x, y, distance, keep = needle.points[i, 0], needle.points[i, 1], needle.distances[i, s], needle.keep
+    best, polygon = limit, s - len(scene.discs)
     if distance <= INSIDE:
+        gx, gy = needle.normal[i, s, 0], needle.normal[i, s, 1]
         depth = max(-distance, 0.0)
         a, b = gx * vx + gy * vy, -gx * vy + gy * vx
         room = ROUNDING
@@ -184,84 +206,47 @@ def _polygon_time(
 
 
 @compiled
-def safe_time(
-    points: Points,
-    turning: Points,
-    ends_only: bool,
-    chord_x: float,
-    chord_y: float,
-    turn: float,
-    vx: float,
-    vy: float,
-    hold: float,
-    keep: float,
-    keep_wall: float,
-    scene: PackedScene,
-    distances: NDArray[np.float64],
-    normal: NDArray[np.float64],
-) -> tuple[float, int, int]:
+def safe_time(vx: float, vy: float, needle: PosedNeedle, scene: PackedScene) -> tuple[float, int, int]:
     """Return for how long a motion keeps the needle clear, at most `hold`, what ends it, and which point meets it.
 
     No point of the needle gets closer than `keep` to a shape or `keep_wall` to the wall; one that is closer already
     gets no closer than it is.
 
     Args:
-        points: that stand for the needle, shape (m, 2) [m].
-        turning: velocity of each for a tip velocity of 1 m/s across the chord, shape (m, 2).
-        ends_only: whether the first and the last point are the ones nearest to the wall, as of a straight needle.
-        chord_x: unit vector along the chord.
-        chord_y: unit vector along the chord.
-        turn: rate of turning for that velocity [rad/m].
         vx: velocity of the tip [m/s].
         vy: velocity of the tip [m/s].
-        hold: [s].
-        keep: least distance of a point from shapes [m].
-        keep_wall: least distance of a point from the wall [m].
+        needle: in its pose.
         scene: packed.
-        distances: signed distance of each point from each disc, then polygon, shape (m, s) [m].
-        normal: its gradient, shape (m, s, 2).
 
     Returns:
         The time [s]; the index of the shape in the scene, `WALL` or `NOTHING`; the index of the point, and -1 for none.
     """
-    best, what, where = hold, NOTHING, -1
+    best, what, where = needle.hold, NOTHING, -1
+    points, distances, chord_x, chord_y = needle.points, needle.distances, needle.chord_x, needle.chord_y
     along, across = vx * chord_x + vy * chord_y, -vx * chord_y + vy * chord_x
-    omega = turn * across
+    omega = needle.turn * across
     count, discs = len(points), len(scene.discs)
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
-        px, py = along * chord_x + across * turning[i, 0], along * chord_y + across * turning[i, 1]
+        px, py = along * chord_x + across * needle.turning[i, 0], along * chord_y + across * needle.turning[i, 1]
         speed = math.hypot(px, py)
         if speed == 0.0:
             continue
-        if not ends_only or i == 0 or i == count - 1:
+        if not needle.ends_only or i == 0 or i == count - 1:
             away = math.hypot(x, y)
-            radius = max(scene.radius - keep_wall, away) + ROUNDING
+            radius = max(scene.radius - needle.keep_wall, away) + ROUNDING
             if radius - away <= speed * best:
                 t = circle_exit(x, y, radius - away, radius, px, py, omega, False)
                 if t < best:
                     best, what, where = t, WALL, i
         for s in range(distances.shape[1]):
-            if distances[i, s] - keep > speed * best:
+            if distances[i, s] - needle.keep > speed * best:
                 continue
             if s < discs:
                 disc = scene.discs[s]
-                t = _disc_time(x - disc[0], y - disc[1], disc[2], keep, px, py, omega)
+                t = _disc_time(x - disc[0], y - disc[1], disc[2], needle.keep, px, py, omega)
             else:
-                t = _polygon_time(
-                    x,
-                    y,
-                    px,
-                    py,
-                    omega,
-                    distances[i, s],
-                    normal[i, s, 0],
-                    normal[i, s, 1],
-                    s - discs,
-                    keep,
-                    best,
-                    scene,
-                )
+                t = _polygon_time(needle, i, s, px, py, omega, best, scene)
             if t < best:
                 best, what, where = t, int(scene.shapes[s]), i
     return best, what, where

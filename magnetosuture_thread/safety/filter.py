@@ -13,9 +13,8 @@ from magnetosuture_thread.barrier import Barrier, check_barriers
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, AddedRows, measure, nearest_clear
-from magnetosuture_thread.safety.certificate import NOTHING, safe_time
+from magnetosuture_thread.safety.certificate import NOTHING, PosedNeedle, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
-from magnetosuture_thread.safety.limits import limit_norm, rate_limit
 from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
 
@@ -50,18 +49,6 @@ class FilteredCommand:
     slowdown: float = 1.0
     active: tuple[str, ...] = ()
     reason: str = ""
-
-
-@dataclass(frozen=True)
-class _Pose:
-    """What the compiled functions need of the needle in one pose."""
-
-    key: tuple[float, ...]
-    points: Vector
-    turning: Vector
-    chord: tuple[float, float]
-    distances: Vector
-    normal: Vector
 
 
 class NeedleSafetyFilter:
@@ -149,7 +136,7 @@ class NeedleSafetyFilter:
         self._barriers, self._time = tuple(barriers), 0.0
         self._names = (*scene.names, *[barrier.name for barrier in barriers], WALL_NAME)  # so that -1 is the wall
         self._touched = np.zeros(len(self._names), np.bool_)
-        self._pose: _Pose | None = None
+        self._pose: tuple[tuple[float, ...], PosedNeedle] | None = None  # the last one, by tail and heading
         # Compiled now, not in the first step.
         middle, east = np.array([-0.5 * chord, 0.0]), np.array([1.0, 0.0])
         self.nearest_clear(np.array([1e-3, 0.0]), middle, east)
@@ -202,7 +189,7 @@ class NeedleSafetyFilter:
         active += touched
         if math.hypot(*passed) <= STUCK * math.hypot(*velocity):
             named = [name for name in active if name not in (SPEED, ACCELERATION)] or active
-            return FilteredCommand(commanded, np.zeros(2), slowdown, tuple(active), held_by(named))
+            return FilteredCommand(commanded, np.zeros(2), slowdown, tuple(active), rest_reason(named))
         return FilteredCommand(commanded, passed, slowdown, tuple(active))
 
     def nearest_clear(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[Vector, list[str]]:
@@ -217,28 +204,13 @@ class NeedleSafetyFilter:
             InvalidInputError: something is not finite.
         """
         speed = _speed(velocity)
-        pose = self._at(tail, heading)
+        needle = self._at(tail, heading)
         if speed == 0.0:
             return velocity, []
         self._touched[:] = False
+        added = self._added_rows(needle) if self._barriers else NO_ROWS
         x, y = nearest_clear(
-            float(velocity[0]),
-            float(velocity[1]),
-            pose.points,
-            pose.turning,
-            self._straight,
-            *pose.chord,
-            self._turn,
-            self.hold_time,
-            self._rate,
-            self._keep,
-            self._keep_wall,
-            BAND,
-            self._packed,
-            pose.distances,
-            pose.normal,
-            self._added_rows(pose) if self._barriers else NO_ROWS,
-            self._touched,
+            float(velocity[0]), float(velocity[1]), needle, self._rate, BAND, self._packed, added, self._touched
         )
         clear = velocity if x == velocity[0] and y == velocity[1] else np.array([x, y])
         if self._barriers:
@@ -268,43 +240,28 @@ class NeedleSafetyFilter:
             InvalidInputError: something is not finite.
         """
         _speed(velocity)
-        pose = self._at(tail, heading)
-        time, what, _ = safe_time(
-            pose.points,
-            pose.turning,
-            self._straight,
-            *pose.chord,
-            self._turn,
-            float(velocity[0]),
-            float(velocity[1]),
-            self.hold_time,
-            self._keep,
-            self._keep_wall,
-            self._packed,
-            pose.distances,
-            pose.normal,
-        )
+        time, what, _ = safe_time(float(velocity[0]), float(velocity[1]), self._at(tail, heading), self._packed)
         found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
         if not self._barriers:
             return found
         return min(found, self._checked_share(velocity, tail, heading), key=lambda share: share[0])
 
-    def _added_rows(self, pose: _Pose) -> AddedRows:
+    def _added_rows(self, needle: PosedNeedle) -> AddedRows:
         """Return the rows of the added barriers on the tip's velocity, each over the size of its gradient."""
-        along = np.array(pose.chord)
+        along = np.array([needle.chord_x, needle.chord_y])
         left = np.array([-along[1], along[0]])
         found: list[AddedRows] = []
         for index, barrier in enumerate(self._barriers, start=len(self.scene.names)):
             barrier.set_time(self._time)
-            rows = barrier.rows(pose.points)
+            rows = barrier.rows(needle.points)
             slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
-            gradient = rows.gradient / np.where(slope > 0.0, slope, 1.0)[:, None, None]
+            size = np.where(slope > 0.0, slope, 1.0)
+            gradient = rows.gradient / size[:, None, None]
             drive = np.einsum("rkd,d->r", gradient, along)
-            turn = np.einsum("rkd,rkd->r", gradient, pose.turning[rows.nodes])
-            margin = rows.value / np.where(slope > 0.0, slope, 1.0)
-            rate = np.full(len(margin), min(barrier.gain, self._rate))
+            turn = np.einsum("rkd,rkd->r", gradient, needle.turning[rows.nodes])
+            rate, which = np.full(len(size), min(barrier.gain, self._rate)), np.full(len(size), index, np.int64)
             on_tip = drive[:, None] * along + turn[:, None] * left
-            found.append(AddedRows(on_tip, margin, rate, np.full(len(margin), index, np.int64)))
+            found.append(AddedRows(on_tip, rows.value / size, rate, which))
         return AddedRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
     def _checked_share(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[float, str]:
@@ -347,15 +304,15 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        pose = self._at(tail, heading)
-        wall = self.scene.dish.radius - float(np.hypot(pose.points[:, 0], pose.points[:, 1]).max())
-        return min(wall, float(pose.distances.min(initial=math.inf)))
+        needle = self._at(tail, heading)
+        wall = self.scene.dish.radius - float(np.hypot(needle.points[:, 0], needle.points[:, 1]).max())
+        return min(wall, float(needle.distances.min(initial=math.inf)))
 
-    def _at(self, tail: Vector, heading: Vector) -> _Pose:
+    def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
         key = (float(tail[0]), float(tail[1]), float(heading[0]), float(heading[1]))
-        if self._pose is not None and self._pose.key == key:
-            return self._pose
+        if self._pose is not None and self._pose[0] == key:
+            return self._pose[1]
         size = math.hypot(key[2], key[3])
         if not (math.isfinite(size) and size > 0.0 and math.isfinite(key[0]) and math.isfinite(key[1])):
             raise InvalidInputError("pose", list(key), "finite numbers and a direction")
@@ -366,11 +323,45 @@ class NeedleSafetyFilter:
         shapes = len(self._packed.shapes)
         distances, normal = np.empty((len(points), shapes)), np.empty((len(points), shapes, 2))
         measure(points, self._packed, distances, normal)
-        self._pose = _Pose(key, points, self._turning @ turn, (float(e[0]), float(e[1])), distances, normal)
-        return self._pose
+        chord_x, chord_y = float(e[0]), float(e[1])
+        needle = PosedNeedle(
+            points,
+            self._turning @ turn,
+            self._straight,
+            chord_x,
+            chord_y,
+            self._turn,
+            self.hold_time,
+            self._keep,
+            self._keep_wall,
+            distances,
+            normal,
+        )
+        self._pose = key, needle
+        return needle
 
 
-def held_by(names: list[str]) -> str:
+def limit_norm(vector: Vector, max_norm: float) -> Vector:
+    """Return a vector scaled down to a maximum norm; its direction is kept.
+
+    >>> limit_norm(np.array([3.0, 4.0]), 1.0)
+    array([0.6, 0.8])
+    """
+    # Scaled by the largest component first: the squares of a hostile command may overflow.
+    greatest = float(np.max(np.abs(vector)))
+    if greatest == 0.0:
+        return np.zeros_like(vector)
+    direction = vector / greatest
+    norm = float(np.linalg.norm(direction))
+    return vector if greatest * norm <= max_norm else direction * (max_norm / norm)
+
+
+def rate_limit(previous: Vector, target: Vector, max_change: float) -> Vector:
+    """Return the vector closest to the target within a maximum change from the previous one."""
+    return previous + limit_norm(target - previous, max_change)
+
+
+def rest_reason(names: list[str]) -> str:
     """Return the reason of a needle that rests at constraints."""
     return f"stopped by {', '.join(dict.fromkeys(names))}"
 

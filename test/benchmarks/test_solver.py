@@ -20,8 +20,8 @@ from benchmarks.solver.measurements import SIMULATORS, Plan, SolverReport, Solve
 from benchmarks.solver.table import solver_lines, solver_table
 from benchmarks.solver.timing import run, time_solves, timed
 from magnetosuture_thread.geometry.obstacles import Mesh, Polygon, Workspace, triangulate
+from magnetosuture_thread.model.solvers import OsqpSolver
 from magnetosuture_thread.model.solvers.banded import BandedSolver
-from magnetosuture_thread.model.solvers.osqp import OsqpSolver
 
 SMALL = Plan(segments=(12,), steps=12, budget=0.1, passes=2, simulated=(12,))
 FIELDS = ("system", "n", "d", "obstacles", "median_s", "p99_s", "max_residual")

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from magnetosuture_thread.coils.input_checks import SILENCE_TIMEOUT, PublisherCounter
+from magnetosuture_thread.coils.watchdog import SILENCE_TIMEOUT, PublisherCounter
 
 
 def test_lost_messages_do_not_add_a_publisher():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.loop_timing import LoopTiming
+from magnetosuture_thread.coils.coil_system import LoopTiming
 
 
 def test_jitter_is_the_deviation_from_the_period():

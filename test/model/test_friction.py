@@ -8,15 +8,15 @@ import pytest
 from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.model.barriers import Connectivity, ObstacleAvoidance, WallAvoidance
-from magnetosuture_thread.model.friction import (
+from magnetosuture_thread.model.margins import (
     UNKNOWN,
     Friction,
     FrictionLaw,
     FrictionState,
+    Margins,
     NodeMotion,
     friction_colour,
 )
-from magnetosuture_thread.model.margins import Margins
 
 LAW = FrictionLaw(threshold=1e-3, beta=0.9, stuck_speed=2e-4)
 NODES = np.column_stack([np.arange(0.0, -8e-3, -1e-3), np.zeros(8)])  # 0 is the needle
@@ -74,7 +74,7 @@ def test_the_needle_itself_is_no_friction_of_the_thread():
 
 
 def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it():
-    close = WallAvoidance(7.5e-3, 0.0, 5e-3).rows(NODES)
+    close = WallAvoidance(Workspace([], 5e-3, 2, 7.5e-3), 0.0).rows(NODES)
     assert (close.clearance < 1e-3).any()
     disc = (-7e-3, 1.5e-3, 1e-3)
     assert LAW.classify(barriers(disc, others=(close,)), np.full(8, 1e-3)) == Friction(FrictionState.FREE, (), 1.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,10 @@ from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model import predictor
-from magnetosuture_thread.model.factory import make_formulation
-from magnetosuture_thread.model.formulations import PaperOptions
+from magnetosuture_thread.model.formulations import PaperOptions, make_formulation
 from magnetosuture_thread.model.margins import SOLID
-from magnetosuture_thread.model.predictor import NeedlePose
-from magnetosuture_thread.model.settings import ThreadModelSettings, check_scene
+from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
 from test.model.worlds import polygon, scene_with
 
@@ -103,11 +101,10 @@ def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
 def test_a_scene_that_the_segments_do_not_resolve_is_refused(scene: Scene, words: str):
     settings = made(segments=25 if scene.shapes else 6)
     with pytest.raises(ConfigurationError, match=words):
-        check_scene(settings, scene)
+        ThreadPredictor(settings.thread(), scene)
     with pytest.raises(ConfigurationError, match=words):
         settings.predictor(scene)
-    check_scene(settings, None)
-    check_scene(made(segments=100), scene)
+    ThreadPredictor(made(segments=100).thread(), scene)
 
 
 def test_a_material_can_be_another_than_those_that_are_known():
@@ -143,7 +140,7 @@ def test_the_papers_options_come_from_the_settings(monkeypatch, values: dict[str
     monkeypatch.setattr(predictor, "make_formulation", spied)
     made(formulation="paper", **values).predictor(None)
     assert (given[0].damping, given[0].stiffness_weight) == (damping, weight)
-    assert given[0] == replace(PaperOptions.tuned(weight), damping=damping)
+    assert given[0] == PaperOptions.tuned(weight)._replace(damping=damping)
 
 
 def test_barriers_of_a_user_come_from_the_settings():

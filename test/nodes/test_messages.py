@@ -24,7 +24,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.messages import building, reading
 from magnetosuture_thread.messages.building import MessageBuilder
-from magnetosuture_thread.model import changes
+from magnetosuture_thread.model.settings import parse_material
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES, serialised_velocity
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
@@ -74,9 +74,9 @@ def test_a_stamp_goes_there_and_back(sec: int, nanosec: int):
 
 def test_a_material_becomes_parameters():
     """Plain numbers: of arrays, as messages have them, no parameter is made."""
-    assert changes.parse_material(ThreadMaterial()) == {}
+    assert parse_material(ThreadMaterial()) == {}
     message = ThreadMaterial(name="silk_6_0", viscosity=0.9, attachment_offset=[1e-3, 0.0], rest_curvature=[0.0])
-    values = changes.parse_material(message)
+    values = parse_material(message)
     assert values == {
         "material": "silk_6_0",
         "diameter": 0.0,

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_markers, packed_path, packed_pose
-from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState, friction_colour
+from magnetosuture_thread.model.margins import UNKNOWN, Friction, FrictionState, friction_colour
 from magnetosuture_thread.model.predictor import Prediction
 from magnetosuture_thread.nodes.messages import MESSAGES
 

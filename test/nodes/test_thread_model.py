@@ -15,7 +15,7 @@ from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.model import factory
+from magnetosuture_thread.model import solvers
 from magnetosuture_thread.model.formulations import rod
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.nodes import topics
@@ -226,7 +226,7 @@ class LameSolver(BandedSolver):
 
 
 def test_a_step_that_fell_back_is_published_and_said(graph, monkeypatch):
-    monkeypatch.setattr(factory, "BandedSolver", LameSolver)
+    monkeypatch.setattr(solvers, "BandedSolver", LameSolver)
     graph.add(ThreadModelNode, initial_shape="straight")
     predicted, diagnostics = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.NEEDLE_POSE, pose(1.0))

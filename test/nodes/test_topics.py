@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from magnetosuture_thread.coils.input_checks import PublisherCounter
+from magnetosuture_thread.coils.watchdog import PublisherCounter
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode

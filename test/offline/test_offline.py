@@ -35,7 +35,7 @@ from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.messages.packing import packed_margins, packed_prediction
 from magnetosuture_thread.messages.reading import margins_of, read_path, read_pose, stamp_of
-from magnetosuture_thread.model.friction import UNKNOWN, Friction, FrictionState
+from magnetosuture_thread.model.margins import UNKNOWN, Friction, FrictionState
 from magnetosuture_thread.offline.predictions import predictions, read_observations
 from magnetosuture_thread.scene import SceneShape
 from magnetosuture_thread.setups import read_setup

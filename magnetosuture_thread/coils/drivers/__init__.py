@@ -1,13 +1,12 @@
-"""Coil drivers, one module each."""
+"""Coil drivers: those without hardware, and that of RoboClaw boards."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from magnetosuture_thread.coils.drivers.protocol import CoilDriver, DriverState, Vector
-from magnetosuture_thread.coils.drivers.recording import RecordingDriver
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
-from magnetosuture_thread.coils.drivers.simulated import SimulatedDriver
+from magnetosuture_thread.coils.drivers.simulated import RecordingDriver, SimulatedDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 

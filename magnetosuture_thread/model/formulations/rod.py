@@ -18,7 +18,7 @@ The barriers are linearised about the end point that the last velocities predict
 that each solve predicts, as the discrete-time condition h(x + dt u) >= (1 - alpha dt) h(x) with
 alpha = 1 / dt, until segments are right to a thousandth and nodes to 1e-7 m, or for `MAX_SOLVES` times.
 One solve is nearly always enough: the prediction is of second order already, and with the constraints'
-curvature in P (`rod_program`) each solve is a Newton step.
+curvature in P (`_taut`) each solve is a Newton step.
 
 Source: [Forghani2025], controller (quadratic program over all velocities). Deviation: the objective is
 dissipation and elastic energy instead of |u - kappa v|^2, the thread may not be compressed, segments have
@@ -31,13 +31,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from magnetosuture_thread.barrier import Barrier, BarrierRows
-from magnetosuture_thread.errors import ConfigurationError, SolverError
+from magnetosuture_thread.barrier import Barrier, CompiledBarrier
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
-from magnetosuture_thread.model.barriers import Compression, Connectivity, ObstacleAvoidance, WallAvoidance
-from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
+from magnetosuture_thread.model.barriers import Compression, Connectivity
+from magnetosuture_thread.model.formulations.added_rows import LinearRows
 from magnetosuture_thread.model.formulations.rod_step import (
     ENDED,
     NO_ROOM,
@@ -47,30 +47,21 @@ from magnetosuture_thread.model.formulations.rod_step import (
     solve_step,
 )
 from magnetosuture_thread.model.formulations.step import (
-    ROW_REACH,
+    Formulation,
     PrescribedMotion,
     StepBuffers,
     StepResult,
     ThreadState,
-    warmed,
 )
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
-from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
-from magnetosuture_thread.model.solvers.banded import STATUS
+from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, banded
 from magnetosuture_thread.model.thread import Attachment, Thread
 
 MAX_SOLVES = 8  # in a step
 
 
-class RodFormulation:
-    """Steps a thread by the program above.
-
-    Args:
-        thread: the thread.
-        workspace: obstacles and wall [m]; their reach is that of the margins.
-        solver: solves the program.
-        tolerance: the largest residual with which a solution is accepted.
-        barriers: what a user adds to the built-in ones.
+class RodFormulation(Formulation):
+    """Steps a thread by the program above; see `Formulation` for the arguments.
 
     Raises:
         ConfigurationError: gravity has not one value for each dimension.
@@ -86,11 +77,8 @@ class RodFormulation:
         tolerance: float,
         barriers: Sequence[Barrier] = (),
     ) -> None:
-        nodes, dimension = thread.segments + 1, workspace.dimension
-        self.dimension = dimension
-        self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
-        reach, wall_radius = ROW_REACH * thread.segment_length, workspace.wall_radius
-        self._near = Workspace(workspace.shapes, reach, dimension, wall_radius)
+        super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
+        dimension = self.dimension
         medium, clamped = thread.medium, thread.attachment is Attachment.CLAMPED
         if len(medium.gravity) not in (0, dimension):
             raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
@@ -99,7 +87,7 @@ class RodFormulation:
         self._rod = RodProperties(
             clamped,
             thread.segment_length,
-            0.5 * thread.diameter,
+            self._radius,
             thread.bending_stiffness,
             medium.drag_across,
             medium.drag_along,
@@ -110,28 +98,27 @@ class RodFormulation:
             mechanics.end_corrected_weights(thread.segments),
             mechanics.bending_bands(thread.segments, clamped),
         )
-        self.added = AddedBarriers(barriers, thread.segment_length)
-        self._axes, (self._banded, self._at_once) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
+        self._axes, (self._banded, self._accepted) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
         if self.added:  # compiled code knows nothing of their rows, and leaves every solve to `step`
             self._banded = BandedSolver(iterations=0)
-        self._motion = MotionBuffers.of(nodes, dimension)
-        self._give(StepBuffers.of(nodes, dimension, thread.segments, 2 * nodes))
+        self._motion = MotionBuffers.of(thread.segments + 1, dimension)
+        self._use(self._buffers)
 
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""
-        unit, segments = self._thread.segment_length, self._thread.segments
+        unit, motion = self._thread.segment_length, self._motion
         if state.interval == 0.0:
             self._buffers.forget()
         # Compiled code would be compiled anew for another layout, in the middle of a run.
         positions = np.ascontiguousarray(state.positions, np.float64)
         velocities = np.ascontiguousarray(state.velocities, np.float64)
-        motion, (nodes, ends) = self._motion, drive.arrays()
+        nodes, ends = drive.arrays()
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
         added: LinearRows | None = None
         if self.added:
             self.added.begin(positions, drive.time, interval)
         while True:
-            code, contacts, solves, off, word, residuals = solve_step(
+            code, contacts, solves, off, number, residuals = solve_step(
                 self._axes,
                 self._rod,
                 self._buffers,
@@ -145,28 +132,22 @@ class RodFormulation:
                 drive.heading,
                 interval,
                 state.interval,
-                self._at_once,
+                self._accepted,
                 MAX_SOLVES,
                 solves,
                 added.off if added is not None else 0.0,
             )
-            worst, status = worst.or_worse(Residuals(*residuals)), status if status != SOLVED else STATUS[word]
+            worst, status = worst.or_worse(Residuals(*residuals)), status if status != SOLVED else banded.STATUS[number]
             if code == ENDED:
                 break
             if code == NO_ROOM:
-                self._give(self._buffers.with_room())
+                self._use(self._buffers.enlarged())
                 continue
-            count = segments + contacts
-            program, wide, guess = self._buffers.program(count, motion.known), None, self._buffers.multipliers[:count]
             if self.added:
                 added = added or self.added.linearised(motion.about, motion.start, motion.known, interval)
-                program, wide = added.joined(program)
-                guess = np.concatenate([guess, np.zeros(len(added.lower))])
-            solution = self._solver.solve(program, motion.velocities, guess, wide)
-            if not solution.residuals.largest <= self._tolerance:
-                self._buffers.forget()
-                raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
-            accept_step(self._buffers, motion, solution.velocities, solution.multipliers[:count], interval)
+            solution = self._solve(contacts, motion.known, motion.velocities, added)
+            multipliers = solution.multipliers[: self._rows + contacts]
+            accept_step(self._buffers, motion, solution.velocities, multipliers, interval)
             if self.added:
                 added = self.added.linearised(motion.about, motion.start, motion.known, interval)
             worst, solves = worst.or_worse(solution.residuals), solves + 1
@@ -179,16 +160,13 @@ class RodFormulation:
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
-        rows = self._thread.segments
-        solution = warmed(self._solver, self._buffers, self._motion.known, rows)
-        accept_step(self._buffers, self._motion, solution.velocities, solution.multipliers, 1.0)
-        self._buffers.forget()
+        super().warm_up()
+        accept_step(self._buffers, self._motion, self._motion.velocities.copy(), np.zeros(self._rows), 1.0)
 
-    def _give(self, buffers: StepBuffers) -> None:
-        """Take buffers for the step, and as much for the structured solver."""
+    def _use(self, buffers: StepBuffers) -> None:
+        """Use buffers for the step, and as much for the structured solver."""
         self._buffers = buffers
-        nodes, dimension = buffers.linear.shape
-        self._solver_buffers = self._banded.buffers(nodes, dimension, len(buffers.first))
+        self._solver_buffers = self._banded.buffers(self._thread.segments + 1, self.dimension, len(buffers.first))
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the chords of the segments' arcs; see `Formulation`."""
@@ -196,15 +174,9 @@ class RodFormulation:
         mechanics.chord_lengths(positions / self._thread.segment_length, heading, self._rod.clamped, chords)
         return chords * self._thread.segment_length
 
-    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return the built-in barriers; see `Formulation`."""
-        radius = 0.5 * self._thread.diameter
-        return [
-            Connectivity(self._thread.segment_length).rows(positions),
-            Compression(self.rest_lengths(positions, heading)).rows(positions),
-            ObstacleAvoidance(self._workspace, radius).rows(positions),
-            WallAvoidance(self._workspace.wall_radius, radius, self._workspace.reach).rows(positions),
-        ]
+    def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
+        """Return connectivity and compression; see `Formulation`."""
+        return [Connectivity(self._thread.segment_length), Compression(self.rest_lengths(positions, heading))]
 
 
 def _structured(solver: Solver, tolerance: float) -> tuple[BandedSolver, float]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.contacts import WorkspaceData
+from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
@@ -16,10 +16,11 @@ from magnetosuture_thread.model.formulations.step import (
     DEPTH_TOLERANCE,
     StepBuffers,
     contact_rows,
-    keep_contact_multipliers,
+    keep_multipliers,
     move_prescribed,
+    program_of,
 )
-from magnetosuture_thread.model.program import ChainProgram, Vector
+from magnetosuture_thread.model.program import Vector
 from magnetosuture_thread.model.solvers import banded
 
 STRAIN_TOLERANCE = 1e-3  # of the segments; beyond it the barriers are linearised once more
@@ -44,49 +45,82 @@ class RodProperties(NamedTuple):
     bands: NDArray[np.float64]
 
 
+class StepInput(NamedTuple):
+    """What a step starts from and where it leads, for compiled code.
+
+    Attributes:
+        positions: of all nodes, shape (n + 1, d) [m].
+        velocities: over the last step [m/s].
+        nodes: of prescribed motion, shape (k,).
+        ends: where these are at the end of the step, shape (k, d) [m].
+        heading: unit vector along the needle at the end of the step, shape (d,).
+        interval: dt [s].
+        last_interval: of the last step, 0 if there was none [s].
+    """
+
+    positions: Points
+    velocities: Points
+    nodes: NDArray[np.int64]
+    ends: Points
+    heading: Points
+    interval: float
+    last_interval: float
+
+
+class MotionBuffers(NamedTuple):
+    """A step under way, in units of the segment length; kept from step to step, so that none pays for buffers.
+
+    Attributes:
+        before: where the nodes are, shape (n + 1, d).
+        start: the same with the prescribed nodes moved.
+        last: velocities over the last step.
+        velocities: those of this step, better with each solve.
+        about: where they lead.
+        known: the prescribed nodes, shape (n + 1,).
+    """
+
+    before: Points
+    start: Points
+    last: Points
+    velocities: Points
+    about: Points
+    known: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, nodes: int, dimension: int) -> MotionBuffers:
+        """Return buffers for every step of a thread."""
+        before, start, last, velocities, about = np.zeros((5, nodes, dimension))
+        return cls(before, start, last, velocities, about, np.zeros(nodes, dtype=np.bool_))
+
+
 @compiled
 def assemble_step(
     solves: int,
     rod: RodProperties,
     buffers: StepBuffers,
     workspace: WorkspaceData,
-    about: Points,
-    start: Points,
-    before: Points,
-    last: Points,
-    known: NDArray[np.bool_],
-    heading: Points,
-    interval: float,
-    last_interval: float,
+    motion: MotionBuffers,
+    given: StepInput,
     elsewhere: float,
 ) -> tuple[int, float]:
     """Write the program about a predicted end point; where that came from a solve and is exact, do not.
 
     Returns the number of contacts, -1 if there is no room for them, and how far off the barriers the point
-    is: the stretch, the depth, or what barriers from elsewhere are, over what is allowed; 1 or less if it is exact.
+    is: the strain, the depth, or what barriers from elsewhere are, over what is allowed; 1 or less if it is exact.
     """
+    about, start, known, interval = motion.about, motion.start, motion.known, given.interval
     segments = len(about) - 1
-    mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
-    stretch = _segment_rows(buffers, about, start, known, interval)
+    mechanics.chord_lengths(about, given.heading, rod.clamped, buffers.chords)
+    strain = _segment_rows(buffers, about, start, known, interval)
     contacts, depth = contact_rows(buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius)
-    off = max(stretch / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
+    off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
     if contacts >= 0 and (solves == 0 or off > 1.0):
-        _objective(rod, buffers, about, start, before, last, heading, interval, last_interval)
+        _objective(rod, buffers, motion, given)
     return contacts, off if solves > 0 else np.inf
 
 
 @compiled
-def _objective(
-    rod: RodProperties,
-    buffers: StepBuffers,
-    about: Points,
-    start: Points,
-    before: Points,
-    last: Points,
-    heading: Points,
-    interval: float,
-    last_interval: float,
-) -> None:
+def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, given: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
         P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z v
@@ -94,6 +128,7 @@ def _objective(
     and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the prescribed nodes, which have
     moved already. In air a = 1, and of Z v only the inertia's part is left.
     """
+    about, start, last, heading, interval = motion.about, motion.start, motion.last, given.heading, given.interval
     nodes, dimension = start.shape
     blocks, couplings, linear = buffers.blocks, buffers.couplings, buffers.linear
     inertia = rod.mass_per_length / interval
@@ -102,7 +137,7 @@ def _objective(
     inertia = inertia / scale
     mechanics.metric(about, rod.weights, inertia, rod.drag_across / scale, rod.drag_along / scale, blocks)
     mechanics.bending_gradient(start, heading, rod.clamped, rod.rest_angles, buffers.work, linear)
-    ratio = interval / last_interval if last_interval > 0.0 else 0.0
+    ratio = interval / given.last_interval if given.last_interval > 0.0 else 0.0
     if inertia > 0.0 or ratio > MAX_STEP_RATIO:
         ratio = 0.0
     leading, trailing = (1.0 + 2.0 * ratio) / (1.0 + ratio), ratio / (1.0 + ratio)
@@ -127,7 +162,7 @@ def _objective(
                 if 0 <= i + apart < nodes:
                     band = weight * rod.bands[abs(apart), min(i, i + apart)]
                     for a in range(dimension):
-                        linear[i, a] += band * (start[i + apart, a] - before[i + apart, a])
+                        linear[i, a] += band * (start[i + apart, a] - motion.before[i + apart, a])
     mechanics.tension_stiffness(
         start, heading, rod.clamped, buffers.multipliers, -0.5 * rate, interval, (blocks, couplings, linear)
     )
@@ -163,7 +198,7 @@ def _segment_rows(
     """Write the rows  grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt; return the largest |h(y)|."""
     nodes, dimension = about.shape
     distance_barrier(about, 1, buffers.chords, buffers.value, buffers.gradient)
-    stretch = 0.0
+    strain = 0.0
     for i in range(nodes - 1):
         begin = min(i, nodes - 3)
         buffers.first[i] = begin
@@ -177,50 +212,15 @@ def _segment_rows(
             # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
             buffers.lower[i], buffers.upper[i], buffers.multipliers[i] = -np.inf, np.inf, 0.0
         else:
-            stretch = max(stretch, abs(buffers.value[i]))
-    return stretch
+            strain = max(strain, abs(buffers.value[i]))
+    return strain
 
 
 ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `solve_step` got
 
 
-class MotionBuffers(NamedTuple):
-    """A step under way, in units of the segment length; kept from step to step, so that none pays for buffers.
-
-    Attributes:
-        before: where the nodes are, shape (n + 1, d).
-        start: the same with the prescribed nodes moved.
-        last: velocities over the last step.
-        velocities: those of this step, better with each solve.
-        about: where they lead.
-        known: the prescribed nodes, shape (n + 1,).
-    """
-
-    before: Points
-    start: Points
-    last: Points
-    velocities: Points
-    about: Points
-    known: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, nodes: int, dimension: int) -> MotionBuffers:
-        """Return buffers for every step of a thread."""
-        before, start, last, velocities, about = np.zeros((5, nodes, dimension))
-        return cls(before, start, last, velocities, about, np.zeros(nodes, dtype=np.bool_))
-
-
 @compiled
-def init_step(
-    motion: MotionBuffers,
-    positions: Points,
-    velocities: Points,
-    nodes: NDArray[np.int64],
-    ends: Points,
-    unit: float,
-    interval: float,
-    last_interval: float,
-) -> None:
+def init_step(motion: MotionBuffers, given: StepInput, unit: float) -> None:
     """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
 
     Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
@@ -228,22 +228,18 @@ def init_step(
 
     Args:
         motion: written.
-        positions: of all nodes, shape (n + 1, d) [m].
-        velocities: over the last step [m/s].
-        nodes: of prescribed motion, shape (k,).
-        ends: where these are at the end of the step, shape (k, d) [m].
+        given: the step.
         unit: D [m].
-        interval: dt [s].
-        last_interval: of the last step, 0 if there was none [s].
     """
-    motion.before[:], motion.last[:] = positions / unit, velocities / unit
+    interval, last_interval = given.interval, given.last_interval
+    motion.before[:], motion.last[:] = given.positions / unit, given.velocities / unit
     motion.velocities[:] = motion.last
-    motion.start[:], motion.known[:] = move_prescribed(motion.before, nodes, ends, unit)
+    motion.start[:], motion.known[:] = move_prescribed(motion.before, given.nodes, given.ends, unit)
     motion.about[:] = motion.start
     if not (last_interval > 0.0 and interval <= MAX_STEP_RATIO * last_interval):
         return
-    for i in range(len(positions)):
-        for a in range(positions.shape[1]):
+    for i in range(len(motion.start)):
+        for a in range(motion.start.shape[1]):
             if not motion.known[i]:
                 motion.about[i, a] = motion.start[i, a] + interval * motion.last[i, a]
                 if not abs(motion.about[i, a] - motion.start[i, a]) <= 1.0:
@@ -280,13 +276,13 @@ def solve_step(
         workspace: obstacles and wall [m].
         solver_buffers: of the structured solver; one without iterations leaves every solve to the caller.
         motion: where the step has got to; written.
-        positions: see `init_step`, as are the following.
-        velocities: over the last step [m/s].
-        nodes: of prescribed motion, shape (k,).
-        ends: where these are at the end of the step, shape (k, d) [m].
-        heading: unit vector along the needle at the end of the step, shape (d,).
-        interval: dt [s].
-        last_interval: of the last step, 0 if there was none [s].
+        positions: see `StepInput`, as are the following; one tuple of them costs more when this is called from Python.
+        velocities: over the last step.
+        nodes: of prescribed motion.
+        ends: of these.
+        heading: of the needle.
+        interval: of the step.
+        last_interval: of the last one.
         tolerance: the largest residual with which a solution is accepted.
         max_solves: of a step.
         solves: how many this step has had; with none it sets out.
@@ -297,25 +293,12 @@ def solve_step(
         another solver; the number of contacts; solves; how far off the barriers are, see `assemble`; the
         first status that is not 0, see `banded.STATUS`; the largest residual of each kind.
     """
+    given = StepInput(positions, velocities, nodes, ends, heading, interval, last_interval)
     if solves == 0:
-        init_step(motion, positions, velocities, nodes, ends, rod.unit, interval, last_interval)
+        init_step(motion, given, rod.unit)
     worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
     while True:
-        contacts, off = assemble_step(
-            solves,
-            rod,
-            buffers,
-            workspace,
-            motion.about,
-            motion.start,
-            motion.before,
-            motion.last,
-            motion.known,
-            heading,
-            interval,
-            last_interval,
-            elsewhere,
-        )
+        contacts, off = assemble_step(solves, rod, buffers, workspace, motion, given, elsewhere)
         if contacts < 0:
             return NO_ROOM, contacts, solves, off, status, worst
         if off <= 1.0 or solves == max_solves:
@@ -325,22 +308,12 @@ def solve_step(
         if solver_buffers.iterations == 0:
             return UNSOLVED, contacts, solves, off, status, worst
         rows = segments + contacts
-        program = ChainProgram(
-            buffers.blocks,
-            buffers.couplings,
-            buffers.linear,
-            motion.known,
-            buffers.first[:rows],
-            buffers.gradient[:rows],
-            buffers.lower[:rows],
-            buffers.upper[:rows],
-            buffers.compliance[:rows],
-        )
+        program = program_of(buffers, motion.known, rows)
         u, multipliers = motion.velocities.copy(), buffers.multipliers[:rows].copy()
         word, _, found = banded.solve_and_check(axes, program, u, multipliers, solver_buffers)
         if not max(found) <= tolerance:
             return UNSOLVED, contacts, solves, off, status, worst
-        accept_step(buffers, motion, u, multipliers, interval)
+        accept_step(buffers, motion, u, multipliers, given.interval)
         worst = (max(worst[0], found[0]), max(worst[1], found[1]), max(worst[2], found[2]))
         status, solves = status if status != 0 else word, solves + 1
 
@@ -350,8 +323,6 @@ def accept_step(
     buffers: StepBuffers, motion: MotionBuffers, velocities: Points, multipliers: Vector, interval: float
 ) -> None:
     """Take a solution: its velocities, where they lead, and its multipliers as a guess for the next one."""
-    segments = len(velocities) - 1
-    buffers.multipliers[: len(multipliers)] = multipliers
-    keep_contact_multipliers(buffers.node, multipliers[segments:], buffers.push)
+    keep_multipliers(buffers, multipliers, len(velocities) - 1)
     motion.velocities[:] = velocities
     motion.about[:] = motion.start + interval * velocities  # known nodes have moved, and have no velocity

@@ -1,20 +1,33 @@
-"""One step of the thread: what goes in, what comes out, and the rows that every formulation shares."""
+"""One step of the thread: what goes in, what comes out, and what every formulation shares."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import BarrierRows
+from magnetosuture_thread.barrier import Barrier, BarrierRows, CompiledBarrier
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import WorkspaceData
+from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
-from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.formulations.added_rows import AddedBarriers
-from magnetosuture_thread.model.program import SPAN, ChainProgram, Residuals, Solution, Solver, Vector, residuals_of
+from magnetosuture_thread.geometry.polyline import Points, chain_along
+from magnetosuture_thread.model.barriers import ObstacleAvoidance, WallAvoidance
+from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
+from magnetosuture_thread.model.program import (
+    SPAN,
+    ChainProgram,
+    Residuals,
+    Solution,
+    Solver,
+    Vector,
+    residuals_of,
+)
+from magnetosuture_thread.model.thread import Thread
 
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
@@ -39,6 +52,23 @@ class ThreadState:
     def at_rest(cls, positions: Points) -> ThreadState:
         """Return a thread that does not move."""
         return cls(positions, np.zeros_like(positions))
+
+    def resampled(self, before: Thread, thread: Thread) -> ThreadState:
+        """Return the state of a thread that takes another's place: it lies where that lay and moves as that moved.
+
+        A longer one goes on straight at its end. Where segments and length are the same, nothing changes.
+
+        Args:
+            before: the thread that this is the state of.
+            thread: the thread that takes its place.
+        """
+        if (thread.segments, thread.length) == (before.segments, before.length):
+            return self
+        positions = chain_along(self.positions, thread.segments, thread.segment_length)
+        at = thread.segment_length * np.arange(thread.segments + 1)
+        nodes = before.segment_length * np.arange(before.segments + 1)
+        velocities = np.column_stack([np.interp(at, nodes, along) for along in self.velocities.T])
+        return ThreadState(positions, velocities, self.interval)
 
 
 @dataclass(frozen=True)
@@ -83,40 +113,6 @@ class StepResult:
     residuals: Residuals
     solves: int
     converged: bool
-
-
-class Formulation(Protocol):
-    """A way of writing one step of the thread as a quadratic program.
-
-    Attributes:
-        name: of the formulation.
-        dimension: 2 or 3.
-        added: the barriers that a user has added.
-    """
-
-    name: str
-    dimension: int
-    added: AddedBarriers
-
-    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
-        """Move the prescribed nodes and let the thread follow for one interval [s].
-
-        Raises:
-            SolverError: a solution's residual is above the tolerance.
-        """
-        ...
-
-    def warm_up(self) -> None:
-        """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
-        ...
-
-    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
-        """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
-        ...
-
-    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
-        ...
 
 
 class StepBuffers(NamedTuple):
@@ -187,7 +183,7 @@ class StepBuffers(NamedTuple):
             np.zeros(nodes),
         )
 
-    def with_room(self) -> StepBuffers:
+    def enlarged(self) -> StepBuffers:
         """Return buffers for twice as many contacts, with the same chords and multipliers."""
         nodes, dimension = self.linear.shape
         rows = len(self.first) - len(self.node)
@@ -202,27 +198,21 @@ class StepBuffers(NamedTuple):
         self.multipliers[:] = 0.0
         self.push[:] = 0.0
 
-    def program(self, count: int, known: NDArray[np.bool_]) -> ChainProgram:
-        """Return the program with the first rows."""
-        return ChainProgram(
-            self.blocks,
-            self.couplings,
-            self.linear,
-            known,
-            self.first[:count],
-            self.gradient[:count],
-            self.lower[:count],
-            self.upper[:count],
-            self.compliance[:count],
-        )
 
-
-def warmed(solver: Solver, buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> Solution:
-    """Return a solution of the buffers's last program as a general solver gets it, its residuals worked out here."""
-    program = buffers.program(rows, known)
-    solution = solver.solve(program, np.zeros_like(buffers.linear), np.zeros(rows))
-    residuals_of(program, solution.velocities, solution.multipliers)
-    return solution
+@compiled
+def program_of(buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> ChainProgram:
+    """Return the program of the first rows."""
+    return ChainProgram(
+        buffers.blocks,
+        buffers.couplings,
+        buffers.linear,
+        known,
+        buffers.first[:rows],
+        buffers.gradient[:rows],
+        buffers.lower[:rows],
+        buffers.upper[:rows],
+        buffers.compliance[:rows],
+    )
 
 
 @compiled
@@ -286,11 +276,13 @@ def contact_rows(
 
 
 @compiled
-def keep_contact_multipliers(node: NDArray[np.int64], multipliers: Vector, push: Vector) -> None:
-    """Keep the multipliers of the contact rows, the largest of each node, for the next guess."""
-    push[:] = 0.0
-    for c in range(len(multipliers)):
-        push[node[c]] = max(push[node[c]], multipliers[c])
+def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
+    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node."""
+    buffers.multipliers[: len(multipliers)] = multipliers
+    buffers.push[:] = 0.0
+    for r in range(rows, len(multipliers)):
+        node = buffers.node[r - rows]
+        buffers.push[node] = max(buffers.push[node], multipliers[r])
 
 
 @compiled
@@ -304,3 +296,85 @@ def move_prescribed(
             moved[nodes[k], a] = ends[k, a] / unit
         known[nodes[k]] = True
     return moved, known
+
+
+class Formulation(ABC):
+    """A way of writing one step of the thread as a quadratic program.
+
+    Args:
+        thread: the thread.
+        workspace: obstacles and wall [m]; their reach is that of the margins.
+        solver: solves the program.
+        tolerance: the largest residual with which a solution is accepted.
+        barriers: what a user adds to the built-in ones.
+        rows: number of the program's rows besides those of contacts and added barriers.
+
+    Attributes:
+        name: of the formulation.
+        dimension: 2 or 3.
+        added: the barriers that a user has added.
+    """
+
+    name: str
+
+    def __init__(
+        self,
+        thread: Thread,
+        workspace: Workspace,
+        solver: Solver,
+        tolerance: float,
+        barriers: Sequence[Barrier],
+        rows: int,
+    ) -> None:
+        nodes, self.dimension = thread.segments + 1, workspace.dimension
+        self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
+        self._radius, reach = 0.5 * thread.diameter, ROW_REACH * thread.segment_length
+        self._near = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius)
+        self.added = AddedBarriers(barriers, thread.segment_length)
+        self._rows, self._buffers = rows, StepBuffers.of(nodes, self.dimension, rows, 2 * nodes)
+
+    @abstractmethod
+    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
+        """Move the prescribed nodes and let the thread follow for one interval [s].
+
+        Raises:
+            SolverError: a solution's residual is above the tolerance.
+        """
+
+    def warm_up(self) -> None:
+        """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
+        nodes = self._thread.segments + 1
+        program = program_of(self._buffers, np.zeros(nodes, dtype=np.bool_), self._rows)
+        solution = self._solver.solve(program, np.zeros((nodes, self.dimension)), np.zeros(self._rows))
+        residuals_of(program, solution.velocities, solution.multipliers)
+        self._buffers.forget()
+
+    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
+        """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
+        return np.full(self._thread.segments, self._thread.segment_length)
+
+    @abstractmethod
+    def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
+        """Return the built-in barriers of the thread itself, obstacles and wall aside, at these positions."""
+
+    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
+        """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
+        contacts = self._workspace.near(positions)
+        return [
+            *(barrier.rows(positions) for barrier in self.segment_barriers(positions, heading)),
+            ObstacleAvoidance(self._workspace, self._radius).rows_of(contacts),
+            WallAvoidance(self._workspace, self._radius).rows_of(contacts),
+        ]
+
+    def _solve(self, contacts: int, known: NDArray[np.bool_], velocities: Points, added: LinearRows | None) -> Solution:
+        """Return the solution of the program in the buffers, with the rows of added barriers."""
+        count, wide = self._rows + contacts, None
+        program, guess = program_of(self._buffers, known, count), self._buffers.multipliers[:count]
+        if added is not None:
+            program, wide = added.joined(program)
+            guess = np.concatenate([guess, np.zeros(len(added.lower))])
+        solution = self._solver.solve(program, velocities, guess, wide)
+        if not solution.residuals.largest <= self._tolerance:
+            self._buffers.forget()
+            raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
+        return solution

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.program import (
     SPAN,
     ChainProgram,
@@ -152,11 +153,7 @@ class BandedSolver:
         self._buffers = SolverBuffers(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
 
     def solve(
-        self,
-        program: ChainProgram,
-        velocities: NDArray[np.float64],
-        multipliers: Vector,
-        wide: WideRows | None = None,
+        self, program: ChainProgram, velocities: Points, multipliers: Vector, wide: WideRows | None = None
     ) -> Solution:
         """Solve one program, started from a guess; see `Solver`. Wide rows do not fit into the band."""
         if wide is not None:
@@ -182,7 +179,7 @@ class BandedSolver:
 
 
 @compiled
-def balance(axes: Axes, program: ChainProgram, u: NDArray[np.float64], smooth: Vector) -> float:
+def balance(axes: Axes, program: ChainProgram, u: Points, smooth: Vector) -> float:
     """Write P u + q and return its largest term."""
     d, nodes, largest = len(axes), len(u), 1.0
     for i in range(nodes):
@@ -201,7 +198,7 @@ def balance(axes: Axes, program: ChainProgram, u: NDArray[np.float64], smooth: V
 
 
 @compiled
-def images(axes: Axes, program: ChainProgram, u: NDArray[np.float64], image: Vector) -> None:
+def images(axes: Axes, program: ChainProgram, u: Points, image: Vector) -> None:
     """Write a_r' u of every row."""
     d, width = len(axes), SPAN * len(axes)
     for r in range(len(program.first)):
@@ -303,7 +300,7 @@ def search(
 def solve(
     axes: Axes,
     program: ChainProgram,
-    u: NDArray[np.float64],
+    u: Points,
     multipliers: Vector,
     buffers: SolverBuffers,
 ) -> tuple[int, int]:
@@ -382,7 +379,7 @@ def solve(
 def solve_and_check(
     axes: Axes,
     program: ChainProgram,
-    u: NDArray[np.float64],
+    u: Points,
     multipliers: Vector,
     buffers: SolverBuffers,
 ) -> tuple[int, int, tuple[float, float, float]]:

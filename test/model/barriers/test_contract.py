@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -29,7 +27,7 @@ def barriers(dimension: int) -> list[Barrier]:
             np.array([(-1.0, -1.5, 0.0), (0.3, -1.4, 0.1), (0.1, -0.6, -0.2), (-0.2, -0.9, 1.1)]),
             np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]),
         )
-    workspace = Workspace([near, far, shape], 50.0, dimension)
+    workspace = Workspace([near, far, shape], 50.0, dimension, 2.5)
     return [
         Connectivity(1.0),
         EnhancedConnectivity(1.0),
@@ -38,7 +36,7 @@ def barriers(dimension: int) -> list[Barrier]:
         ObstacleAvoidance(workspace, 0.05),
         SquaredObstacleAvoidance(workspace, 0.05),
         Stiffness(np.linspace(1.5, 2.0, 7)),
-        WallAvoidance(2.5, 0.05, 50.0),
+        WallAvoidance(workspace, 0.05),
     ]
 
 
@@ -130,20 +128,20 @@ def test_the_needle_has_a_margin_too_and_far_pairs_have_none():
 
 def test_the_wall_is_a_circle_and_in_space_a_cylinder():
     plane = np.array([[0.0, 0.0], [1.5, 0.0], [0.0, 1.75], [-3.0, 0.0]])
-    rows = WallAvoidance(2.0, 0.25, 0.5).rows(plane)
+    rows = WallAvoidance(Workspace([], 0.5, 2, 2.0), 0.25).rows(plane)
     np.testing.assert_array_equal(rows.nodes, [[1], [2], [3]])
     np.testing.assert_allclose(rows.value, [0.25, 0.0, -1.25], atol=1e-15)
     np.testing.assert_allclose(rows.gradient[:, 0], [[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]], atol=1e-15)
     space = np.column_stack([plane, [5.0, -3.0, 0.0, 1.0]])
-    above = WallAvoidance(2.0, 0.25, 0.5).rows(space)
+    above = WallAvoidance(Workspace([], 0.5, 3, 2.0), 0.25).rows(space)
     np.testing.assert_array_equal(above.value, rows.value)
     assert (above.gradient[:, 0, 2] == 0.0).all()
-    assert len(WallAvoidance(math.inf, 0.25, 0.5).rows(plane).value) == 0
+    assert len(WallAvoidance(Workspace([], 0.5), 0.25).rows(plane).value) == 0
 
 
 def test_a_wall_row_forbids_nothing_that_the_circle_allows():
     random = np.random.default_rng(1)
-    barrier = WallAvoidance(2.0, 0.1, 50.0)
+    barrier = WallAvoidance(Workspace([], 50.0, 2, 2.0), 0.1)
     about, inside = random.normal(size=(200, 2)), random.normal(size=(200, 2))
     inside *= (1.9 * random.uniform(size=(200, 1)) ** 0.1) / np.linalg.norm(inside, axis=1, keepdims=True)
     rows = barrier.rows(about)

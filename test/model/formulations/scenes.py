@@ -9,10 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from magnetosuture_thread.geometry.obstacles import Obstacle, Workspace
-from magnetosuture_thread.model.factory import make_formulation, make_solver
-from magnetosuture_thread.model.formulations import Formulation, PaperOptions, PrescribedMotion, StepResult, ThreadState
-from magnetosuture_thread.model.medium import Medium
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.model.formulations import (
+    Formulation,
+    PaperOptions,
+    PrescribedMotion,
+    StepResult,
+    ThreadState,
+    make_formulation,
+)
+from magnetosuture_thread.model.solvers import make_solver
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Medium, Thread
 
 DT = 1.0 / 66.0
 TOLERANCE = 1e-6

@@ -17,7 +17,7 @@ from magnetosuture_thread.model.formulations import (
     StepResult,
     ThreadState,
 )
-from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, init_step
+from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, StepInput, init_step
 from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, WideRows
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
@@ -158,12 +158,12 @@ def test_the_first_guess_goes_on_as_before_unless_that_is_noise_or_too_far():
     unit, lead_node, end = polyamide().segment_length, np.array([0]), np.array([[1e-4, 2e-4]])
     start, velocities = straight(polyamide()), np.full((26, 2), 3.0 * unit)
     onwards, still = MotionBuffers.of(26, 2), MotionBuffers.of(26, 2)
-    init_step(onwards, start, velocities, lead_node, end, unit, DT, DT)
+    init_step(onwards, StepInput(start, velocities, lead_node, end, east(), DT, DT), unit)
     np.testing.assert_allclose(onwards.about[1:], start[1:] / unit + 3.0 * DT)
     np.testing.assert_array_equal(onwards.about[0], end[0] / unit)
     np.testing.assert_array_equal(onwards.known, np.arange(26) == 0)
     for last_interval, speeds in ((0.0, velocities), (0.1 * DT, velocities), (DT, 100.0 * velocities)):
-        init_step(still, start, speeds, lead_node, end, unit, DT, last_interval)
+        init_step(still, StepInput(start, speeds, lead_node, end, east(), DT, last_interval), unit)
         np.testing.assert_array_equal(still.about, still.start)
         np.testing.assert_array_equal(still.start[1:], start[1:] / unit)
 
@@ -290,7 +290,7 @@ def test_a_thread_among_hundreds_of_obstacles_keeps_its_length():
 def test_memory_that_grows_keeps_the_chords_and_the_multipliers():
     memory = StepBuffers.of(6, 2, 5, 3)
     memory.chords[:], memory.multipliers[:], memory.push[:] = 0.9, 7.0, 3.0
-    larger = memory.with_room()
+    larger = memory.enlarged()
     assert len(larger.node) == 6
     np.testing.assert_array_equal(larger.chords, 0.9)
     np.testing.assert_array_equal(larger.multipliers[:5], 7.0)

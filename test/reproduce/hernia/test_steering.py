@@ -8,7 +8,7 @@ import pytest
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.friction import FrictionState
+from magnetosuture_thread.model.margins import FrictionState
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.reproduce.hernia.steering import (
     HerniaRun,

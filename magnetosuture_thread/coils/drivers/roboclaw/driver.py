@@ -7,8 +7,7 @@ import time
 import numpy as np
 
 from magnetosuture_thread.coils.drivers.protocol import DriverState
-from magnetosuture_thread.coils.drivers.roboclaw.line import LineThread
-from magnetosuture_thread.coils.drivers.roboclaw.mailbox import Mailbox
+from magnetosuture_thread.coils.drivers.roboclaw.line import LineThread, Mailbox
 from magnetosuture_thread.coils.drivers.roboclaw.protocol import Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import DriverError

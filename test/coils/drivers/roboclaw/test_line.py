@@ -14,8 +14,7 @@ import serial
 from magnetosuture_thread.coils.drivers.roboclaw import board as board_module
 from magnetosuture_thread.coils.drivers.roboclaw import line as line_module
 from magnetosuture_thread.coils.drivers.roboclaw.driver import CLOSE_TIMEOUT
-from magnetosuture_thread.coils.drivers.roboclaw.line import LineThread
-from magnetosuture_thread.coils.drivers.roboclaw.mailbox import LineReport, Mailbox
+from magnetosuture_thread.coils.drivers.roboclaw.line import LineReport, LineThread, Mailbox
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
 from magnetosuture_thread.coils.drivers.roboclaw.protocol import Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magnetosuture_thread.coils.drivers.roboclaw.mailbox import LineReport, Mailbox
+from magnetosuture_thread.coils.drivers.roboclaw.line import LineReport, Mailbox
 
 CURRENTS = np.array([1.0, 2.0, 3.0, 4.0])
 
