@@ -15,7 +15,7 @@ from matplotlib.patches import Circle
 from magnetosuture_thread.evaluation.plots import FAINT, INK, tidy
 from magnetosuture_thread.evaluation.scene_plot import shape_patch
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.friction import Friction, FrictionState, friction_colour
+from magnetosuture_thread.model.margins import Friction, FrictionState, friction_colour
 from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, SteeredInstant
 from magnetosuture_thread.scene import Scene
 
