@@ -15,11 +15,10 @@ import numpy as np
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.jobs.frames import FrameFile, FrameSource, numbered
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.vision.look import State, Track, no_pose
+from magnetosuture_thread.vision.frame import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import VisionTracker, warm_up
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.scene.scene import Scene
-from magnetosuture_thread.vision.look import State, Track
+from magnetosuture_thread.vision.frame import State, Track
 from magnetosuture_thread.vision.scene_mask import mask_outlines
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}

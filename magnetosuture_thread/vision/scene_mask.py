@@ -129,7 +129,7 @@ class SceneMask:
         return self.depth[np.clip(at[:, 1], 0, rows - 1), np.clip(at[:, 0], 0, columns - 1)]
 
 
-def scene_mask(
+def make_scene_mask(
     scene: Scene, view: DishView, shape: tuple[int, ...], factor: int, tolerance: float, cell: int
 ) -> SceneMask | None:
     """Return the mask of a frame; None for a scene without shapes.

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.images import Picture
+from magnetosuture_thread.vision.images import Picture, middle
 from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle, measure_body
-from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
