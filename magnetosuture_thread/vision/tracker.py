@@ -270,7 +270,7 @@ class VisionTracker:
 
 @dataclass(frozen=True)
 class FrameMeasurement:
-    """What is told of one frame.
+    """What is measured in one frame, as it is published.
 
     Attributes:
         track: what was seen.
