@@ -104,11 +104,11 @@ class FaultSchedule:
         self._seed = seed
 
     def set_dish(self, diameter: float) -> None:
-        """Take another dish, of this inner diameter [m]."""
+        """Replace the dish by one of this inner diameter [m]."""
         self._dish = diameter
 
     def add(self, fault: Fault) -> None:
-        """Take one more fault, and forget those that are over."""
+        """Add a fault, and forget those that are over."""
         self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-MAX_FAULTS:]
 
     def kinds(self, time: float) -> frozenset[str]:

@@ -172,7 +172,7 @@ def _edge_points(
 
 
 def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:
-    """Say whether the floor near the rim is as bright as the image can show."""
+    """Return whether the floor near the rim is as bright as the image can show."""
     angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     at = np.column_stack([u + 0.93 * radius * np.cos(angles), v + 0.93 * radius * np.sin(angles)])
     columns, rows = np.clip(at.round().astype(int), 0, np.array(gray.shape[::-1]) - 1).T

@@ -41,7 +41,7 @@ MIN_SHARE = 0.9  # of the thread seen before; if less is seen in the region, the
 
 @dataclass(frozen=True)
 class _Pose:
-    """A needle that was seen, in the dish frame."""
+    """A measured needle in the dish frame."""
 
     time: float
     tail: np.ndarray
@@ -72,7 +72,7 @@ class VisionTracker:
         self.reset()
 
     def set_scene(self, scene: Scene) -> None:
-        """Take another scene. The needle is still tracked, unless the dish has another size."""
+        """Replace the scene. The needle is still tracked, unless the dish has another size."""
         other_dish = scene.dish.diameter != self._scene.dish.diameter
         self._scene = scene
         self._masks.clear()
@@ -183,7 +183,7 @@ class VisionTracker:
         self._time = time_s
 
     def _is_cut(self, found: Track, picture: Picture) -> bool:
-        """Say whether the thread may go on beyond the part of the frame that was looked at."""
+        """Return whether the thread may go on beyond the part of the frame that was looked at."""
         assert found.view is not None
         line = found.view.to_pixels(found.centreline)
         if _length(line) < MIN_SHARE * _length(self._thread[2:]):
@@ -229,7 +229,7 @@ class VisionTracker:
         return None, None, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
 
     def _fits(self, pose: _Pose, last: _Pose) -> bool:
-        """Say whether a needle can have come from where it was last."""
+        """Return whether a needle can have come from where it was last."""
         after = pose.time - last.time
         tail, angle = last.at(pose.time)
         assert self._dish.view is not None
@@ -314,7 +314,7 @@ class TrackerSession:
         return State.LOST if self.tracked else State.SEARCHING
 
     def set_scene(self, scene: Scene) -> None:
-        """Take another scene; see `VisionTracker.set_scene`."""
+        """Replace the scene; see `VisionTracker.set_scene`."""
         self._tracker.set_scene(scene)
 
     def on_image(self, time_s: float, image: np.ndarray) -> FrameMeasurement:

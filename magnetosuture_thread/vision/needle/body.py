@@ -89,7 +89,7 @@ def measure_body(
         toward: where it must point, u right and v down; see `find_needles`.
 
     Returns:
-        The needle as `SeenNeedle`, or in words why this is none.
+        The needle as `MeasuredNeedle`, or in words why this is none.
     """
     rows, columns = gray.shape
     arc = guess.moved(first, 0.0, 0.0, 0.0)

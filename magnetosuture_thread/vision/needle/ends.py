@@ -105,7 +105,7 @@ def _falls_below(along: np.ndarray, profile: np.ndarray, level: float) -> float:
 
 
 def is_glaring(strip: Strip, tail: float, tip: float, body: float) -> bool:
-    """Say whether the lamp is reflected at an end."""
+    """Return whether the lamp is reflected at an end."""
     wide = np.abs(strip.aside) < 0.5 * body + 3.0
     usual = middle(strip.ground[(strip.along > tail) & (strip.along < tip)])
     light = ((1.0 - strip.dark) * strip.ground.mean(axis=1, keepdims=True) / usual).astype(np.float32)
@@ -117,7 +117,7 @@ def is_glaring(strip: Strip, tail: float, tip: float, body: float) -> bool:
 
 
 def find_cover(strip: Strip, tail: float, tip: float, body: float) -> str:
-    """Say what covers or touches the needle; empty if nothing does."""
+    """Return what covers or touches the needle; empty if nothing does."""
     along, length = strip.along, tip - tail
     rows = (along > tail + 2.0) & (along < tail + (1.0 - TAPER) * length - 2.0)
     core = np.abs(strip.aside) < max(0.42 * body, 0.6)
