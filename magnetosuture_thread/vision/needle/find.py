@@ -135,7 +135,7 @@ def _dark_components(
 
 
 def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
-    """Return whether a needle's axis lies in shapes: that of a real one stays half its width off their outlines [px]."""
+    """Return whether a needle's axis lies in shapes: a real one stays half its width off their outlines [px]."""
     depths = mask.depths(needle.arc.at(np.linspace(0.0, needle.length_px, AXIS_POINTS)))
     return middle(depths) > mask.tolerance_px - 0.5 * width
 
