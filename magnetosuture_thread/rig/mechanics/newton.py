@@ -48,7 +48,8 @@ class NewtonBuffers(NamedTuple):
 def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
     """Return buffers for a thread of n segments and for so many contacts of one point or segment."""
     size = 2 * segments + 3
-    shapes = (size, size, size, (size, WIDTH), (size, WIDTH), size, (segments + 1, 3), (3, 3), (contacts, 5))
+    bands, drag, rows = (size, WIDTH), (segments + 1, 3), (contacts, 5)
+    shapes: tuple[int | tuple[int, int], ...] = (size, size, size, bands, bands, size, drag, (3, 3), rows)
     return NewtonBuffers(*(np.zeros(shape) for shape in shapes))
 
 
