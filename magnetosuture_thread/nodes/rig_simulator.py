@@ -76,7 +76,7 @@ class RigSimulatorNode(Node):
     def on_fault(self, message: String) -> None:
         """Take a fault that begins now."""
         try:
-            self.rig.faults.add(Fault.requested_faults(message.data, max(0.0, self.rig.running)))
+            self.rig.faults.add(Fault.parse_request(message.data, max(0.0, self.rig.running)))
         except InvalidInputError as error:
             self._health.refuse(error)
 
@@ -120,7 +120,7 @@ class RigSimulatorNode(Node):
 
     def _take(self, elapsed: float) -> None:
         try:
-            frame = self.rig.look(elapsed)
+            frame = self.rig.capture_frame(elapsed)
         except MagnetosutureError as error:
             self._fail(error)
             return
@@ -130,7 +130,7 @@ class RigSimulatorNode(Node):
         else:
             self._publisher.publish(stamp, frame)
         self._frames += 1
-        self._health.ok(self.rig.words, taken=self._frames, skipped=self._skipped)
+        self._health.ok(self.rig.status, taken=self._frames, skipped=self._skipped)
 
     def _fail(self, error: MagnetosutureError) -> None:
         """Switch the coils off where the simulation does not find its next state, and say so."""

@@ -20,7 +20,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RigFrame:
-    """One frame and the truth of its moment.
+    """One frame and the ground truth of its moment.
 
     Attributes:
         time: since the start [s].
@@ -118,10 +118,7 @@ class Rig:
         currents = np.clip(currents, -limit, limit)
         if np.any(currents):
             self.began = min(self.began, self.time)
-        stuck = self.currents[0]
-        self.currents = currents.copy()
-        if COIL_STUCK in self.faults.kinds(self.running):
-            self.currents[0] = stuck
+        self._switch(currents)
         self._applied_at = time
 
     def advance(self, time: float) -> None:
@@ -134,9 +131,13 @@ class Rig:
 
     def switch_off(self) -> None:
         """Set all currents to zero, but that of a stuck coil."""
-        stuck = self.currents[0] if COIL_STUCK in self.faults.kinds(self.running) else 0.0
-        self.currents = np.zeros_like(self.currents)
-        self.currents[0] = stuck
+        self._switch(np.zeros_like(self.currents))
+
+    def _switch(self, currents: Vector) -> None:
+        stuck = self.currents[0]
+        self.currents = currents.copy()
+        if COIL_STUCK in self.faults.kinds(self.running):
+            self.currents[0] = stuck
 
     def _move(self, time: float) -> None:
         if time > self.time:
@@ -149,14 +150,14 @@ class Rig:
         return self.time - self.began
 
     @property
-    def words(self) -> str:
-        """What goes on, for a person."""
+    def status(self) -> str:
+        """What the rig does, in words for the operator."""
         faults = ", ".join(sorted(self.faults.kinds(self.running)))
         text = "running" if self.running >= 0.0 else "waiting for the first current"
         return f"{text}, with {faults}" if faults else text
 
-    def look(self, time: float) -> RigFrame:
-        """Take a frame at a time since the start [s]."""
+    def capture_frame(self, time: float) -> RigFrame:
+        """Advance to a time since the start, and return the frame that the camera takes then [s]."""
         self.advance(time)
         faults, dynamics, running = self.faults, self._dynamics, self.running
         away = faults.lifted(running)

@@ -6,10 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes
+from magnetosuture_thread.rig.mechanics.contact import Array, Shapes
 from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle, turn_resistance
 from magnetosuture_thread.rig.mechanics.rod import (
     WIDTH,
@@ -35,125 +34,107 @@ FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere els
 class NewtonBuffers(NamedTuple):
     """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows."""
 
-    trial: NDArray[np.float64]
-    step: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    band: NDArray[np.float64]
-    chol: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    drag: NDArray[np.float64]
-    turned: NDArray[np.float64]
-    rows: NDArray[np.float64]
+    trial: Array
+    step: Array
+    gradient: Array
+    band: Array
+    chol: Array
+    rest: Array
+    drag: Array
+    turned: Array
+    rows: Array
 
 
 def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
-    """Return memory for a thread of n segments and for so many contacts of one point or segment."""
+    """Return buffers for a thread of n segments and for so many contacts of one point or segment."""
     size = 2 * segments + 3
-    return NewtonBuffers(
-        trial=np.zeros(size),
-        step=np.zeros(size),
-        gradient=np.zeros(size),
-        band=np.zeros((size, WIDTH)),
-        chol=np.zeros((size, WIDTH)),
-        rest=np.zeros(size),
-        drag=np.zeros((segments + 1, 3)),
-        turned=np.zeros((3, 3)),
-        rows=np.zeros((contacts, 5)),
-    )
+    bands, drag, rows = (size, WIDTH), (segments + 1, 3), (contacts, 5)
+    shapes: tuple[int | tuple[int, int], ...] = (size, size, size, bands, bands, size, drag, (3, 3), rows)
+    return NewtonBuffers(*(np.zeros(shape) for shape in shapes))
 
 
 @compiled
 def assemble_energy(
-    q: NDArray[np.float64],
-    field: NDArray[np.float64],
+    q: Array,
+    field: Array,
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
-    memory: NewtonBuffers,
-    driven: bool,
+    buffers: NewtonBuffers,
+    prescribed: bool,
     convex: bool,
 ) -> float:
     """Write gradient and band of what a step makes least, and return its value [J].
 
-    Where the needle is driven, its three unknowns are known: they get no force and no coupling.
+    Where the needle is prescribed, its three unknowns are known: they get no force and no coupling.
     """
-    memory.gradient[:] = 0.0
-    memory.band[:, :] = 0.0
-    g, band = memory.gradient, memory.band
-    energy = add_drag(q, memory.rest, memory.drag, g, band)
+    buffers.gradient[:] = 0.0
+    buffers.band[:, :] = 0.0
+    g, band = buffers.gradient, buffers.band
+    energy = add_drag(q, buffers.rest, buffers.drag, g, band)
     energy += add_stretching(q, rod, g, band, convex) + add_bending(q, rod, g, band, convex)
-    energy += add_contact(q, rod, shapes, memory.rows, g, band, convex)
+    energy += add_contact(q, rod, shapes, buffers.rows, g, band, convex)
     energy += add_clamp(q, needle, rod.segment, g, band, convex)
-    if not driven:
-        rest, turned, rows = memory.rest, memory.turned, memory.rows
+    if not prescribed:
+        rest, turned, rows = buffers.rest, buffers.turned, buffers.rows
         energy += add_needle(q, field, needle, shapes, rest, turned, rows, g, band, convex)
         return energy
     for i in range(3):
         g[i] = 0.0
         band[i, :] = 0.0
         band[i, 0] = 1.0
-        for j in range(3, 9):
-            if j - i < band.shape[1] and j < band.shape[0]:
-                band[j, j - i] = 0.0
+        for j in range(3, i + WIDTH):
+            band[j, j - i] = 0.0
     return energy
 
 
 @compiled
-def _largest(gradient: NDArray[np.float64], arm: float) -> float:
+def _largest(gradient: Array, arm: float) -> float:
     """Return the largest force, the needle's torque as one at its tip [N]."""
-    largest = abs(gradient[0]) / arm
-    for i in range(1, gradient.shape[0]):
-        largest = max(largest, abs(gradient[i]))
-    return float(largest)
+    return float(max(abs(gradient[0]) / arm, np.abs(gradient[1:]).max()))
 
 
 @compiled
 def _minimise(
-    start: NDArray[np.float64],
-    field: NDArray[np.float64],
+    start: Array,
+    field: Array,
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
-    memory: NewtonBuffers,
-    driven: bool,
+    buffers: NewtonBuffers,
+    prescribed: bool,
     tolerance: float,
     search: bool,
 ) -> tuple[int, float, float]:
-    """Find in `memory.trial` where a step's value is least; see `advance`.
+    """Find in `buffers.trial` where a step's value is least; see `advance`.
 
     Newton, with the convex part of the second derivatives where they are not positive definite. Without a line
     search a contact is found in one or two steps; with one, steps end short of every new contact. So the first way is
     given few steps of at most half a segment, and must end below where it started.
     """
-    trial, size = memory.trial, start.shape[0]
+    trial, step = buffers.trial, buffers.step
     arm = math.sqrt(needle.tip[0] ** 2 + needle.tip[1] ** 2)
     current = start.copy()
-    first = energy = assemble_energy(start, field, needle, rod, shapes, memory, driven, False)
-    move, force = np.inf, _largest(memory.gradient, arm)
+    first = energy = assemble_energy(start, field, needle, rod, shapes, buffers, prescribed, False)
+    move, force = np.inf, _largest(buffers.gradient, arm)
     for iteration in range(1, (MAX_ITERATIONS if search else MAX_FULL_STEPS) + 1):
-        memory.chol[:, :] = memory.band
-        if not factor(memory.chol):
-            assemble_energy(current, field, needle, rod, shapes, memory, driven, True)
-            memory.chol[:, :] = memory.band
-            if not factor(memory.chol):
+        buffers.chol[:, :] = buffers.band
+        if not factor(buffers.chol):
+            assemble_energy(current, field, needle, rod, shapes, buffers, prescribed, True)
+            buffers.chol[:, :] = buffers.band
+            if not factor(buffers.chol):
                 return -1, np.inf, force
-        for i in range(size):
-            memory.step[i] = -memory.gradient[i]
-        back_substitute(memory.chol, memory.step)
-        slope = 0.0
-        move = abs(memory.step[0]) * arm
-        for i in range(size):
-            slope += memory.gradient[i] * memory.step[i]
-            if i > 0:
-                move = max(move, abs(memory.step[i]))
+        step[:] = -buffers.gradient
+        back_substitute(buffers.chol, step)
+        slope = (buffers.gradient * step).sum()
+        move = max(abs(step[0]) * arm, np.abs(step[1:]).max())
         if not move < (np.inf if search else 0.5 * rod.segment):
             return -1, move, force
         part = 1.0
         while True:
-            for i in range(size):
-                trial[i] = current[i] + part * memory.step[i]
-            new = assemble_energy(trial, field, needle, rod, shapes, memory, driven, False)
-            force = _largest(memory.gradient, arm)
+            trial[:] = current + part * step
+            new = assemble_energy(trial, field, needle, rod, shapes, buffers, prescribed, False)
+            force = _largest(buffers.gradient, arm)
             if move <= tolerance:
                 lower = search or new <= first + FALSE_RISE * abs(first) + MIN_ENERGY
                 return iteration if lower else -1, move, force
@@ -169,16 +150,16 @@ def _minimise(
 
 @compiled
 def advance(
-    q: NDArray[np.float64],
-    before: NDArray[np.float64],
+    q: Array,
+    before: Array,
     dt: float,
     ratio: float,
-    field: NDArray[np.float64],
+    field: Array,
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
-    memory: NewtonBuffers,
-    driven: bool,
+    buffers: NewtonBuffers,
+    prescribed: bool,
     tolerance: float,
 ) -> tuple[int, float, float]:
     """Find the state after a step of the second backward difference formula with variable steps.
@@ -190,8 +171,8 @@ def advance(
     contacts begin and end. Where they do not, the search starts again with a line search.
 
     Args:
-        q: state at the start, shape (N,); replaced by the state at the end. Of a driven needle its first three
-            values are in `memory.trial` [rad, m].
+        q: state at the start, shape (N,); replaced by the state at the end. Of a prescribed needle its first three
+            values are in `buffers.trial` [rad, m].
         before: the state one step earlier.
         dt: step [s].
         ratio: w, 0 for a first step, which is backward Euler.
@@ -199,8 +180,8 @@ def advance(
         needle: the needle.
         rod: the thread.
         shapes: what can be touched.
-        memory: to work in.
-        driven: whether the needle's motion is given.
+        buffers: to work in.
+        prescribed: whether the needle's motion is given.
         tolerance: the largest last move of a node [m].
 
     Returns:
@@ -208,18 +189,17 @@ def advance(
 
     Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section III.5. Deviation: none.
     """
-    trial, size = memory.trial, q.shape[0]
+    trial = buffers.trial
     beta = (1.0 + ratio) / (1.0 + 2.0 * ratio)
-    for i in range(size):
-        memory.rest[i] = ((1.0 + ratio) ** 2 * q[i] - ratio**2 * before[i]) / (1.0 + 2.0 * ratio)
-        if not driven or i > 2:
-            trial[i] = q[i] + ratio * (q[i] - before[i])
-    drag_matrices(trial, rod, 1.0 / (beta * dt), memory.drag)
-    turn_resistance(needle, trial[0], 1.0 / (beta * dt), memory.turned)
+    buffers.rest[:] = ((1.0 + ratio) ** 2 * q - ratio**2 * before) / (1.0 + 2.0 * ratio)
+    free = 3 if prescribed else 0  # the first unknown that is not given
+    trial[free:] = q[free:] + ratio * (q[free:] - before[free:])
+    drag_matrices(trial, rod, 1.0 / (beta * dt), buffers.drag)
+    turn_resistance(needle, trial[0], 1.0 / (beta * dt), buffers.turned)
     start = trial.copy()
-    done, move, force = _minimise(start, field, needle, rod, shapes, memory, driven, tolerance, False)
+    done, move, force = _minimise(start, field, needle, rod, shapes, buffers, prescribed, tolerance, False)
     if done < 0:
-        done, move, force = _minimise(start, field, needle, rod, shapes, memory, driven, tolerance, True)
+        done, move, force = _minimise(start, field, needle, rod, shapes, buffers, prescribed, tolerance, True)
     if done > 0:
         q[:] = trial
     return done, move, force
