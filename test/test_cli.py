@@ -14,7 +14,8 @@ import pytest
 from magnetosuture_thread import cli
 from magnetosuture_thread.cli import commands
 from magnetosuture_thread.cli.main import COMMANDS, MOVED, make_parser
-from magnetosuture_thread.model.formulations import FORMULATIONS, SOLVERS
+from magnetosuture_thread.model.formulations import FORMULATIONS
+from magnetosuture_thread.model.solvers import SOLVERS
 from test.evaluation.test_reference_scores import write
 
 

@@ -22,8 +22,8 @@ from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.vision.frame import State, Track, no_pose
 from magnetosuture_thread.vision.images import decode_image, unpack_image
-from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker, warm_up
