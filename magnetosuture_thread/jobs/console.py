@@ -17,8 +17,8 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.jobs.console_hosts import RecordingHost, SimulatedHost
 from magnetosuture_thread.jobs.replay import GraphInput, live_replay
 from magnetosuture_thread.jobs.replay_inputs import DEFAULT_SETUP, Log, open_bag
-from magnetosuture_thread.nodes.console_graph import ConsoleGraph
-from magnetosuture_thread.nodes.console_host import joined
+from magnetosuture_thread.nodes.console.graph import ConsoleGraph
+from magnetosuture_thread.nodes.console.node import joined
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.setups import Setup, read_setup

@@ -22,9 +22,9 @@ from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log
 from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE, START_TIMEOUT
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console_graph import ConsoleGraph
-from magnetosuture_thread.nodes.console_host import RIG, GraphHost
-from magnetosuture_thread.nodes.console_tap import RECORDED_TOPICS, ConsoleTap
+from magnetosuture_thread.nodes.console.graph import ConsoleGraph
+from magnetosuture_thread.nodes.console.inbox import RECORDED_TOPICS, ConsoleTap
+from magnetosuture_thread.nodes.console.node import RIG, GraphHost
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.setups import Setup, read_setup
 

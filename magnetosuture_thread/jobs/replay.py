@@ -41,10 +41,10 @@ from magnetosuture_thread.jobs.replay_inputs import (
 )
 from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.interruption import Interruption
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
-from magnetosuture_thread.nodes.replay import DEPTH, LiveReplay
-from magnetosuture_thread.nodes.replay_time import Timeline
+from magnetosuture_thread.nodes.replay.clock import Timeline
+from magnetosuture_thread.nodes.replay.player import DEPTH, LiveReplay
+from magnetosuture_thread.nodes.run import Interruption
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.offline.predictions import read_observations
 from magnetosuture_thread.scene import write_scene

@@ -20,9 +20,9 @@ from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_client import CoilClient
-from magnetosuture_thread.nodes.interruption import Interruption
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.recorder import Recorder
+from magnetosuture_thread.nodes.run import Interruption
 from magnetosuture_thread.setups import Setup, read_setup
 
 ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # published while nodes start, for the bag's beginning

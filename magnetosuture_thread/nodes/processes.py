@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.nodes.scheduling import raise_priority
+from magnetosuture_thread.nodes.run import raise_priority
 
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
 LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"

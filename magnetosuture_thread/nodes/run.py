@@ -1,13 +1,16 @@
-"""Runs a node as a program: one-line errors, a clean end, exit codes."""
+"""Runs a node as a program: one-line errors, a clean end, exit codes, priority."""
 
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
-from types import FrameType
-from typing import TypeVar
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, TypeVar
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -17,6 +20,85 @@ from rclpy.node import Node
 
 from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.nodes.parameter_files import init
+
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Interruption:
+    """Keeps the signals that interrupt this process until it is asked whether one came.
+
+    The library behind rclpy calls Python to make and convert messages, and has its own idea of an exception there: a
+    KeyboardInterrupt comes out as another error, or is lost. Signals that are ignored, or that end the process
+    without a word to Python, are left as they are, and outside the main thread, which gets none, so are all.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._before: list[tuple[signal.Signals, Callable[[int, FrameType | None], Any]]] = []
+
+    def __enter__(self) -> Interruption:
+        """Begin to keep signals."""
+        if threading.current_thread() is threading.main_thread():
+            handlers = [(which, signal.getsignal(which)) for which in STOPS]
+            self._before = [(which, handler) for which, handler in handlers if callable(handler)]
+            for which, _ in self._before:
+                signal.signal(which, self._keep)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Keep no more; raise for one that came, unless something was raised already.
+
+        Raises:
+            KeyboardInterrupt: a signal came.
+        """
+        for which, handler in self._before:
+            signal.signal(which, handler)
+        if kind is None:
+            self.check()
+
+    def check(self) -> None:
+        """Raise if a signal came.
+
+        Raises:
+            KeyboardInterrupt: one came.
+        """
+        if self._asked:
+            self._asked = False
+            raise KeyboardInterrupt
+
+    def _keep(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
+
+
+ORDINARY = "ordinary"
+
+
+def raise_priority(priority: int, process: int | None = None) -> str:
+    """Give all threads of a process a real-time priority, and say what came of it.
+
+    Under the ordinary scheduling a process that wakes up waits for others that are busy, here by up to some
+    milliseconds. Threads that begin later inherit the priority.
+
+    Args:
+        priority: of SCHED_FIFO, 1 to 99; with 0 all stays as it is.
+        process: its number; this one if None.
+
+    Returns:
+        How the process is scheduled now, for a person.
+    """
+    if not priority:
+        return ORDINARY
+    try:
+        for thread in Path(f"/proc/{process or 'self'}/task").iterdir():
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+    except ProcessLookupError:
+        pass  # a thread that has just ended
+    except OSError as error:
+        return f"{ORDINARY}; real-time priority {priority} refused ({error.strerror}), see `ulimit -r`"
+    return f"real time, priority {priority}"
+
 
 N = TypeVar("N", bound="Node | tuple[Node, ...]")
 

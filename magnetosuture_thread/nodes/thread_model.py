@@ -1,4 +1,4 @@
-"""The thread model node: needle poses in, predicted thread and safety margins out."""
+"""The node `thread_model`: predicts the thread from the needle poses of the tracker."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.configuration import configuration_fields
+from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp, time_of
 from magnetosuture_thread.messages.packing import packed_margins, packed_markers, packed_prediction
@@ -20,16 +21,58 @@ from magnetosuture_thread.model.margins import UNKNOWN
 from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
-from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
+from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import decoded
 from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
-from magnetosuture_thread.nodes.thread_settings import ThreadSettings
 from magnetosuture_thread.scene import Scene
+
+MAX_MESSAGE_BYTES = 1 << 18  # bytes of a message; what is larger is not even read
+
+
+class ThreadSettings:
+    """Changes a session's settings by the node's parameters.
+
+    A message becomes parameters, so that these always tell what is in force, and there is one way to refuse.
+
+    Args:
+        node: has the session's settings declared as its parameters.
+        session: whose settings they are.
+        health: where a message is said to be refused; who calls a service is told.
+    """
+
+    def __init__(self, node: Node, session: ThreadSession, health: Health) -> None:
+        self._node, self._session, self._health = node, session, health
+        self._names = [about.name for about in configuration_fields(ThreadModelSettings)]
+        self._parameters = Changeable(node, session.settings, self._prepare)
+        topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
+
+    def on_material(self, data: bytes) -> None:
+        """Take what is newly known of the thread and the liquid, or say why that cannot be."""
+        try:
+            if len(data) > MAX_MESSAGE_BYTES:
+                raise InvalidInputError(
+                    topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}"
+                )
+            self._parameters.set(parse_material(decoded(topics.MATERIAL, data)))
+        except MagnetosutureError as error:
+            self._health.refuse(error)
+
+    def _prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
+        put_in_force = self._session.prepare(settings, self._session.scene)
+
+        def change() -> None:
+            before = self._session.settings
+            put_in_force()
+            changed = [name for name in self._names if getattr(settings, name) != getattr(before, name)]
+            if changed:
+                self._node.get_logger().info(f"changed: {', '.join(changed)}")
+
+        return change
 
 
 class ThreadModelNode(Node):

@@ -26,7 +26,7 @@ from rclpy.context import Context
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console_inbox import Inbox
+from magnetosuture_thread.nodes.console.inbox import Inbox
 from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "post_wrap"

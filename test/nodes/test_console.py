@@ -22,11 +22,12 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.jobs.console_hosts import SimulatedHost
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.nodes import console_graph, console_services, topics
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
-from magnetosuture_thread.nodes.console_graph import ConsoleGraph
-from magnetosuture_thread.nodes.console_host import GraphHost, joined
-from magnetosuture_thread.nodes.console_tap import ConsoleTap
+from magnetosuture_thread.nodes.console import graph as console_graph
+from magnetosuture_thread.nodes.console.graph import ConsoleGraph
+from magnetosuture_thread.nodes.console.inbox import ConsoleTap
+from magnetosuture_thread.nodes.console.node import GraphHost, joined
 from magnetosuture_thread.nodes.messages import MESSAGES, decoded
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
@@ -122,7 +123,7 @@ def test_a_stop_waits_for_no_other_action_and_ends_one_that_waits(graph, console
 
 
 def test_a_switch_that_nobody_offers_is_refused_in_words(console, monkeypatch):
-    monkeypatch.setattr(console_services, "TIMEOUT", 0.1)
+    monkeypatch.setattr(console_graph, "TIMEOUT", 0.1)
     assert act(console, "arm") == "no service coils/arm within 0.1 s"
 
 
@@ -300,7 +301,7 @@ def test_a_bridge_that_is_heard_says_all_that_the_page_shows(graph, console):
 def program(domain: int, *parameters: str) -> subprocess.Popen[str]:
     """Run the node as a program."""
     given = [part for parameter in parameters for part in ("-p", parameter)]
-    command = [sys.executable, "-m", "magnetosuture_thread.nodes.console", "--ros-args", *given]
+    command = [sys.executable, "-m", "magnetosuture_thread.nodes.console.node", "--ros-args", *given]
     environment = graph_environment(domain)
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 

@@ -21,7 +21,7 @@ from magnetosuture_msgs.msg import (
 )
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes import console_messages
+from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.scene import read_scene
 from test.nodes.margins import no_margins
@@ -37,17 +37,17 @@ def plain(told: Any) -> Any:
 
 def test_the_needle():
     message = MESSAGES.pose_message(STAMP, np.array([0.003, -0.004]), np.array([0.6, 0.8]))
-    told = plain(console_messages.needle(message))
+    told = plain(messages.needle(message))
     assert told["tail"] == [0.003, -0.004]
     assert told["heading"] == pytest.approx(np.arctan2(0.8, 0.6))
     message.header.frame_id = "map"
     with pytest.raises(InvalidInputError, match="'dish'"):
-        console_messages.needle(message)
+        messages.needle(message)
 
 
 def test_the_tracker_with_and_without_the_dish():
     message = TrackerState(state=TrackerState.STATE_LOST, reason="glare", dish_centre=[320.0, 240.0])
-    assert plain(console_messages.tracker(message)) == {
+    assert plain(messages.tracker(message)) == {
         "state": "lost",
         "reason": "glare",
         "confidence": 0.0,
@@ -55,16 +55,16 @@ def test_the_tracker_with_and_without_the_dish():
     }
     message.metres_per_pixel, message.camera_rotation = 8e-5, 0.1
     view = {"centre": [320.0, 240.0], "scale": 8e-5, "rotation": 0.1}
-    assert plain(console_messages.tracker(message))["view"] == view
-    assert console_messages.tracker(TrackerState())["state"] == "searching"
-    assert console_messages.tracker(TrackerState(state=TrackerState.STATE_TRACKED))["state"] == "tracked"
+    assert plain(messages.tracker(message))["view"] == view
+    assert messages.tracker(TrackerState())["state"] == "searching"
+    assert messages.tracker(TrackerState(state=TrackerState.STATE_TRACKED))["state"] == "tracked"
 
 
 def test_the_threads():
     path = MESSAGES.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
-    assert plain(console_messages.seen(path)) == [[0.0, 0.001], [0.002, 0.003]]
+    assert plain(messages.seen(path)) == [[0.0, 0.001], [0.002, 0.003]]
     message = PredictedThread(positions=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
-    assert plain(console_messages.predicted(message)) == {
+    assert plain(messages.predicted(message)) == {
         "vertices": [[0.1, 0.2]],
         "residual": 1e-9,
         "step_time": 1e-4,
@@ -90,7 +90,7 @@ def test_of_each_node_the_least_clearance_of_wall_and_shapes():
         friction_nodes=[1, 2],
         slowdown=0.81,
     )
-    told = plain(console_messages.margins(message))
+    told = plain(messages.margins(message))
     assert told["clearance"] == [None, 2e-4, 0.0, None, 3e-4]
     assert told["least"] == {"obstacle": 0.0, "connectivity": 1e-6}
     assert told["contact"] == [2]
@@ -99,14 +99,14 @@ def test_of_each_node_the_least_clearance_of_wall_and_shapes():
 
 
 def test_margins_that_are_not_valid_have_no_number():
-    told = plain(console_messages.margins(no_margins(STAMP, "no pose")))
+    told = plain(messages.margins(no_margins(STAMP, "no pose")))
     assert (told["valid"], told["reason"], told["clearance"], told["least"]) == (False, "no pose", [], {})
     assert told["friction"]["state"] == "unknown"
 
 
 def test_scene_outlines_are_simplified_to_the_resolution_of_the_screen():
     scene = every_shape()
-    told = plain(console_messages.scene(MESSAGES.scene_message(STAMP, scene)))
+    told = plain(messages.scene(MESSAGES.scene_message(STAMP, scene)))
     assert (told["version"], told["dish_diameter"], told["dish_depth"]) == (scene.version, 0.05, 0.004)
     assert [(shape["name"], shape["kind"]) for shape in told["shapes"]] == [(s.name, s.kind) for s in scene.shapes]
     post, *others = told["shapes"]
@@ -123,20 +123,20 @@ def test_a_damaged_scene_is_not_shown():
     message = MESSAGES.scene_message(STAMP, every_shape())
     message.shapes[0].disc[0].x += 1e-9
     with pytest.raises(InvalidInputError, match=r"scene\.version"):
-        console_messages.scene(message)
+        messages.scene(message)
 
 
 def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
     scene = read_scene("hernia_ring")
-    heard = console_messages.scene(MESSAGES.scene_message(STAMP, scene))
-    assert console_messages.shown_scene(scene) == heard
+    heard = messages.scene(MESSAGES.scene_message(STAMP, scene))
+    assert messages.shown_scene(scene) == heard
     assert len(json.dumps(heard)) < 10_000  # 30 times a second, for every page
 
 
 def test_the_filter_state():
     message = FilterState(source="operator", slowdown=0.9, active=["friction", "ring"], overridden="needle", reason="")
     message.commanded.x, message.filtered.y, message.applied.y = 0.005, 0.004, 0.003
-    assert plain(console_messages.filter_state(message)) == {
+    assert plain(messages.filter_state(message)) == {
         "source": "operator",
         "commanded": [0.005, 0.0],
         "filtered": [0.0, 0.004],
@@ -159,7 +159,7 @@ def test_the_bridge():
         measured_current=[0.9],
         refused=3,
     )
-    told = plain(console_messages.bridge(message))
+    told = plain(messages.bridge(message))
     assert told["state"] == "fault"
     assert told["emergency_stopped"]
     assert not told["armed"]
@@ -172,7 +172,7 @@ def test_what_a_node_says():
     status = DiagnosticStatus(
         level=DiagnosticStatus.WARN, message="no pose", values=[KeyValue(key="refused", value="2")]
     )
-    assert plain(console_messages.node_state(status)) == {
+    assert plain(messages.node_state(status)) == {
         "level": "warn",
         "message": "no pose",
         "values": {"refused": "2"},

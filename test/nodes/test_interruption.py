@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.nodes.interruption import Interruption
+from magnetosuture_thread.nodes.run import Interruption
 
 
 @pytest.fixture

@@ -16,11 +16,13 @@ from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE
-from magnetosuture_thread.nodes import replay, replay_time, topics
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.replay import LiveReplay
-from magnetosuture_thread.nodes.replay_losses import Losses
-from magnetosuture_thread.nodes.replay_time import Timeline
+from magnetosuture_thread.nodes.replay import clock as replay_clock
+from magnetosuture_thread.nodes.replay import player
+from magnetosuture_thread.nodes.replay.clock import Timeline
+from magnetosuture_thread.nodes.replay.losses import Losses
+from magnetosuture_thread.nodes.replay.player import LiveReplay
 from test.nodes.margins import no_margins
 
 
@@ -35,7 +37,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     def on(duration: float) -> None:
         now[0] += duration
 
-    monkeypatch.setattr(replay_time, "time", Clock)
+    monkeypatch.setattr(replay_clock, "time", Clock)
     return on
 
 
@@ -125,8 +127,8 @@ class Recorded:
 
 def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pytest.MonkeyPatch):
     """Here the graph is a probe that answers every other pose."""
-    monkeypatch.setattr(replay, "SETTLE", 0.5)
-    monkeypatch.setattr(replay, "STUCK", 0.6)
+    monkeypatch.setattr(player, "SETTLE", 0.5)
+    monkeypatch.setattr(player, "STUCK", 0.6)
     for topic in topics.OUTPUTS:
         if topic.channel is not MARGINS and topic.channel is not NEEDLE_POSE:
             topic.publisher(graph.probe)
@@ -151,10 +153,10 @@ def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pyte
     )
     try:
         # Nobody is there for the seen thread.
-        monkeypatch.setattr(replay, "START_TIMEOUT", 0.5)
+        monkeypatch.setattr(player, "START_TIMEOUT", 0.5)
         with pytest.raises(GraphError, match=r"nobody at /thread/measured"):
             live.wait_for_graph()
-        monkeypatch.setattr(replay, "START_TIMEOUT", 20.0)
+        monkeypatch.setattr(player, "START_TIMEOUT", 20.0)
         graph.probe.create_subscription(
             topics.MEASURED_THREAD.message, topics.MEASURED_THREAD.name, lambda message: None, 100
         )

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from magnetosuture_thread.nodes.scheduling import raise_priority
+from magnetosuture_thread.nodes.run import raise_priority
 
 PRIORITY = 3
 SLEEPER = "import threading, sys; threading.Thread(target=sys.stdin.read).start(); print(flush=True)"

@@ -1,19 +1,29 @@
-"""Host of the operator page on a graph that is already running, and the node that joins the graph."""
+"""The node `console`: serves the operator page for a running graph."""
 
 from __future__ import annotations
 
+import asyncio
+import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import rclpy
 from rclpy.context import Context
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.interface import PAUSE_REPLAY, PAUSE_RIG
-from magnetosuture_thread.nodes.console_graph import ConsoleGraph
+from magnetosuture_thread.nodes.console.graph import ConsoleGraph
+from magnetosuture_thread.nodes.diagnostics import PERIOD, Health
+from magnetosuture_thread.nodes.parameter_files import init, node_options
+from magnetosuture_thread.nodes.parameters import declare
 
 NAME = "console"
 RIG = "rig_simulator"
@@ -90,3 +100,50 @@ class GraphHost:
         """Return the service that pauses time; empty if there is none."""
         ready = (name for name in (PAUSE_REPLAY, PAUSE_RIG) if self.graph.services.ready(name))
         return next(ready, "")
+
+
+async def serve(node: Node, settings: ConsoleSettings) -> None:
+    """Serve the page until the process is terminated; the needle is stopped first."""
+    loop, terminated = asyncio.get_running_loop(), asyncio.Event()
+    for which in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(which, terminated.set)
+    graph = ConsoleGraph(node, settings)
+    server = ConsoleServer(settings, graph, GraphHost(graph))
+    url = await server.start()
+    print(f"the operator's page: {url}", flush=True)
+    health = Health(node)
+    health.ok(f"serving on {settings.address}")
+    try:
+        while not terminated.is_set():
+            graph.now()  # sets the clock for the stamp
+            health.publish()
+            try:
+                await asyncio.wait_for(terminated.wait(), PERIOD)
+            except asyncio.TimeoutError:
+                continue
+    finally:
+        await server.stop()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node as a program; return 0 when it was terminated, 1 when it could not start."""
+    node = None
+    try:
+        init(arguments, signal_handler_options=SignalHandlerOptions.NO)
+        # Without an executor its parameter services could not answer.
+        node = rclpy.create_node(NAME, **node_options(NAME, {"start_parameter_services": False}))
+        asyncio.run(serve(node, declare(node, ConsoleSettings)))
+    except (MagnetosutureError, ParameterException, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        pass  # before the page was there
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

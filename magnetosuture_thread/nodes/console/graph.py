@@ -1,7 +1,8 @@
-"""Operator page's connection to a running graph: commands out, states in."""
+"""The running graph as the operator page sees it: states in, jog commands and bridge services out."""
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -10,29 +11,109 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
+from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.nodes import console_messages, topics
-from magnetosuture_thread.nodes.console_inbox import Inbox, Latest
-from magnetosuture_thread.nodes.console_services import ACTIONS, ConsoleServices
+from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, PAUSE_REPLAY, PAUSE_RIG, RESET
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.console import messages
+from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.vision.images import unpack_image
+
+TIMEOUT = 10.0  # s for a service to be found and to answer
+RETRY_PERIOD = 0.5  # s without an answer, after which it is called again
+POLL_PERIOD = 0.005  # s between two checks for an answer
+
+_TYPES = {ARM: SetBool, EMERGENCY_STOP: Trigger, RESET: Trigger, PAUSE_REPLAY: SetBool, PAUSE_RIG: SetBool}
+ACTIONS: dict[str, tuple[str, Any]] = {
+    "arm": (ARM, SetBool.Request(data=True)),
+    "disarm": (ARM, SetBool.Request(data=False)),
+    "stop": (EMERGENCY_STOP, Trigger.Request()),
+    "reset": (RESET, Trigger.Request()),
+}
+
+
+class ConsoleServices:
+    """Clients of the coil bridge's services, and of those that pause time.
+
+    The clients are created at once, so that the emergency stop is discovered before it is needed.
+
+    Args:
+        node: that calls.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._clients = {name: node.create_client(kind, name) for name, kind in _TYPES.items()}
+        self._answers: dict[str, dict[int, Any]] = {name: {} for name in _TYPES}
+        self._turn = 0
+
+    def ready(self, name: str) -> bool:
+        """Return whether a service is available."""
+        return bool(self._clients[name].service_is_ready())
+
+    async def execute_action(self, action: str) -> str:
+        """Execute one of `ACTIONS`; return an empty text, or the reason of a refusal.
+
+        The latest action has priority: one that still waits for its answer is cancelled.
+        """
+        self._turn += 1
+        turn = self._turn
+        name, request = ACTIONS[action]
+        return await self._call(name, request, lambda: self._turn == turn)
+
+    async def set_paused(self, name: str, paused: bool) -> str:
+        """Pause or resume time by one of the services `PAUSE_REPLAY` and `PAUSE_RIG`."""
+        return await self._call(name, SetBool.Request(data=paused), lambda: True)
+
+    async def _call(self, name: str, request: Any, is_current: Any) -> str:
+        client, answers = self._clients[name], self._answers[name]
+        calls: list[int] = []
+        deadline, retry_at = time.monotonic() + TIMEOUT, 0.0
+        while (now := time.monotonic()) < deadline:
+            if not is_current():
+                return "cancelled by a later action"
+            if now >= retry_at and client.service_is_ready():
+                # The services may be called repeatedly: a lost answer blocks nothing.
+                with client.handle:
+                    calls.append(client.handle.send_request(request))
+                retry_at = now + RETRY_PERIOD
+            await asyncio.sleep(POLL_PERIOD)
+            self._collect(name)
+            for number in calls:
+                if number in answers:
+                    answer = answers.pop(number)
+                    return "" if answer.success else str(answer.message) or "refused"
+        if not calls:
+            return f"no service {name} within {TIMEOUT:g} s"
+        return f"{name} did not answer within {TIMEOUT:g} s"
+
+    def _collect(self, name: str) -> None:
+        """Collect answers of all calls."""
+        client = self._clients[name]
+        with client.handle:
+            while True:
+                header, answer = client.handle.take_response(client.srv_type.Response)
+                if header is None:
+                    return
+                self._answers[name][header.request_id.sequence_number] = answer
+
 
 NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 MEASURED_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
 MAX_DIAGNOSTICS = 100  # queued messages of /diagnostics
 JPEG_QUALITY = 80
 READERS = {
-    "tracker": (topics.TRACKER_STATE, console_messages.tracker, 0.0),
-    "needle": (topics.NEEDLE_POSE, console_messages.needle, 0.0),
-    "measured": (topics.MEASURED_THREAD, console_messages.seen, MEASURED_PERIOD),
-    "predicted": (topics.PREDICTED_THREAD, console_messages.predicted, 0.0),
-    "margins": (topics.MARGINS, console_messages.margins, 0.0),
-    "scene": (topics.SCENE, console_messages.scene, 0.0),
-    "filter": (topics.FILTER_STATE, console_messages.filter_state, 0.0),
-    "bridge": (topics.BRIDGE_STATE, console_messages.bridge, 0.0),
+    "tracker": (topics.TRACKER_STATE, messages.tracker, 0.0),
+    "needle": (topics.NEEDLE_POSE, messages.needle, 0.0),
+    "measured": (topics.MEASURED_THREAD, messages.seen, MEASURED_PERIOD),
+    "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
+    "margins": (topics.MARGINS, messages.margins, 0.0),
+    "scene": (topics.SCENE, messages.scene, 0.0),
+    "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
+    "bridge": (topics.BRIDGE_STATE, messages.bridge, 0.0),
 }
 ZERO_FILTER_STATE = {
     "source": "",
@@ -127,7 +208,7 @@ class ConsoleGraph:
         """Return the last diagnostics of each node, and their age."""
         for report, arrived in self._reports.read():
             for status in report.status:
-                self._diagnostics[status.name.split(":")[0]] = (console_messages.node_state(status), arrived)
+                self._diagnostics[status.name.split(":")[0]] = (messages.node_state(status), arrived)
         return dict(self._aged_nodes())
 
     def is_active(self, name: str) -> bool:
@@ -164,7 +245,7 @@ class ConsoleGraph:
 
 def _file_scene(settings: ConsoleSettings) -> dict[str, Any] | None:
     """Return the scene to show until one is received; None where the settings name none."""
-    return console_messages.shown_scene(read_scene(settings.scene)) if settings.scene else None
+    return messages.shown_scene(read_scene(settings.scene)) if settings.scene else None
 
 
 def _compressed(message: CompressedImage) -> bytes:

@@ -20,8 +20,8 @@ from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, P
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import command_stamp
-from magnetosuture_thread.nodes.replay_losses import Losses
-from magnetosuture_thread.nodes.replay_time import Timeline
+from magnetosuture_thread.nodes.replay.clock import Timeline
+from magnetosuture_thread.nodes.replay.losses import Losses
 
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
 STILL_PERIOD = 0.1  # s of real time between two messages on /clock while it stands still

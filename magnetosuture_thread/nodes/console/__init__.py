@@ -1,0 +1,1 @@
+"""The node `console`: the operator page of a running graph."""

@@ -1,0 +1,1 @@
+"""Plays a recorded bag into the running graph."""
