@@ -116,7 +116,7 @@ class Pilot:
 
 
 def nearby(folder: Path) -> Path:
-    """Write the set-up with a needle that begins below the penetration path."""
+    """Write the setup with a needle that begins below the penetration path."""
     text = (SETUPS / "hernia_ring.yaml").read_text()
     for name, value in CHANGES.items():
         text, changes = re.subn(rf"(\n    {name}): .*", rf"\1: {value}", text)
@@ -129,7 +129,7 @@ def nearby(folder: Path) -> Path:
 
 @contextmanager
 def served(setup: Path) -> Iterator[str]:
-    """Run the command with a set-up, and yield the page's address."""
+    """Run the command with a setup, and yield the page's address."""
     command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", str(setup), "--port", "0"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:

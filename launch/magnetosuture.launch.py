@@ -1,7 +1,7 @@
 """Starts the nodes on a robot: `ros2 launch magnetosuture_thread magnetosuture.launch.py setup:=NAME`.
 
-The set-up is one that ships with the package, by `setup:=NAME`, or a file of your own, by `setup_file:=PATH`. With
-`namespace:=NAME` all nodes are in a namespace. The coil bridge goes as far as the set-up says; on hardware a person
+The setup is one that ships with the package, by `setup:=NAME`, or a file of your own, by `setup_file:=PATH`. With
+`namespace:=NAME` all nodes are in a namespace. The coil bridge goes as far as the setup says; on hardware a person
 arms it. With `simulated:=true` a rig in software and a path follower come with them, and the bridge drives that rig and
 arms itself. With `console:=true` the operator's page is served on this machine.
 """
@@ -21,9 +21,9 @@ RIG_NODES = ("rig_simulator", "path_follower")
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the nodes with the parameters of one set-up.
+    """Return the nodes with the parameters of one setup.
 
-    A name that is none of the shipped set-ups, or a file that does not exist, refuses to launch: nodes that started on
+    A name that is none of the shipped setups, or a file that does not exist, refuses to launch: nodes that started on
     their defaults would believe in another dish and another needle.
     """
     folder = Path(get_package_share_directory(PACKAGE)) / "config"
@@ -41,8 +41,8 @@ def generate_launch_description() -> LaunchDescription:
 
     return LaunchDescription(
         [
-            argument("setup", DEFAULT_SETUP, "name of a set-up that ships with the package", choices=names),
-            argument("setup_file", "", "path of a set-up of your own, in place of setup"),
+            argument("setup", DEFAULT_SETUP, "name of a setup that ships with the package", choices=names),
+            argument("setup_file", "", "path of a setup of your own, in place of setup"),
             argument("namespace", "", "namespace of all nodes"),
             argument("use_sim_time", "false", "take the time from /clock"),
             argument("simulated", "false", "with a rig in software"),

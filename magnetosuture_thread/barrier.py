@@ -194,7 +194,7 @@ def load_barriers(names: Sequence[str], parameter: str = "barriers") -> tuple[Ba
             raise ConfigurationError(parameter, name, "module:class, as in my_package.barriers:KeepIn")
         try:
             found = getattr(import_module(module), attribute)
-            # Nothing else is called: a set-up may come with a bag of somebody else.
+            # Nothing else is called: a setup may come with a bag of somebody else.
             if not (isinstance(found, type) and issubclass(found, Barrier)):
                 raise ConfigurationError(parameter, name, "a subclass of magnetosuture_thread.Barrier")
             barriers.append(found())

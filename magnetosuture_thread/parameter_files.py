@@ -99,7 +99,7 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
     fields = {group: {about.name for about in configuration_fields(cls)} for group, cls in known.items()}
     given: dict[str, dict[str, Any]] = {group: {} for group in known}
     spaces: list[str] = []
-    for key, section in read_sections(path, "set-up file"):
+    for key, section in read_sections(path, "setup file"):
         values = {name: value for name, value in section.items() if name.split(".")[0] not in ROS_PARAMETERS}
         group = node_of_key(key)
         for name, value in values.items():
@@ -121,7 +121,7 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
             spaces.append(space)
         if len(set(spaces)) > 1:
             raise ConfigurationError(
-                format_key(key), "…", f"one namespace in a set-up, as {spaces[0]} before", str(path)
+                format_key(key), "…", f"one namespace in a setup, as {spaces[0]} before", str(path)
             )
         given[group].update(values)
     return {group: from_mapping(cls, given[group], str(path)) for group, cls in known.items()}

@@ -40,7 +40,7 @@ def find_setup_file(name: str) -> Path:
     Raises:
         ConfigurationError: there is no such file.
     """
-    return _named_file("set-up", name, "config", (".yaml", ".yml"))
+    return _named_file("setup", name, "config", (".yaml", ".yml"))
 
 
 def find_scene_file(name: str) -> Path:

@@ -132,8 +132,8 @@ def test_wrong_use_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]
         (["replay", "nowhere"], 1, "error: nowhere: does not exist"),
         (["replay", "x" * 300], 1, "error: " + "x" * 300 + ": cannot be read"),
         (["render", "no.npz", "--setup", "petri_35mm_polyamide"], 1, "error: no.npz: does not exist"),
-        (["render", "no.npz", "--setup", "petri_35cm"], 2, "error: set-up: got 'petri_35cm'"),
-        (["render", "no.npz", "--setup", "x" * 300], 2, "error: set-up: got 'xxx"),
+        (["render", "no.npz", "--setup", "petri_35cm"], 2, "error: setup: got 'petri_35cm'"),
+        (["render", "no.npz", "--setup", "x" * 300], 2, "error: setup: got 'xxx"),
     ],
 )
 def test_a_failed_job_is_one_line(tmp_path: Path, monkeypatch, capsys, arguments: list[str], code: int, words: str):

@@ -177,7 +177,7 @@ def test_sections_are_for_whom_ros_has_them(tmp_path: Path, text: str, kettle: f
         ("/lab1/*: {ros__parameters: {viscosity: 2.0}}", "/lab1/*: got"),
         (
             "/lab1/kettle: {ros__parameters: {volume: 0.002}}\n/lab2/kettle: {ros__parameters: {volume: 0.001}}",
-            "/lab2/kettle: got '…', expected one namespace in a set-up, as /lab1 before",
+            "/lab2/kettle: got '…', expected one namespace in a setup, as /lab1 before",
         ),
         ("/**/kettle: {ros__parameters: {volume: 0.002}, other: {}}", "one key, ros__parameters"),
         ("/**/kettle:", "one key, ros__parameters"),

@@ -1,4 +1,4 @@
-"""Every set-up that ships is valid; what is not is refused by name."""
+"""Every setup that ships is valid; what is not is refused by name."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@
 
 is what they have to solve. Only setting up and solving is timed: writing the program in each one's form,
 and reading lambda from it, is not. Where a program's entries are at the same places as the last one's, the
-solver keeps its set-up and gets new numbers.
+solver keeps its setup and gets new numbers.
 """
 
 from __future__ import annotations

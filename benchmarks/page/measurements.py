@@ -27,7 +27,7 @@ from magnetosuture_thread.setups import read_setup
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-SCENARIO = "petri_35mm_polyamide"
+SETUP = "petri_35mm_polyamide"
 SEGMENTS, FRAME_RATE = 81, 30.0  # in place of the scenario's own
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH, HEIGHT = 1366, 768  # of the page [px]
@@ -105,7 +105,7 @@ def measure_page(
         GraphError: the graph does not start, or moves nothing.
     """
     browser = _browser()
-    log(f"starting {SCENARIO} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
+    log(f"starting {SETUP} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
     with TemporaryDirectory() as folder, _serving(Path(folder)) as server:
         domain = int(server.says(r"ROS domain (\d+)"))
         url = server.says(r"open (http\S+)")
@@ -122,16 +122,16 @@ def measure_page(
         raise GraphError("no key moved the needle")
     rates = {name: (after[name] - before[name]) / took for name in ("drawn", "states", "frames")}
     delays = [KeyDelays.between(words, keys, heard[channel.recorded]) for channel, words in _STATIONS]
-    return PageReport(SCENARIO, SEGMENTS, tuple(delays), rates["drawn"], rates["states"], rates["frames"])
+    return PageReport(SETUP, SEGMENTS, tuple(delays), rates["drawn"], rates["states"], rates["frames"])
 
 
 @contextmanager
 def _serving(folder: Path) -> Iterator[Server]:
     """Run the command with the scenario that is measured."""
-    content = read_yaml(read_setup(SCENARIO).path, "set-up file")
+    content = read_yaml(read_setup(SETUP).path, "setup file")
     content["/**/thread_model"]["ros__parameters"]["segments"] = SEGMENTS
     content["/**/rig_simulator"]["ros__parameters"]["frame_rate"] = FRAME_RATE
-    path = folder / f"{SCENARIO}.yaml"
+    path = folder / f"{SETUP}.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     server = Server(str(path))
     try:

@@ -224,11 +224,11 @@ def initial_guesses(
     """Return the best initial settings of each attachment that may be right.
 
     Stiffnesses from a hundredth to a hundred times the material's are tried with each attachment, and the best local
-    minima fitted, all else as the set-up has it, by the whole distance of prediction and thread.
+    minima fitted, all else as the setup has it, by the whole distance of prediction and thread.
 
     Args:
         replays: of all runs.
-        start: what the set-up says.
+        start: what the setup says.
         parameters: that will be fitted.
         both: whether the attachment is asked for.
     """

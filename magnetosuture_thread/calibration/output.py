@@ -46,7 +46,7 @@ def to_yaml(calibration: CalibrationResult) -> str:
 
 def _header(calibration: CalibrationResult) -> list[str]:
     words = [
-        "A thread calibrated by `magnetosuture calibrate`, for the node thread_model: put the lines into the set-up's"
+        "A thread calibrated by `magnetosuture calibrate`, for the node thread_model: put the lines into the setup's"
     ]
     words[0] += " own section, or give the node both files, this one last."
     if not calibration.finished:
@@ -80,7 +80,7 @@ def _comment(text: str, indent: str = "") -> list[str]:
 def _attachment(calibration: CalibrationResult) -> list[str]:
     verdict, value = calibration.attachment, calibration.settings.attachment
     if verdict is None:
-        return [f"    {ATTACHMENT}: {value} # as in the set-up"]
+        return [f"    {ATTACHMENT}: {value} # as in the setup"]
     if verdict.reason:
         return _comment(f"{ATTACHMENT} is left out, as this data cannot tell it: {verdict.reason}", "    ")
     errors = ", ".join(f"{kind} {error:.3g} %" for kind, error in sorted(verdict.errors.items()))
@@ -128,7 +128,7 @@ def parameter_table(found: Mapping[str, Any]) -> Table:
     title = f"{found['material']}, formulation {found['formulation']}"
     table = Table(title=title if found["finished"] else f"{title}: best so far, not finished")
     table.caption = "? cannot be identified in this data"
-    for name in ("parameter", "value", "95 % interval", "set-up"):
+    for name in ("parameter", "value", "95 % interval", "setup"):
         table.add_column(name, justify="left" if name == "parameter" else "right", no_wrap=True)
     for row in found["parameters"]:
         scale, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])

@@ -5,7 +5,7 @@ Of the thread's bending stiffness EI and the liquid's drag across it, zeta_perp,
     B = EI / zeta_perp   [m^4/s]
 
 moves the thread: it is overdamped, and a wave of length l straightens in about l^4 / B. So `elastic_modulus` is
-fitted as B, and written as the modulus that has this ratio at the set-up's viscosity, diameter, length and wetted
+fitted as B, and written as the modulus that has this ratio at the setup's viscosity, diameter, length and wetted
 part. It is the thread's own modulus as far as those are true.
 """
 
@@ -27,7 +27,7 @@ DOUBLED = math.log(2.0)
 WIDEST = math.log(1.5)  # of a logarithm: half an interval beyond says nothing of use
 LOGARITHM = 700.0  # whose exponential is a number yet
 STIFFNESS_RANGE = 1e3  # B is looked for within this factor of the material's
-MAX_MODULUS = 0.99e12  # Pa; just within what a set-up may say
+MAX_MODULUS = 0.99e12  # Pa; just within what a setup may say
 OFFSET_COUNTS, MAX_OFFSET = 0.01, 0.1  # of the thread's length
 MAX_KAPPA = 0.999  # kappa
 MIN_WEIGHT, MAX_WEIGHT = 1e-6, 1e7  # W_stiff; beyond, every step needs another solver

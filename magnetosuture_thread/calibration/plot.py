@@ -60,13 +60,13 @@ def _summary(calibration: CalibrationResult) -> str:
 
 
 def _draw_scene(axes: Axes, calibration: CalibrationResult, fit: BagFit) -> None:
-    """Draw the thread as it was, as the set-up has it and as calibrated, at instants evenly over the bag."""
+    """Draw the thread as it was, as the setup has it and as calibrated, at instants evenly over the bag."""
     run, length = fit.run, calibration.settings.thread_length
     whole = np.flatnonzero(run.known.mean(axis=1) >= np.quantile(run.known.mean(axis=1), 0.5))
     chosen = whole[np.linspace(0, len(whole) - 1, min(INSTANTS, len(whole))).astype(int)]
     styles = [
         ("seen by the camera" if run.against == "seen" else "the truth", {**WIDE, "linewidth": 6.0}),
-        ("as the set-up has it", {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2))}),
+        ("as the setup has it", {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2))}),
         ("calibrated", {"color": PREDICTED, "linewidth": 1.4}),
     ]
     labelled: list[Points] = []
@@ -134,9 +134,9 @@ def _percent_axis(axes: Axes, values: NDArray[np.float64]) -> None:
 
 
 def _draw_parameters(figure: Figure, calibration: CalibrationResult, box: tuple[float, float, float, float]) -> None:
-    """Draw a scale for each parameter: fitted value with its interval, and what the set-up says."""
+    """Draw a scale for each parameter: fitted value with its interval, and what the setup says."""
     left, low, width, height = box
-    title = "parameters with 95 % intervals; the tick is what the set-up says"
+    title = "parameters with 95 % intervals; the tick is what the setup says"
     figure.text(left, low + height, title, fontsize=9.5, color=INK, va="bottom")
     rows, attachment = calibration.estimates, calibration.attachment
     step = min(height / max(1, len(rows) + (attachment is not None)), 0.062)

@@ -147,7 +147,7 @@ def read_run(
         if is_settled and lengths[AGAINST.index(against)] >= enough:
             compared.append((len(poses) - 1, measured if against == "seen" else true, true))
     problems = {
-        "shows no needle in any frame; is it another set-up's?": not counts["needle"],
+        "shows no needle in any frame; is it another setup's?": not counts["needle"],
         "shows no thread in any frame: nothing to start from or to compare with": not counts["seen"],
         "never shows half of the thread or more: nothing to start from": not poses,
         "holds no truth (ground_truth/thread), as bags of a robot do; compare against seen": against == "truth"

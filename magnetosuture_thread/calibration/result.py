@@ -29,11 +29,11 @@ class Estimate:
         setting: the field of the settings that it belongs to.
         unit: of the values.
         value: that is used from now on.
-        start: what the set-up and the material say.
+        start: what the setup and the material say.
         low: lower end of the 95 % interval of the fit to all that is unknown; not a number where there is none.
         high: upper end.
-        status: `identified`; `fixed` at what the set-up says, as the data cannot tell; `stand-in`: the data cannot
-            tell it, but contradict what the set-up says, or it predicts worse, so that the fitted one stands in; or
+        status: `identified`; `fixed` at what the setup says, as the data cannot tell; `stand-in`: the data cannot
+            tell it, but contradict what the setup says, or it predicts worse, so that the fitted one stands in; or
             `unfinished`.
         reason: why it cannot be identified; else empty.
         effect_percent: how far a change that counts moves the prediction, what others make up for left out
@@ -60,7 +60,7 @@ class AttachmentDecision:
 
     Attributes:
         value: that is used.
-        start: what the set-up says.
+        start: what the setup says.
         errors: mean distance across the thread with each that was fitted [% of length].
         reason: why they cannot be told apart; empty where they can.
         looked: whether both were fitted.
@@ -80,13 +80,13 @@ class BagErrors:
     Attributes:
         name: of the bag.
         frames: that were compared.
-        before: with what the set-up says, against what was fitted to.
+        before: with what the setup says, against what was fitted to.
         after: calibrated.
         held_out: calibrated by the other bags.
-        truth_before: against the truth, with what the set-up says.
+        truth_before: against the truth, with what the setup says.
         truth_after: calibrated.
         truth_held_out: calibrated by the other bags.
-        across_before: mean distance across the thread, with what the set-up says.
+        across_before: mean distance across the thread, with what the setup says.
         across_after: calibrated; this is what was made least.
     """
 
@@ -119,7 +119,7 @@ class BagFit:
 
     Attributes:
         run: the bag.
-        before: predicted nodes with what the set-up says, shape (K, n + 1, 2) [m].
+        before: predicted nodes with what the setup says, shape (K, n + 1, 2) [m].
         after: calibrated.
     """
 
@@ -138,7 +138,7 @@ class CalibrationResult:
 
     Attributes:
         settings: of the thread model, calibrated.
-        start: what the set-up and the material say.
+        start: what the setup and the material say.
         against: `seen` or `truth`.
         estimates: of all numbers that were asked for.
         attachment: which fits better; None if it was not asked for.
@@ -184,7 +184,7 @@ class CalibrationResult:
                 lines.append(
                     f"{estimate.name} cannot be identified in this data: {estimate.reason}; {estimate.value:.4g} "
                     f"{estimate.unit}".rstrip()
-                    + " stands in, as it predicts better than what the set-up says"
+                    + " stands in, as it predicts better than what the setup says"
                 )
             elif estimate.reason:
                 lines.append(f"{estimate.name} cannot be identified in this data: {estimate.reason}")

@@ -58,12 +58,12 @@ def calibrate(
        of them fitted alone, by the whole distance of prediction and thread.
     2. All that is unknown is fitted, by the distance across the thread, with a robust loss.
     3. The attachment is the one that fits better, if the difference is beyond its own scatter over blocks of time.
-    4. What cannot be identified is put back to what the set-up says, and the rest is fitted again.
+    4. What cannot be identified is put back to what the setup says, and the rest is fitted again.
     5. With several runs, each is predicted by a fit to the others.
 
     Args:
         runs: recorded runs of one thread.
-        settings: what the set-up and the material say; where the fit starts.
+        settings: what the setup and the material say; where the fit starts.
         names: of settings to fit; all that the formulation has if empty.
         run_tasks: gives the predictions of tasks; here, one after the other, if None.
         best: is updated with the best so far at every moment.
@@ -152,7 +152,7 @@ class _Search:
         return objective.fit(solution.x, narrower) if narrower < NARROWER * scale else solution
 
     def _attached(self, solutions: Sequence[FitSolution]) -> tuple[FitSolution, AttachmentDecision | None]:
-        """Return the solution whose attachment fits better, or the set-up's where that cannot be told."""
+        """Return the solution whose attachment fits better, or the setup's where that cannot be told."""
         if not self.both:
             return solutions[0], None
         errors = {s.settings.attachment: self.replays.error(s.settings) for s in solutions}
@@ -198,7 +198,7 @@ class _Search:
             statuses[spare.pop(0)] = STAND_IN
 
     def _status(self, solution: FitSolution, index: int, each: Identifiability) -> str:
-        """Return what becomes of a number at first: the set-up's is kept unless the data contradict it."""
+        """Return what becomes of a number at first: the setup's is kept unless the data contradict it."""
         if each.identified:
             return IDENTIFIED
         parameter = self.parameters[index]

@@ -169,7 +169,7 @@ class ReplaySummary:
 
     Attributes:
         bag: its path.
-        setup: the set-up's name.
+        setup: the setup's name.
         simulated: what was simulated, empty if the bag does not say that anything was.
         frames: camera frames played, or recorded poses.
         tracked: frames in which the needle was found.

@@ -81,7 +81,7 @@ def draw_summary(
 
 def _title(summary: ReplaySummary) -> str:
     found = "frames tracked" if summary.source == "camera" else "recorded poses taken"
-    words = f"{Path(summary.bag).name}, set-up {summary.setup}: {summary.tracked} of {summary.frames} {found}"
+    words = f"{Path(summary.bag).name}, setup {summary.setup}: {summary.tracked} of {summary.frames} {found}"
     if summary.simulated:
         words += "\nsimulated: " + summary.simulated
     return words

@@ -165,7 +165,7 @@ def _shown(value: Any, how: Callable[[float], str]) -> str:
 
 def summary_table(summary: ReplaySummary) -> Table:
     """Return the figures of a replayed bag as a table."""
-    table = _figures_table(f"{summary.bag}, set-up {summary.setup}")
+    table = _figures_table(f"{summary.bag}, setup {summary.setup}")
     live, by_camera = summary.speed is None, summary.source == "camera"
     simulated = "simulated" if summary.simulated else ""
     table.add_row("camera frames" if by_camera else "recorded poses", str(summary.frames), simulated)
@@ -185,7 +185,7 @@ def summary_table(summary: ReplaySummary) -> Table:
     if summary.damage:
         table.add_row("the bag is damaged", "", summary.damage)
     if summary.remark:
-        table.add_row("set-up in doubt", "", summary.remark)
+        table.add_row("setup in doubt", "", summary.remark)
     table.add_section()
     table.add_row("latency, median" if live else "times, median", "", "99th percentile, greatest")
     for stage, found in summary.latency.items():

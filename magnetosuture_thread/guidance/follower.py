@@ -38,7 +38,7 @@ class PathFollower:
         v = w dp/dl + k e + c,    e = p(l) - x_tip,    dc/dt = k_i e,    |c| <= half of the speed
 
     with the setpoint's speed w, which has a trapezoidal profile. The setpoint moves only while poses arrive,
-    and waits while the tip is farther from it than `longest_lag`, so it does not run away from a needle that
+    and waits while the tip is farther from it than `max_lag`, so it does not run away from a needle that
     does not move. The path begins along the needle, where its tip is when `settle` is over.
 
     Args:
@@ -47,7 +47,7 @@ class PathFollower:
         acceleration: [m/s^2].
         gain: k [1/s].
         integral_gain: k_i [1/s^2]; compensates drag that the coil model does not include.
-        longest_lag: maximum distance from tip to setpoint while the setpoint moves [m].
+        max_lag: maximum distance from tip to setpoint while the setpoint moves [m].
         tolerance: the path is done once the tip was this close to its end [m].
         settle: time after the first pose without motion [s].
         needle_length: along the body [m].
@@ -61,7 +61,7 @@ class PathFollower:
         acceleration: float,
         gain: float,
         integral_gain: float,
-        longest_lag: float,
+        max_lag: float,
         tolerance: float,
         settle: float,
         needle_length: float,
@@ -72,7 +72,7 @@ class PathFollower:
         self._acceleration = acceleration
         self._gain = gain
         self._integral_gain = integral_gain
-        self._longest_lag = longest_lag
+        self._max_lag = max_lag
         self._tolerance = tolerance
         self._settle = settle
         self._first: float | None = None
@@ -111,7 +111,7 @@ class PathFollower:
         # Trapezoidal profile: the setpoint starts from rest and can still stop at the end.
         max_from_rest = np.sqrt(2.0 * self._acceleration * (self._length + 0.5 * self._acceleration * interval**2))
         speed = float(min(self._speed, max_from_rest, np.sqrt(2.0 * self._acceleration * max(remaining, 0.0))))
-        waiting = float(np.linalg.norm(path.point(self._length) - tip)) > self._longest_lag
+        waiting = float(np.linalg.norm(path.point(self._length) - tip)) > self._max_lag
         speed = 0.0 if waiting else speed
         self._length = min(path.length, self._length + speed * interval)
         error = path.point(self._length) - tip

@@ -48,7 +48,7 @@ class PathFollowerSettings(Configuration):
     audience: int = quantity(
         1, "subscribers to its commands that it waits for: the bridge, and any recorder", minimum=1, maximum=100
     )
-    longest_lag: float = quantity(
+    max_lag: float = quantity(
         0.002,
         "maximum distance from the tip to its setpoint while the setpoint moves",
         unit="m",
@@ -84,7 +84,7 @@ class PathFollowerSettings(Configuration):
             self.acceleration,
             self.gain,
             self.integral_gain,
-            self.longest_lag,
+            self.max_lag,
             self.tolerance,
             self.settle,
             self.needle_length,

@@ -125,18 +125,18 @@ def _predict(given: BagInput, model: ThreadModelSettings, metrics: RunMetrics, s
     recorded = RecordedPredictions(given.recording, given.start, given.duration)
     refused = Counter[str]()
     for step in predictions(seen, model, given.setup.scene):
-        if step.outcome.prediction is not None:
+        if step.result.prediction is not None:
             frame = FrameResult.of(
-                step.sight,
-                step.outcome.prediction,
+                step.observation,
+                step.result.prediction,
                 step.margins,
                 step.step_time,
-                recorded=recorded.of(step.sight.stamp),
+                recorded=recorded.of(step.observation.stamp),
                 obstacles=step.scene.obstacles if step.scene is not None else (),
             )
             metrics.add(frame)
-        elif step.outcome.problem is not None:
-            refused[_kind(step.outcome.problem)] += 1
+        elif step.result.problem is not None:
+            refused[_kind(step.result.problem)] += 1
     refused += Counter({why: count for why, count in seen.refused.items() if why != NOT_FOUND})
     return refused + given.recording.refused
 

@@ -81,11 +81,11 @@ def replay_offline(
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)
-                if step.outcome.prediction is not None:
-                    predicted = step.outcome.prediction
-                    metrics.add(FrameResult.of(step.sight, predicted, step.margins, step.step_time))
-                elif step.outcome.problem is not None:
-                    refused[_kind(step.outcome.problem)] += 1
+                if step.result.prediction is not None:
+                    predicted = step.result.prediction
+                    metrics.add(FrameResult.of(step.observation, predicted, step.margins, step.step_time))
+                elif step.result.problem is not None:
+                    refused[_kind(step.result.problem)] += 1
             speed = given.duration / (time.perf_counter() - began)
         log(f"{speed:.3g} times as fast as it was recorded; judging what came out")
         summary = _summary(given, seen, metrics, refused, speed)
@@ -152,14 +152,14 @@ class _Output:
 
     def write(self, step: Step) -> None:
         """Write the prediction of an observation."""
-        stamp, outcome, prediction = step.outcome.stamp, step.outcome, step.outcome.prediction
+        stamp, result, prediction = step.result.stamp, step.result, step.result.prediction
         if prediction is not None:
             packed = packed_prediction(time_of(stamp), prediction, step.settings.material)
             self._bag.write(PREDICTED_THREAD.recorded, max(stamp, 0), packed)
-        if isinstance(outcome.problem, InvalidInputError):
+        if isinstance(result.problem, InvalidInputError):
             return  # as live: a pose that is refused gets no answer
-        reason = WAITING if outcome.waiting else str(outcome.problem) if prediction is None else prediction.status
-        packed = packed_margins(time_of(stamp), step.margins, reason, outcome.scene_version)
+        reason = WAITING if result.waiting else str(result.problem) if prediction is None else prediction.status
+        packed = packed_margins(time_of(stamp), step.margins, reason, result.scene_version)
         self._bag.write(MARGINS.recorded, max(stamp, 0), packed)
 
     def _frame(self, stamp: int, seen: FrameMeasurement) -> None:

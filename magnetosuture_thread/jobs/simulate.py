@@ -242,9 +242,9 @@ def _follow(
         recorder.spin(POLL_PERIOD)
         if not following and recorder.taken[TIP_SETPOINT.recorded]:
             following, began = True, time.monotonic()
-        if "path_follower" not in recorder.said and time.monotonic() - started < START_TIMEOUT:
+        if "path_follower" not in recorder.status_texts and time.monotonic() - started < START_TIMEOUT:
             began = time.monotonic()  # its process is still loading
-        state, values = recorder.said.get("path_follower", ("", {}))
+        state, values = recorder.status_texts.get("path_follower", ("", {}))
         elapsed = (time.monotonic() - began) * rate
         done = float(values.get("progress", 0.0))
         progress(done if duration is None else min(1.0, elapsed / duration))
@@ -253,9 +253,9 @@ def _follow(
         if duration is None and state == "done":
             recorder.spin(FINAL_TIME / rate)
             return ""
-        bridge = recorder.said.get("coil_bridge", ("", {}))[0]
+        bridge = recorder.status_texts.get("coil_bridge", ("", {}))[0]
         if bridge.startswith(FAULT):
             return f"coil_bridge: {bridge}"
         if elapsed > timeout:
-            states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.said.items()))
+            states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.status_texts.items()))
             return f"after {elapsed:.0f} s only {done:.0%} of the path is done; {states}"

@@ -85,7 +85,7 @@ class Material:
     """A suture material.
 
     Attributes:
-        name: short name, used in set-up files.
+        name: short name, used in setup files.
         diameter: [m]
         elastic_modulus: effective modulus in bending [Pa].
         source: where the numbers come from.

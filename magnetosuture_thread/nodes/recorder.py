@@ -49,7 +49,7 @@ class Recorder:
         self._receive = receive
         self._now = 0 if simulated_clock else None
         self.taken: Counter[str] = Counter()
-        self.said: dict[str, tuple[str, dict[str, str]]] = {}
+        self.status_texts: dict[str, tuple[str, dict[str, str]]] = {}
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain, args=[])
         self._node = rclpy.create_node("recorder", context=self._context)
@@ -89,7 +89,7 @@ class Recorder:
         if topic.channel is DIAGNOSTICS:
             for status in deserialize_message(data, DiagnosticArray).status:
                 values = {value.key: value.value for value in status.values}
-                self.said[status.name.split(":")[0]] = (status.message, values)
+                self.status_texts[status.name.split(":")[0]] = (status.message, values)
 
     def _quality(self, topic: Topic) -> QoSProfile:
         """Return the topic's own quality of service, with a longer queue."""

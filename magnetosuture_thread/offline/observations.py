@@ -32,7 +32,7 @@ from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.tracker import FrameMeasurement, TrackerSession, warm_up
 
 MEASURED = 8  # the length of each so many seen threads is looked at
-MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the set-up's thread; a seen one beyond is not of this set-up
+MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the setup's thread; a seen one beyond is not of this setup
 NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
     "no needle for sure",
     "a broken picture",
@@ -110,12 +110,12 @@ class ObservationReader(Iterator[Observation]):
         return changes
 
     def thread_problem(self) -> str:
-        """Return in words that most of the seen threads are not of this set-up; else empty."""
+        """Return in words that most of the seen threads are not of this setup; else empty."""
         if 2 * self._odd <= self._measured:
             return ""
         return (
             f"{self._odd} of {self._measured} measured threads are longer than {MAX_LENGTH_RATIO:g} times or "
-            f"shorter than {MIN_LENGTH_RATIO:g} times the set-up's {self._length:g} m: is it another thread?"
+            f"shorter than {MIN_LENGTH_RATIO:g} times the setup's {self._length:g} m: is it another thread?"
         )
 
     def _go(self, records: Iterator[RecordedMessage], awaited: set[Channel]) -> Iterator[Observation]:
@@ -177,13 +177,21 @@ class ObservationReader(Iterator[Observation]):
         if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
             del known[next(iter(known))]
 
-    def _whole(self, sight: Observation, parts: dict[str, dict[int, Points]]) -> Observation:
-        truth = parts.get(_TRUE, {}).get(sight.stamp, _NOTHING)
-        seen = parts.get(_SEEN, {}).get(sight.stamp, _NOTHING)
+    def _whole(self, observation: Observation, parts: dict[str, dict[int, Points]]) -> Observation:
+        truth = parts.get(_TRUE, {}).get(observation.stamp, _NOTHING)
+        seen = parts.get(_SEEN, {}).get(observation.stamp, _NOTHING)
         if not len(truth) and not len(seen):
-            return sight
-        seen = seen if self.source == "poses" else sight.measured
-        return Observation(sight.stamp, sight.tail, sight.heading, seen, truth, sight.reason, sight.processing)
+            return observation
+        seen = seen if self.source == "poses" else observation.measured
+        return Observation(
+            observation.stamp,
+            observation.tail,
+            observation.heading,
+            seen,
+            truth,
+            observation.reason,
+            observation.processing,
+        )
 
     def _pose(self, record: RecordedMessage) -> Observation:
         """Return what a recorded pose says."""
@@ -230,7 +238,7 @@ class ObservationReader(Iterator[Observation]):
         if np.maximum.reduce(np.abs(points), axis=None) > width:  # what is not finite is refused by the model
             worst = points.reshape(-1, 2)[np.abs(points).reshape(-1, 2).max(axis=1).argmax()]
             where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {width:g} m wide"
-            raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another set-up's?")
+            raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another setup's?")
 
 
 def pixels(message: Any, type_name: str) -> Any:

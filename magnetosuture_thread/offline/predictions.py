@@ -85,8 +85,8 @@ class Step:
         scene: in force.
     """
 
-    sight: Observation
-    outcome: PredictionResult
+    observation: Observation
+    result: PredictionResult
     margins: Margins | None
     step_time: float
     settings: ThreadModelSettings
@@ -114,27 +114,27 @@ def predictions(given: Iterable[Observation], settings: ThreadModelSettings, sce
 def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Step]:
     waiting: dict[int, Observation] = {}
 
-    def step(sight: Observation, outcome: PredictionResult, began: float) -> Step:
+    def step(observation: Observation, result: PredictionResult, began: float) -> Step:
         taken = time.perf_counter() - began
-        if outcome.waiting:
-            waiting[outcome.stamp] = sight
+        if result.waiting:
+            waiting[result.stamp] = observation
         else:
-            waiting.pop(outcome.stamp, None)
-        return Step(sight, outcome, outcome.margins, taken, session.settings, session.scene)
+            waiting.pop(result.stamp, None)
+        return Step(observation, result, result.margins, taken, session.settings, session.scene)
 
-    for sight in given:
+    for observation in given:
         if isinstance(given, ObservationReader):
             _change(session, given)
-        if not sight.found:
+        if not observation.found:
             continue
-        if len(sight.measured):
+        if len(observation.measured):
             began = time.perf_counter()
-            for outcome in session.on_measured_thread(sight.stamp, sight.measured):
-                yield step(waiting.get(outcome.stamp, sight), outcome, began)
+            for result in session.on_measured_thread(observation.stamp, observation.measured):
+                yield step(waiting.get(result.stamp, observation), result, began)
                 began = time.perf_counter()
         began = time.perf_counter()
-        pose = NeedlePose(sight.stamp * 1e-9, sight.tail, sight.heading)
-        yield step(sight, session.on_pose(sight.stamp, pose), began)
+        pose = NeedlePose(observation.stamp * 1e-9, observation.tail, observation.heading)
+        yield step(observation, session.on_pose(observation.stamp, pose), began)
         while len(waiting) > 2 * MAX_WAITING_POSES:
             del waiting[next(iter(waiting))]
 

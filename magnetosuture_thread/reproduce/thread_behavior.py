@@ -70,7 +70,7 @@ def thread_behavior(
 
     Args:
         output: folder to make.
-        scenarios: names or paths of set-ups with a path for the needle.
+        scenarios: names or paths of setups with a path for the needle.
         log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 

@@ -30,7 +30,7 @@ JUMP_BACK = 1.0  # s; time that goes back by more begins anew, as a bag that was
 GATE_PX = 3.0  # that a needle may be off its prediction, beside what its greatest speed allows
 GATE_ANGLE = math.radians(6.0)
 MAX_PREDICTION = 0.2  # s; a motion is not extrapolated farther
-MEMORY = 0.5  # weight of the newest velocity
+SMOOTHING = 0.5  # weight of the newest velocity
 MARGIN_PX = 32.0  # around the needle and the thread, that is looked at
 BORDER_PX = 20.0  # a thread that ends so near to the region's border may go on
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
@@ -246,9 +246,9 @@ class VisionTracker:
         velocity, turn_rate = np.zeros(2), 0.0
         if before is not None:
             after = pose.time - before.time
-            velocity = before.velocity + MEMORY * ((pose.tail - before.tail) / after - before.velocity)
+            velocity = before.velocity + SMOOTHING * ((pose.tail - before.tail) / after - before.velocity)
             turned = (pose.angle - before.angle + math.pi) % (2.0 * math.pi) - math.pi
-            turn_rate = before.turn_rate + MEMORY * (turned / after - before.turn_rate)
+            turn_rate = before.turn_rate + SMOOTHING * (turned / after - before.turn_rate)
             velocity *= min(1.0, self._settings.max_needle_speed / max(float(np.hypot(*velocity)), 1e-12))
             turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
         self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate)

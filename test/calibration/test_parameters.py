@@ -125,7 +125,7 @@ def test_a_whole_number_is_written_with_its_point(tmp_path: Path):
     text = to_yaml(found(settings=settings, estimates=found().estimates[:3], attachment=None))
     assert "elastic_modulus: 2.0e+09 #" in text
     assert "rest_curvature: 12.0 #" in text
-    assert "attachment: pinned # as in the set-up" in text
+    assert "attachment: pinned # as in the setup" in text
     assert loaded(text, tmp_path) == settings
 
 

@@ -71,7 +71,7 @@ def test_command_is_zero_at_the_end():
 
 
 def test_path_is_done_only_when_the_tip_arrives():
-    controller = follower(longest_lag=0.1)
+    controller = follower(max_lag=0.1)
     for step in range(1200):
         command = controller.compute_command(step / RATE, np.zeros(2), EAST)
     assert command.progress < 1.0
@@ -101,7 +101,7 @@ def test_setpoint_waits_while_no_pose_arrives():
 
 
 def test_setpoint_waits_for_a_blocked_needle_and_the_command_stays_bounded():
-    controller = follower(longest_lag=0.001)
+    controller = follower(max_lag=0.001)
     for step in range(600):
         command = controller.compute_command(step / RATE, np.zeros(2), EAST)
     assert np.linalg.norm(command.tip - LENGTH * EAST) < 0.0012

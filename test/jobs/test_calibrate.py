@@ -50,7 +50,7 @@ def trajectory(phase: float = 0.0) -> ReferenceTrajectory:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a set-up and two bags of poses with noise."""
+    """Return a folder with a setup and two bags of poses with noise."""
     folder = tmp_path_factory.mktemp("calibrate")
     setup = folder / "lab.yaml"
     setup.write_text(SETUP)

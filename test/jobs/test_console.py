@@ -346,7 +346,7 @@ def test_a_graph_that_runs_is_joined_and_recorded(tmp_path: Path):
 
 def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path):
     for arguments, code, words in (
-        (["petri_36mm"], 2, "set-up: got 'petri_36mm'"),
+        (["petri_36mm"], 2, "setup: got 'petri_36mm'"),
         (["--port", "70000"], 2, "console.port: got 70000"),
         (["--address", "0.0.0.0"], 2, "a token, as 0.0.0.0 can be reached"),
         (["--replay", str(tmp_path / "nowhere")], 1, "does not exist"),

@@ -101,7 +101,7 @@ class Bench:
 @pytest.fixture(scope="module")
 def bench(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """Run the command, and open its page."""
-    with running(str(nearby(tmp_path_factory.mktemp("set-up")))) as console:
+    with running(str(nearby(tmp_path_factory.mktemp("setup")))) as console:
         domain = int(console.find(r"ROS domain (\d+)"))
         url = console.find(r"open (http://\S+)$")
         with wire(domain) as currents:

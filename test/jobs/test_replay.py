@@ -49,9 +49,9 @@ def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceT
 
 
 def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
-    said: list[str] = []
+    count_diagnostics: list[str] = []
     shares: list[float] = []
-    summary = replay_live(short_bag, tmp_path / "out", log=said.append, progress=shares.append)
+    summary = replay_live(short_bag, tmp_path / "out", log=count_diagnostics.append, progress=shares.append)
     assert summary.setup == "petri_35mm_polyamide"
     assert "straight_pull" in summary.simulated
     assert (summary.frames, summary.tracked, summary.predicted) == (30, 28, 28)  # the first in the third frame
@@ -68,7 +68,7 @@ def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
     for spread in summary.latency.values():
         assert spread is not None
         assert 0.0 < spread.median < 1.0
-    assert any("this machine only" in line for line in said)
+    assert any("this machine only" in line for line in count_diagnostics)
     assert shares[-1] == pytest.approx(1.0, abs=0.05)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["tracked"] == 28
     picture = cv2.imread(str(tmp_path / "out" / "summary.png"))
@@ -179,8 +179,8 @@ def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag:
     with started([*command, "--output", "out", "--loop"], tmp_path) as process:
         assert process.stdout is not None
         lines = iter(process.stdout)
-        said = next(line for line in lines if "to pause: " in line)
-        found = re.search(r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) std_srvs/srv/SetBool", said)
+        count_diagnostics = next(line for line in lines if "to pause: " in line)
+        found = re.search(r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) std_srvs/srv/SetBool", count_diagnostics)
         assert found is not None
         with Watch(int(found[1]), found[2]) as watch:
             watch.pause(True)
@@ -339,11 +339,11 @@ def test_a_bag_of_raw_frames_alone_is_played(short_bag: Path, tmp_path: Path):
                 data=pixels.ravel(),
             )
             writer.write_message(IMAGE.recorded, each.time, image)
-    said: list[str] = []
-    summary = replay_live(tmp_path / "raw", tmp_path / "out", log=said.append)
+    count_diagnostics: list[str] = []
+    summary = replay_live(tmp_path / "raw", tmp_path / "out", log=count_diagnostics.append)
     assert (summary.frames, summary.tracked, summary.commands, summary.driven) == (30, 28, 0, 0)
     assert summary.error_truth is None
-    assert any(line.startswith("the bag names no setup; taking petri_35mm_polyamide") for line in said)
+    assert any(line.startswith("the bag names no setup; taking petri_35mm_polyamide") for line in count_diagnostics)
     assert summary.simulated == ""
 
 

@@ -26,7 +26,7 @@ SQUARE = polygon(-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007)
 
 
 def made(**values: Any) -> ThreadModelSettings:
-    """Return settings from what a set-up file would hold."""
+    """Return settings from what a setup file would hold."""
     return from_mapping(ThreadModelSettings, values)
 
 

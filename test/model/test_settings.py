@@ -24,7 +24,7 @@ SQUARE = polygon(0.0, 0.0, 0.01, 0.0, 0.01, 0.01, 0.0, 0.01)
 
 
 def made(**values: Any) -> ThreadModelSettings:
-    """Return settings from what a set-up file would hold."""
+    """Return settings from what a setup file would hold."""
     return from_mapping(ThreadModelSettings, values)
 
 

@@ -62,7 +62,7 @@ def test_the_tracker_with_and_without_the_dish():
 
 def test_the_threads():
     path = MESSAGES.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
-    assert plain(messages.seen(path)) == [[0.0, 0.001], [0.002, 0.003]]
+    assert plain(messages.measured_thread(path)) == [[0.0, 0.001], [0.002, 0.003]]
     message = PredictedThread(positions=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
     assert plain(messages.predicted(message)) == {
         "vertices": [[0.1, 0.2]],

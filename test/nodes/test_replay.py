@@ -85,8 +85,8 @@ def diagnostics(node: str, **values: int) -> bytes:
 def test_losses_are_counted_by_the_way_on_which():
     losses = Losses()
     losses.played = Counter({"camera/image_raw/compressed": 10, "needle/servo_cv": 7})
-    losses.said(diagnostics("vision_tracker", frames=8, refused=1))
-    losses.said(diagnostics("thread_model", refused=1))
+    losses.count_diagnostics(diagnostics("vision_tracker", frames=8, refused=1))
+    losses.count_diagnostics(diagnostics("thread_model", refused=1))
     assert losses.frames_waiting
     for stamp in range(8):
         losses.heard("needle/measured_cp", stamp, stamp + 1)

@@ -77,15 +77,15 @@ def test_sights_of_poses_hold_what_was_recorded(pose_bag: Path, straight_pull: R
     seen = list(found)
     assert (found.count, found.found, found.refused) == (30, 30, {})
     assert [s.stamp for s in seen] == [round((1.0 + k / 30.0) * 1e9) for k in range(30)]
-    for k, sight in enumerate(seen):
+    for k, observation in enumerate(seen):
         tail, _, thread = straight_pull.at(k / 30.0)
-        assert np.linalg.norm(sight.tail - tail) < 6e-5
-        assert np.linalg.norm(sight.heading) == pytest.approx(1.0, abs=1e-12)
-        assert sight.measured.shape == (64, 2)
-        assert np.array_equal(sight.measured[0], sight.tail)
-        assert np.abs(sight.measured[-1] - thread[-1]).max() < 6e-5
-        assert sight.ground_truth.shape == (51, 2)
-        assert np.allclose(sight.ground_truth[0], tail, atol=1e-12)
+        assert np.linalg.norm(observation.tail - tail) < 6e-5
+        assert np.linalg.norm(observation.heading) == pytest.approx(1.0, abs=1e-12)
+        assert observation.measured.shape == (64, 2)
+        assert np.array_equal(observation.measured[0], observation.tail)
+        assert np.abs(observation.measured[-1] - thread[-1]).max() < 6e-5
+        assert observation.ground_truth.shape == (51, 2)
+        assert np.allclose(observation.ground_truth[0], tail, atol=1e-12)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
 
@@ -96,11 +96,11 @@ def test_sights_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_p
     assert (found.source, found.count, found.found) == ("camera", 30, 28)
     assert found.refused == {"no needle for sure": 2}
     assert [bool(s.reason) for s in seen] == [True] * 2 + [False] * 28
-    for k, sight in enumerate(seen[2:], 2):
-        assert np.linalg.norm(sight.tail - straight_pull.at(k / 30.0)[0]) < 1e-4
-        assert sight.measured.shape == (64, 2)
-        assert sight.ground_truth.shape == (51, 2)
-        assert sight.processing > 0.0
+    for k, observation in enumerate(seen[2:], 2):
+        assert np.linalg.norm(observation.tail - straight_pull.at(k / 30.0)[0]) < 1e-4
+        assert observation.measured.shape == (64, 2)
+        assert observation.ground_truth.shape == (51, 2)
+        assert observation.processing > 0.0
 
 
 def test_a_window_is_a_part_of_the_whole(pose_bag: Path):
@@ -236,7 +236,7 @@ def test_nothing_predicted_is_said_with_the_reason(pose_bag: Path, tmp_path: Pat
         )
     )
     assert len(steps) == 30
-    assert all(step.outcome.prediction is not None for step in steps)
+    assert all(step.result.prediction is not None for step in steps)
 
 
 def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_path: Path):
@@ -257,8 +257,8 @@ def test_poses_may_wait_for_their_thread(pose_bag: Path):
     seen = list(read_observations(recording, SETUP))
     late = [replace(s, measured=np.empty((0, 2))) if k < 5 else s for k, s in enumerate(seen)]
     steps = list(predictions(late, SETUP.model, SETUP.scene))
-    assert [step.outcome.waiting for step in steps] == [True] * 5 + [False] * 25
-    assert steps[5].outcome.stamp == steps[5].sight.stamp == seen[5].stamp
+    assert [step.result.waiting for step in steps] == [True] * 5 + [False] * 25
+    assert steps[5].result.stamp == steps[5].observation.stamp == seen[5].stamp
 
 
 @pytest.mark.parametrize("frame", ["dish", "another_frame", ""])
@@ -295,7 +295,7 @@ def test_poses_are_read_as_a_node_gets_them():
 
 def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
     steps = list(predictions(list(read_observations(Recording(Bag(pose_bag)), SETUP))[:3], SETUP.model, SETUP.scene))
-    prediction, margins = steps[-1].outcome.prediction, steps[-1].margins
+    prediction, margins = steps[-1].result.prediction, steps[-1].margins
     assert prediction is not None
     assert margins is not None
     store = typestore()
@@ -345,7 +345,7 @@ def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
     for start, found in ((0.0, 12), (0.5, 0)):
         seen = read_observations(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
         # In a dish of twice the diameter, what was the needle is twice as long.
-        tracked = [sight.found for sight in seen]
+        tracked = [observation.found for observation in seen]
         assert sum(tracked) == sum(tracked[:found]) >= found - 2
 
 
@@ -383,10 +383,10 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
         seen = read_observations(Recording(Bag(tmp_path / "told")), SETUP, start=start)
         steps = list(predictions(seen, SETUP.model, SETUP.scene))
         assert [step.scene for step in steps] == [SETUP.scene] * first + [scene] * (len(steps) - first)
-        assert [step.outcome.scene_version for step in steps] == [step.scene.version for step in steps if step.scene]
+        assert [step.result.scene_version for step in steps] == [step.scene.version for step in steps if step.scene]
         assert {step.settings.material for step in steps} == {SETUP.model.material, "silk_6_0"}
         assert steps[-1].settings.material == "silk_6_0"
-        assert all(step.outcome.prediction is not None for step in steps)
+        assert all(step.result.prediction is not None for step in steps)
         assert sum(seen.refused.values()) == 2
     replay_offline(tmp_path / "told", tmp_path / "again")
     said = [render_bag.decode().version for render_bag in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]

@@ -29,7 +29,7 @@ def setup() -> Setup:
 
 @pytest.fixture(scope="module")
 def camera(setup: Setup) -> DishCamera:
-    """Return the set-up's own camera, which shows the needle 33 pixels long."""
+    """Return the setup's own camera, which shows the needle 33 pixels long."""
     return setup.rig.camera(setup.scene)
 
 
@@ -67,7 +67,7 @@ def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
 ):
     """As when the needle was turned sharply, and has not pulled its thread straight yet.
 
-    At 35 degrees the set-up's own camera has too few pixels between the two: the heading may be off by 7 degrees.
+    At 35 degrees the setup's own camera has too few pixels between the two: the heading may be off by 7 degrees.
     """
     x, y, heading = PLACES["free"]
     tail = np.array([x, y])

@@ -106,7 +106,7 @@ class BagDetails:
     Attributes:
         name: of the report.
         path: of the bag.
-        setup: name of the set-up.
+        setup: name of the setup.
         simulated: what of the bag is simulated; empty if the bag does not say.
         source: `camera` or `poses`.
         formulation: of the model.

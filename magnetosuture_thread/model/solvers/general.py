@@ -64,7 +64,7 @@ class _GeneralSolver(ABC):
 class OsqpSolver(_GeneralSolver):
     """Solves programs with OSQP, each of the last one's pattern started from its solution, slacks included.
 
-    The first of a pattern pays for the set-up.
+    The first of a pattern pays for the setup.
 
     Args:
         tolerance: absolute and relative tolerance asked of OSQP before its solution is polished.

@@ -108,7 +108,7 @@ JPEG_QUALITY = 80
 READERS = {
     "tracker": (topics.TRACKER_STATE, messages.tracker, 0.0),
     "needle": (topics.NEEDLE_POSE, messages.needle, 0.0),
-    "measured": (topics.MEASURED_THREAD, messages.seen, MEASURED_PERIOD),
+    "measured": (topics.MEASURED_THREAD, messages.measured_thread, MEASURED_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
     "margins": (topics.MARGINS, messages.margins, 0.0),
     "scene": (topics.SCENE, messages.scene, 0.0),

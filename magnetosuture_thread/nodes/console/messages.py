@@ -74,7 +74,7 @@ def tracker(message: TrackerState) -> dict[str, Any]:
     return {"state": state, "reason": message.reason, "confidence": message.confidence, "view": view}
 
 
-def seen(message: Path) -> list[list[float]]:
+def measured_thread(message: Path) -> list[list[float]]:
     """Return the vertices of the seen centreline [m]."""
     places = (placed.pose.position for placed in message.poses)
     return [[place.x, place.y] for place in places]

@@ -61,7 +61,7 @@ class Losses:
         if stamp is not None and topic in (PREDICTED_THREAD.name, MARGINS.name):
             self._answered.add(stamp)
 
-    def said(self, data: bytes) -> None:
+    def count_diagnostics(self, data: bytes) -> None:
         """Take what a node says of itself on /diagnostics."""
         for status in deserialize_message(data, DiagnosticArray).status:
             values = {value.key: value.value for value in status.values}

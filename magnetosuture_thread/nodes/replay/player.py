@@ -246,7 +246,7 @@ class LiveReplay:
                 self._last_answer = time.perf_counter()
                 self.losses.heard(name, stamp, info["publication_sequence_number"])
             if topic.channel is DIAGNOSTICS:
-                self.losses.said(data)
+                self.losses.count_diagnostics(data)
             self._receive(topic.channel.recorded, self._time.now(), bytes(data))
 
         return take

@@ -50,15 +50,15 @@ def replay_hernia(
     Args:
         bag_path: a bag with velocities that an operator asked for.
         output: folder to make.
-        setup_name: name or path of the set-up; the one the bag names if empty.
-        formulation: of the thread model; the set-up's if empty.
+        setup_name: name or path of the setup; the one the bag names if empty.
+        formulation: of the thread model; the setup's if empty.
         animation: whether to draw one.
         log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
         BagError: the bag cannot be used, or the output exists or cannot be written.
-        ConfigurationError: the set-up cannot be used.
+        ConfigurationError: the setup cannot be used.
         SolverError: a step had no solution.
     """
     bag = Bag(bag_path)
@@ -66,7 +66,7 @@ def replay_hernia(
     settings = replace(setup.model, formulation=formulation or setup.model.formulation)
     steering = read_steering(bag)
     with whole_folder(output) as folder:
-        log(f"steering {steering.duration:.0f} s in set-up {setup.name}")
+        log(f"steering {steering.duration:.0f} s in setup {setup.name}")
         needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
         run = replay_steering(settings, start_centreline(setup), steering, needle, progress)
         summary = run.summary(setup.name)

@@ -144,7 +144,7 @@ class HerniaSummary:
     """The figures of a run.
 
     Attributes:
-        setup: name of the set-up.
+        setup: name of the setup.
         formulation: of the thread model.
         nodes: n.
         duration: [s].
@@ -214,7 +214,7 @@ class HerniaRun:
         return [self.nearest(time) for time in times]
 
     def summary(self, setup: str) -> HerniaSummary:
-        """Return the figures; `setup` is the set-up's name."""
+        """Return the figures; `setup` is the setup's name."""
         steps = self.instants[1:]
         took = np.array([step.took for step in steps])
         radius = 0.5 * self.settings.thread().diameter

@@ -25,7 +25,7 @@ FAR_WEIGHT = 0.6
 BENDS = 31  # curvatures tried at each step ...
 SHARPEST = 0.21  # ... up to this [1/px], closer around the present one's
 BEND_COST = 1.1  # of the usual strength, for a change of curvature by 1 / px, along the way looked ahead
-MEMORY = 0.05  # weight of the newest strength in the usual one
+SMOOTHING = 0.05  # weight of the newest strength in the usual one
 WAYS = 90  # directions tried at the tail
 START_BENDS = (-0.08, -0.04, 0.0, 0.04, 0.08)
 START_PX = 3.0  # the first sample's distance from the tail
@@ -197,7 +197,7 @@ def walk_on(ridge, dish, max_length, path, count, bend_first, forks):
             if forced == 0:
                 x, y = x - shift * math.sin(turned), y + shift * math.cos(turned)
                 turned += 0.25 * shift / STEP_PX
-            usual = max(ridge.faintest, (1.0 - MEMORY) * usual + MEMORY * min(strength, STRONGEST * usual))
+            usual = max(ridge.faintest, (1.0 - SMOOTHING) * usual + SMOOTHING * min(strength, STRONGEST * usual))
             gap = 0.0
         else:
             gap += STEP_PX * (HIDDEN_GAP if is_hidden(ridge, x, y) else 1.0)
