@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.remap import parse_remap
-from magnetosuture_thread.errors import ConfigurationError
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 from rich.console import Console
 
+from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.cli.arguments import EXIT_CODES, FAILED, WRONG_USE
 from magnetosuture_thread.cli.commands import bag, calibrate, evaluate, run_graph, scene
-from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 
 MOVED = {  # commands of before, and what is written instead
     "record": "`magnetosuture render`",

@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from magnetosuture_thread import MATERIALS, ConfigurationError, InvalidInputError
 from magnetosuture_thread.calibration.output import to_yaml
 from magnetosuture_thread.calibration.parameters import choose_parameters
 from magnetosuture_thread.calibration.plot import draw_calibration
@@ -19,7 +20,7 @@ from magnetosuture_thread.calibration.residuals import BestSettings
 from magnetosuture_thread.calibration.result import CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate as fit
 from magnetosuture_thread.calibration.search import unfinished_result
-from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.jobs.output import whole_file
 from magnetosuture_thread.jobs.replay_inputs import (
     BagInput,
@@ -30,7 +31,6 @@ from magnetosuture_thread.jobs.replay_inputs import (
     setup_of_notes,
 )
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.model.thread import MATERIALS
 from magnetosuture_thread.offline.predictions import read_observations
 from magnetosuture_thread.setups import Setup
 

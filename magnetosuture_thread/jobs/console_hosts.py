@@ -14,9 +14,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import GraphError, MagnetosutureError
+from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.bag_folder import STORAGE_SUFFIXES, find_bag_files
-from magnetosuture_thread.errors import BagError, ConfigurationError, MagnetosutureError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
 from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag, printable_path
 from magnetosuture_thread.jobs.output import whole_folder

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.configuration import Configuration, configuration_fields
-from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation, WorstFrame
 from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
 from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures, LiveFigures

@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread import interface
+from magnetosuture_thread import Attachment, ConfigurationError, Disc, interface
 from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.model.thread import Attachment
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.setups import Setup

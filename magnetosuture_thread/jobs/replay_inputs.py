@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import draw_summary
@@ -24,7 +25,6 @@ from magnetosuture_thread.interface import DISH_FRAME, GROUND_TRUTH_THREAD, MEAS
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.offline.observations import pixels
 from magnetosuture_thread.offline.predictions import chosen_source
-from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.tracker import VisionTracker
 

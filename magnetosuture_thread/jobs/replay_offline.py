@@ -7,10 +7,11 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics

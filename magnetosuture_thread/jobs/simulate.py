@@ -10,9 +10,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.interface import CAMERA, NODES, PROCESSES, SCENE, SCENE_MARKERS, SCENE_SERVER, TIP_SETPOINT

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.bags.bag_folder import COMPRESSED_SUFFIXES, STORAGE_SUFFIXES
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import pluralize
-from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA
-from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.frame import State, Track, no_pose
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay

@@ -16,11 +16,11 @@ from rclpy.node import Node
 from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState, make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
@@ -29,7 +29,6 @@ from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.run import raise_priority, run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
-from magnetosuture_thread.scene import Scene
 
 
 class BridgeServices:

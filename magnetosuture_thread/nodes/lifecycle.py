@@ -11,8 +11,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.configuration import ROS_PARAMETERS, Configuration
-from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 

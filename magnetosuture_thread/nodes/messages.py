@@ -12,7 +12,7 @@ from geometry_msgs.msg import TwistStamped
 from magnetosuture_msgs.msg import CoilCurrents
 from rclpy.serialization import deserialize_message
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.messages.building import MessageBuilder
 from magnetosuture_thread.messages.reading import nanoseconds
 from magnetosuture_thread.nodes.topics import Topic

@@ -20,8 +20,8 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.utilities import get_default_context
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.configuration import parse_parameter_value
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.parameter_files import (
     EVERY_NODE,
     check_list_value,

@@ -9,6 +9,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.configuration import (
     ROS_PARAMETERS,
     Configuration,
@@ -17,7 +18,6 @@ from magnetosuture_thread.configuration import (
     from_mapping,
     to_mapping,
 )
-from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
 C = TypeVar("C", bound=Configuration)

@@ -8,7 +8,7 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
@@ -18,7 +18,6 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
-from magnetosuture_thread.scene import Scene
 
 
 class PathFollowerNode(Node):

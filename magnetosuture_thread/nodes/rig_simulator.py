@@ -19,7 +19,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError
+from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene
 from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.messages.cdr import time_of
 from magnetosuture_thread.messages.packing import packed_path
@@ -35,7 +35,6 @@ from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
-from magnetosuture_thread.scene import Scene
 
 
 class RigTime:

@@ -18,7 +18,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
-from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.nodes.parameter_files import init
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

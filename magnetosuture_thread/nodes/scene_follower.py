@@ -6,12 +6,11 @@ from collections.abc import Callable
 
 from rclpy.node import Node
 
-from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import decoded
-from magnetosuture_thread.scene import Scene, read_scene
 
 MAX_MESSAGE_BYTES = 1 << 19  # of 10,000 vertices; what is larger is not even read
 

@@ -9,14 +9,13 @@ from typing import Any
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 from rclpy.node import Node
 
-from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread import MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
-from magnetosuture_thread.scene import Scene, read_scene
 from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
 
 

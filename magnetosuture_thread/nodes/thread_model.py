@@ -12,13 +12,13 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Prediction, Scene
 from magnetosuture_thread.configuration import configuration_fields
-from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp, time_of
 from magnetosuture_thread.messages.packing import packed_margins, packed_markers, packed_prediction
 from magnetosuture_thread.model.margins import UNKNOWN
-from magnetosuture_thread.model.predictor import STARTED, NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import STARTED
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings, parse_material
@@ -29,7 +29,6 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
-from magnetosuture_thread.scene import Scene
 
 MAX_MESSAGE_BYTES = 1 << 18  # bytes of a message; what is larger is not even read
 

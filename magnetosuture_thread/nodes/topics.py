@@ -20,8 +20,7 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from magnetosuture_thread import interface
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread import InvalidInputError, interface
 from magnetosuture_thread.interface import Channel
 
 SENSOR = qos_profile_sensor_data

@@ -13,7 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_path, packed_pose
@@ -24,7 +24,6 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
-from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.frame import State, no_pose
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.cli.arguments import (
     DONE,
     Subparsers,
@@ -25,7 +26,7 @@ from magnetosuture_thread.cli.arguments import (
     whole_number,
 )
 from magnetosuture_thread.cli.terminal import make_console, make_log, progress
-from magnetosuture_thread.errors import BagError, InvalidInputError
+from magnetosuture_thread.errors import BagError
 
 if TYPE_CHECKING:
     from magnetosuture_thread.coils.calibration_fit import CalibrationFit
@@ -94,8 +95,8 @@ def run_calibrate(options: argparse.Namespace) -> int:
     Ctrl-C ends it at any moment: the best so far is written, marked as such and without intervals, and the exit code
     is 130. Before there is any, nothing is written, and it is 1.
     """
+    from magnetosuture_thread import calibrate_bags
     from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table
-    from magnetosuture_thread.jobs.calibrate import calibrate_bags
 
     console = make_console()
     log = make_log(console)

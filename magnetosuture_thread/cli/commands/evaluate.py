@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.table import Table
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.cli.arguments import (
     DONE,
     FAILED,
@@ -24,7 +25,6 @@ from magnetosuture_thread.cli.arguments import (
     output_file,
 )
 from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
-from magnetosuture_thread.errors import ConfigurationError
 
 MAX_ROWS = 20  # of frames; beyond, only the summary is shown
 BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers")
@@ -171,8 +171,8 @@ def run_track(options: argparse.Namespace) -> int:
     and time_s, the processor time to search the frame, on one core, without reading and decoding it; all is
     compiled before. What has no value is null.
     """
+    from magnetosuture_thread import read_scene
     from magnetosuture_thread.jobs.track import settings_with, track
-    from magnetosuture_thread.scene import read_scene
     from magnetosuture_thread.setups import read_setup
 
     console = make_console()

@@ -6,6 +6,7 @@ import argparse
 import os
 from pathlib import Path
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.cli.arguments import (
     DONE,
     Subparsers,
@@ -17,7 +18,6 @@ from magnetosuture_thread.cli.arguments import (
     whole_number,
 )
 from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
-from magnetosuture_thread.errors import ConfigurationError
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
 COIL_ACTIONS = ("state", "arm", "disarm", "stop", "reset", "configure", "activate", "deactivate", "cleanup")
@@ -122,7 +122,7 @@ def run_replay(options: argparse.Namespace) -> int:
     with progress(console, "replay") as advance:
         given = {**bag_selection(options), "log": log, "progress": advance}
         if options.offline:
-            from magnetosuture_thread.jobs.replay_offline import replay_offline
+            from magnetosuture_thread import replay_offline
 
             summary = replay_offline(options.bag, options.output, **given)
         else:

@@ -11,12 +11,12 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.cli.arguments import DONE, Subparsers, command, number_argument, output_file
 from magnetosuture_thread.cli.terminal import make_console, make_log, write_json
-from magnetosuture_thread.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.scene import SceneShape
+    from magnetosuture_thread import SceneShape
 
 NEEDLE_WIDTH = 0.0004  # m
 PICTURES = (".png", ".svg")
@@ -55,7 +55,7 @@ def run_scene_check(options: argparse.Namespace) -> int:
     area_m2, vertices) and warnings (what: overlap, gap, hole or wall; shapes; value [m], of an overlap [m^2];
     place [m]; text).
     """
-    from magnetosuture_thread.scene import read_scene
+    from magnetosuture_thread import read_scene
     from magnetosuture_thread.scene.checks import scene_warnings
 
     console = make_console()
@@ -81,9 +81,9 @@ def run_draw(options: argparse.Namespace) -> int:
     if options.output.suffix not in PICTURES:
         raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
 
+    from magnetosuture_thread import read_scene
     from magnetosuture_thread.evaluation.scene_plot import plot_scene
     from magnetosuture_thread.jobs.output import whole_file
-    from magnetosuture_thread.scene import read_scene
 
     scene = read_scene(options.file)
     with whole_file(options.output) as partial:

@@ -13,6 +13,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
+from magnetosuture_thread import read_scene
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, PAUSE_REPLAY, PAUSE_RIG, RESET
 from magnetosuture_thread.nodes import topics
@@ -20,7 +21,6 @@ from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
-from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.vision.images import unpack_image
 
 TIMEOUT = 10.0  # s for a service to be found and to answer

@@ -10,7 +10,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import decoded
 from magnetosuture_thread.nodes.topics import Topic

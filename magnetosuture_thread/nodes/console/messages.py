@@ -17,12 +17,11 @@ from magnetosuture_msgs.msg import (
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
 
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread import Disc, Scene, SceneShape
 from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.margins import node_clearance
-from magnetosuture_thread.scene import Scene, SceneShape
 
 DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
 

@@ -16,9 +16,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.interface import PAUSE_REPLAY, PAUSE_RIG
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.diagnostics import PERIOD, Health
