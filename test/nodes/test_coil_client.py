@@ -6,8 +6,8 @@ import pytest
 
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.cli.commands.run_graph import COIL_ACTIONS
-from magnetosuture_thread.nodes import coil_client
-from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+from magnetosuture_thread.nodes.bridge import client
+from magnetosuture_thread.nodes.bridge.node import CoilBridgeNode
 
 
 def press(capsys, action: str) -> tuple[int, str]:
@@ -50,7 +50,7 @@ def test_without_a_bridge_it_fails_and_says_so(
     graph, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
-    monkeypatch.setattr(coil_client, "TIMEOUT", 0.5)
+    monkeypatch.setattr(client, "TIMEOUT", 0.5)
     for action in ("stop", "state"):
         code, said = press(capsys, action)
         assert code == 1

@@ -123,7 +123,7 @@ def _table(report: dict[str, Any]) -> Table:
 
 def _shape(shape: SceneShape) -> dict[str, Any]:
     """Return what is reported of a shape."""
-    from magnetosuture_thread.geometry.obstacles import Disc
+    from magnetosuture_thread import Disc
 
     geometry, kind = shape.geometry, next(iter(name for name in shape.definition if name != "corner_radius"), None)
     if isinstance(geometry, Disc):

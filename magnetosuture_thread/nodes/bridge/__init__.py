@@ -1,0 +1,1 @@
+"""The node `coil_bridge` and its client."""

@@ -1,0 +1,142 @@
+"""The node `rig_simulator`: the simulated rig in the place of camera, power stage and needle."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock as ClockMessage
+from std_msgs.msg import String
+
+from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.parameter_files import node_options
+from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.rig.devices import (
+    CLOCK_PERIOD,
+    EARLY,
+    EPOCH,
+    FramePublisher,
+    RigCurrents,
+    RigTime,
+)
+from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.rig.faults import Fault
+from magnetosuture_thread.rig.rig import Rig, RigFrame
+from magnetosuture_thread.rig.settings import RigSettings
+
+
+class RigSimulatorNode(Node):
+    """Stands in for coils, dish and camera."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("rig_simulator", **node_options("rig_simulator", options))
+        self._settings = settings = declare(self, RigSettings)
+        # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        rate = settings.rate if simulated else 1.0
+        self.get_logger().info("loading the rig's kernels; the first start on a machine compiles them")
+        scene = initial_scene(settings.scene)
+        if scene is None:
+            raise ConfigurationError(f"{settings.GROUP}.scene", "", "a scene file: what is simulated has a dish")
+        self.rig = Rig(settings, scene)
+        self.rig.warm_up()
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._health = Health(self)
+        epoch = EPOCH if simulated else self.get_clock().now().nanoseconds
+        self.time = RigTime(self, epoch, rate, simulated=simulated)
+        self._phase: float | None = None
+        self._last_index = -1
+        self._frames = self._skipped = 0
+        self._late: deque[tuple[float, int, RigFrame]] = deque()
+        self._publisher = FramePublisher(self, self.rig.camera, settings)
+        topics.FAULT_REQUEST.subscribe(self, self.on_fault)
+        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
+        if simulated:
+            self._clocks = topics.CLOCK.publisher(self)
+            self.create_timer(CLOCK_PERIOD / rate, self.on_clock, clock=self._steady)
+        self.create_timer(1.0 / (settings.frame_rate * rate), self.on_frame, clock=self._steady)
+        self.currents = RigCurrents(self, settings, self._steady, self._apply)
+        self.get_logger().info("ready: everything here is simulated")
+
+    def on_scene(self, scene: Scene) -> None:
+        """Put another dish and other shapes around needle and thread, which stay where they are."""
+        self.rig.set_scene(scene)
+        self._publisher.take(self.rig.camera)
+
+    def on_fault(self, message: String) -> None:
+        """Take a fault that begins now."""
+        try:
+            self.rig.faults.add(Fault.parse_request(message.data, max(0.0, self.rig.running)))
+        except InvalidInputError as error:
+            self._health.refuse(error)
+
+    def on_clock(self) -> None:
+        """Say what time it is in the simulation."""
+        self._clocks.publish(ClockMessage(clock=Time(nanoseconds=self.time.stamp(self.time.elapsed())).to_msg()))
+
+    def on_frame(self) -> None:
+        """Take the frame that is due; one that nobody had time for is left out."""
+        if self.time.paused:
+            self._health.ok("paused")
+            return
+        elapsed = self.time.elapsed()
+        if self._phase is None:
+            self._phase = elapsed
+        index = math.floor((elapsed - self._phase) * self._settings.frame_rate + EARLY)
+        # No frame is stamped later than it is taken: the first tick may have been later than the others.
+        self._phase = min(self._phase, elapsed - index / self._settings.frame_rate)
+        if index > self._last_index:
+            self._skipped += index - self._last_index - 1
+            self._last_index = index
+            self._take(self._phase + index / self._settings.frame_rate)
+        while self._late and self._late[0][0] <= elapsed:
+            _, stamp, frame = self._late.popleft()
+            self._publisher.publish(stamp, frame)
+
+    def destroy_node(self) -> None:
+        """Take away the lines of simulated boards."""
+        try:
+            self.currents.close()
+        finally:
+            super().destroy_node()
+
+    def _apply(self, currents: NDArray[np.float64]) -> None:
+        try:
+            self.rig.apply(currents, self.time.elapsed())
+        except InvalidInputError as error:
+            self._health.refuse(error)
+        except MagnetosutureError as error:
+            self._fail(error)
+
+    def _take(self, elapsed: float) -> None:
+        try:
+            frame = self.rig.capture_frame(elapsed)
+        except MagnetosutureError as error:
+            self._fail(error)
+            return
+        stamp = self.time.stamp(frame.time)  # currents may have moved the rig on since the frame was due
+        if frame.lateness:
+            self._late.append((elapsed + frame.lateness, stamp, frame))
+        else:
+            self._publisher.publish(stamp, frame)
+        self._frames += 1
+        self._health.ok(self.rig.status, taken=self._frames, skipped=self._skipped)
+
+    def _fail(self, error: MagnetosutureError) -> None:
+        """Switch the coils off where the simulation does not find its next state, and say so."""
+        self.rig.switch_off()
+        self._health.error(str(error))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node as a program."""
+    return run(RigSimulatorNode, arguments)
