@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
 from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.building import ADD, IN_PLANE, LINE_STRIP
@@ -18,6 +20,7 @@ from magnetosuture_thread.messages.cdr import (
     HEADER,
     KEPT,
     REAL,
+    Text,
     Time,
     array_codes,
     form,
@@ -26,7 +29,7 @@ from magnetosuture_thread.messages.cdr import (
     text,
     text_codes,
 )
-from magnetosuture_thread.model.margins import Friction, FrictionState, Margins, friction_colour
+from magnetosuture_thread.model.margins import UNKNOWN, FrictionState, Margins, friction_colour
 from magnetosuture_thread.model.predictor import Prediction
 
 _UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
@@ -43,9 +46,12 @@ _STAMPED = np.dtype(
         "itemsize": 80,
     }
 )
-SPHERE_LIST = 7  # as in Marker.msg
-_NAMESPACE = text("thread")
-_UPRIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+SPHERE_LIST, TEXT_VIEW_FACING = 7, 9  # as in Marker.msg
+TEXT_HEIGHT, LINE_HEIGHT = 8e-4, 1e-3  # m
+LIFETIME = 500_000_000  # ns of a barrier's text; poses come far more often
+SEGMENT_BARRIERS = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
+_THREAD, _MARGINS = text("thread"), text("margins")
+_INK, _RED = (0.1, 0.13, 0.16, 1.0), (0.78, 0.06, 0.18, 1.0)
 
 
 def packed_pose(
@@ -216,47 +222,71 @@ def _nodes(count: int) -> tuple[str, ...]:
     return "B", "I", *"I" * count
 
 
-def packed_markers(time: Time, prediction: Prediction, friction: Friction, diameter: float) -> bytes:
-    """Return the predicted thread as a line in the colour of its friction, and the nodes under friction as balls.
+def packed_markers(time: Time, prediction: Prediction, margins: Margins | None, diameter: float) -> bytes:
+    """Return a MarkerArray: the predicted thread, its nodes under friction, and the minimum of each barrier.
 
-    A MarkerArray.
+    The line has the colour of the friction, and the nodes under friction are spheres. A barrier's least clearance is
+    written beside the node that has it, in the namespace `margins`, also for barriers that users added; those of
+    single segments are not shown. The text disappears by its lifetime when its barrier has no row any more.
 
     Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback": green where free, orange, darker
-    with every node, where pulled under friction, blue where it rests. Deviation: grey where nobody knows.
+    with every node, where sliding under friction, blue where stuck. Deviation: grey where unknown.
 
     Args:
         time: of the pose, seconds and nanoseconds.
         prediction: the thread.
-        friction: of it.
+        margins: of it; None where there are none.
         diameter: of the thread [m].
     """
     width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
+    friction = UNKNOWN if margins is None else margins.friction
     colour = (*friction_colour(friction), 1.0)
-    balls = prediction.positions[list(friction.nodes)]
-    line = _marker(time, 0, LINE_STRIP, (width, 0.0, 0.0), colour, len(prediction.positions))
-    spheres = _marker(time, 1, SPHERE_LIST, (2.0 * width,) * 3, colour, len(balls))
-    packed = _markers_form(len(prediction.positions), len(balls)).pack(
-        2, *line, points_of(prediction.positions), *_REST, *spheres, points_of(balls), *_REST
-    )
-    return BEGIN + packed
+    nodes = prediction.positions
+    markers = [
+        _Marker(_THREAD, 0, LINE_STRIP, (width, 0.0, 0.0), colour, points=nodes),
+        _Marker(_THREAD, 1, SPHERE_LIST, (2.0 * width,) * 3, colour, points=nodes[list(friction.nodes)]),
+    ]
+    shown = [each for each in (() if margins is None else margins.minima) if each.barrier not in SEGMENT_BARRIERS]
+    for number, minimum in enumerate(shown):
+        clearance = minimum.minimum_clearance
+        x, y = nodes[minimum.node[0]]
+        place = (float(x), float(y) + (number + 1) * LINE_HEIGHT, 0.0)  # several may be closest at the same node
+        caption = text(f"{minimum.barrier} {1e3 * clearance:.2f} mm")
+        colour = _RED if clearance <= 0.0 else _INK
+        marker = _Marker(_MARGINS, number, TEXT_VIEW_FACING, (0.0, 0.0, TEXT_HEIGHT), colour, place, caption=caption)
+        markers.append(marker)
+    values = [value for marker in markers for value in marker.values(time)]
+    codes = tuple((len(marker.points), len(marker.namespace[1]), len(marker.caption[1])) for marker in markers)
+    return BEGIN + _markers_form(codes).pack(len(markers), *values)
 
 
-def _marker(
-    time: Time, number: int, kind: int, scale: tuple[float, ...], colour: tuple[float, ...], points: int
-) -> tuple[object, ...]:
-    return (*time, *DISH, *_NAMESPACE, number, kind, ADD, *_UPRIGHT, *scale, *colour, 0, 0, False, points)
+class _Marker(NamedTuple):
+    """A marker of visualization_msgs, as far as ours differ."""
 
+    namespace: Text
+    number: int
+    kind: int
+    scale: tuple[float, ...]
+    colour: tuple[float, ...]
+    place: tuple[float, ...] = (0.0, 0.0, 0.0)
+    points: Points = np.empty((0, 2))
+    caption: Text = EMPTY
 
-# Colours of single points, a texture with its header and picture, its coordinates, a text, a mesh and its file.
-_REST = (0, *EMPTY, 0, 0, *EMPTY, *EMPTY, 0, 0, *EMPTY, *EMPTY, *EMPTY, 0, False)
-_EMPTY = text_codes(EMPTY[0])
-_REST_CODES = ("I", *_EMPTY, "i", "I", *_EMPTY, *_EMPTY, "I", "I", *_EMPTY, *_EMPTY, *_EMPTY, "I", "?")
+    def values(self, time: Time) -> tuple[object, ...]:
+        """Return the fields in the message's order."""
+        upright, lifetime = (0.0, 0.0, 0.0, 1.0), (0, LIFETIME if self.kind == TEXT_VIEW_FACING else 0)
+        head = (*time, *DISH, *self.namespace, self.number, self.kind, ADD, *self.place, *upright)
+        shape = (*self.scale, *self.colour, *lifetime, False, len(self.points), points_of(self.points))
+        # Colours of single points, a texture with its header and picture, its coordinates, then a mesh and its file.
+        return (*head, *shape, 0, *EMPTY, 0, 0, *EMPTY, *EMPTY, 0, 0, *self.caption, *EMPTY, *EMPTY, 0, False)
 
 
 @lru_cache(KEPT)
-def _markers_form(line: int, balls: int) -> struct.Struct:
+def _markers_form(sizes: tuple[tuple[int, int, int], ...]) -> struct.Struct:
     codes = ["I"]
-    for points in (line, balls):
-        codes += [*HEADER, *text_codes(_NAMESPACE[0]), "i", "i", "i", *"d" * 7, *"d" * 3, *"f" * 4, "i", "I", "?"]
-        codes += [*array_codes(points, "d", 3), *_REST_CODES]
+    empty = text_codes(EMPTY[0])
+    for points, namespace, caption in sizes:
+        codes += [*HEADER, *text_codes(namespace), "i", "i", "i", *"d" * 7, *"d" * 3, *"f" * 4, "i", "I", "?"]
+        codes += [*array_codes(points, "d", 3), "I", *empty, "i", "I", *empty, *empty, "I", "I"]
+        codes += [*text_codes(caption), *empty, *empty, "I", "?"]
     return form(*codes)

@@ -17,7 +17,6 @@ from magnetosuture_thread.configuration import configuration_fields
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp, time_of
 from magnetosuture_thread.messages.packing import packed_margins, packed_markers, packed_prediction
-from magnetosuture_thread.model.margins import UNKNOWN
 from magnetosuture_thread.model.predictor import STARTED
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
@@ -178,8 +177,7 @@ class ThreadModelNode(Node):
         reason = "" if margins else prediction.status
         self._margins.publish(packed_margins(when, margins, reason, version))
         if self._markers.get_subscription_count():
-            friction = margins.friction if margins else UNKNOWN
-            self._markers.publish(packed_markers(when, prediction, friction, self._session.thread.diameter))
+            self._markers.publish(packed_markers(when, prediction, margins, self._session.thread.diameter))
         figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
         if prediction.status in (SOLVED, STARTED):
             self._health.ok("predicting", **figures)

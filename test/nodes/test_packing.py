@@ -14,7 +14,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_markers, packed_path, packed_pose
-from magnetosuture_thread.model.margins import UNKNOWN, Friction, FrictionState, friction_colour
+from magnetosuture_thread.model.margins import (
+    UNKNOWN,
+    BarrierMargins,
+    Friction,
+    FrictionState,
+    Margins,
+    friction_colour,
+)
 from magnetosuture_thread.model.predictor import Prediction
 from magnetosuture_thread.nodes.messages import MESSAGES
 
@@ -73,7 +80,40 @@ def test_markers_are_packed_as_rclpy_makes_them(segments: int, friction: Frictio
             marker(1, Marker.SPHERE_LIST, balls, friction, vertices[list(friction.nodes)]),
         ]
     )
-    same(packed_markers(WHEN, prediction, friction, diameter), expected)
+    margins = None if friction is UNKNOWN else Margins((), friction=friction)
+    same(packed_markers(WHEN, prediction, margins, diameter), expected)
+
+
+def test_the_minimum_of_every_barrier_is_written_beside_its_node():
+    """Also of a barrier that a user added; not of those that hold the segments together, nor of one without rows."""
+
+    def rows(barrier: str, *entries: tuple[int, float]) -> BarrierMargins:
+        nodes, clearances = np.array([n for n, _ in entries], int), np.array([h for _, h in entries])
+        return BarrierMargins(
+            barrier, nodes.astype(np.uint32), -np.ones(len(entries), np.int32), clearances, clearances
+        )
+
+    barriers = (rows("connectivity", (1, 0.0)), rows("obstacle", (1, 2e-3), (3, -1e-6)), rows("wall"))
+    added = rows("moving_disc", (2, 1.234e-3))
+    vertices = np.random.default_rng(1).normal(size=(5, 2))
+    none: Any = None
+    prediction = Prediction(1.0, "rod", "", vertices, np.zeros(4), 0.0, 0, "", "", 0.0, True, none)
+    data = packed_markers(WHEN, prediction, Margins((*barriers, added)), 1e-4)
+    shown: Any = deserialize_message(data, MarkerArray)
+    assert data == serialize_message(shown) or len(data) == len(serialize_message(shown))
+    texts = [each for each in shown.markers if each.ns == "margins"]
+    assert [(each.text, each.type) for each in texts] == [
+        ("obstacle -0.00 mm", Marker.TEXT_VIEW_FACING),
+        ("moving_disc 1.23 mm", Marker.TEXT_VIEW_FACING),
+    ]
+    assert [each.id for each in texts] == [0, 1]
+    assert texts[0].color.r > texts[1].color.r  # red where it is touched
+    for each, node in zip(texts, (3, 2), strict=True):
+        assert each.pose.position.x == vertices[node, 0]
+        assert abs(each.pose.position.y - vertices[node, 1]) <= 3e-3
+        assert each.header == shown.markers[0].header
+        assert each.lifetime.nanosec > 0  # it goes when the barrier has no row any more
+        assert each.scale.z > 0.0
 
 
 def test_a_pose_that_is_handed_over_is_that_of_its_message():
