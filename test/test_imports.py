@@ -192,8 +192,8 @@ def test_modules_stay_small():
     names = [
         "vision_tracker",
         "thread_model",
-        "bridge/node",
-        "rig/node",
+        "coil_bridge/node",
+        "rig_simulator/node",
         "path_follower",
         "scene_server",
         "console/node",

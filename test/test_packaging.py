@@ -38,7 +38,7 @@ def test_every_message_is_built():
 def test_every_message_package_that_the_nodes_import_is_declared():
     declared = {entry.text for entry in package_xml(ROOT / "package.xml").findall("depend")}
     used = set()
-    for path in (ROOT / "magnetosuture_thread" / "nodes").glob("*.py"):
+    for path in (ROOT / "magnetosuture_thread" / "nodes").rglob("*.py"):
         used |= set(re.findall(r"^from (\w+)\.(?:msg|srv) import", path.read_text(), re.MULTILINE))
     interface = (ROOT / "magnetosuture_thread" / "interface.py").read_text()
     used |= set(re.findall(r'"(\w+)/msg/\w+"', interface))

@@ -20,7 +20,7 @@ from magnetosuture_thread.interface import CAMERA, NODES, PROCESSES, SCENE, SCEN
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.bridge.client import CoilClient
+from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.recorder import Recorder
 from magnetosuture_thread.nodes.run import Interruption

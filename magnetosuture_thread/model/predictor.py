@@ -151,7 +151,8 @@ class ThreadPredictor:
             workspace = scene
         elif scene is not None:
             check_scene(thread, scene)
-            workspace = Workspace(scene.obstacles, margin_range, wall_radius=scene.dish.radius)
+            reach = margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
+            workspace = Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius)
             self._scene_version = scene.version
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)

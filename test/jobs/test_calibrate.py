@@ -44,7 +44,7 @@ def trajectory(phase: float = 0.0) -> ReferenceTrajectory:
     sights = rig_run(TRUE, phase=phase)
     headings = np.unwrap([math.atan2(sight.heading[1], sight.heading[0]) for sight in sights])
     times = np.array([(sight.stamp - sights[0].stamp) * 1e-9 for sight in sights])
-    tails, threads = (np.array([getattr(sight, name) for sight in sights]) for name in ("tail", "truth"))
+    tails, threads = (np.array([getattr(sight, name) for sight in sights]) for name in ("tail", "ground_truth"))
     return ReferenceTrajectory("rig", times, tails, headings, threads, (), {"material": {"L_m": LENGTH}})
 
 

@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread.interface import ARM
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.scene import read_scene
 

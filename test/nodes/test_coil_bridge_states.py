@@ -14,7 +14,7 @@ from magnetosuture_msgs.msg import CoilBridgeState
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.interface import EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from test.nodes.bridge import (
     LONG,
     READY,

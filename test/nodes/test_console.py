@@ -23,14 +23,14 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.jobs.console_hosts import SimulatedHost
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.console import graph as console_graph
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.inbox import ConsoleTap
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
 from magnetosuture_thread.nodes.messages import MESSAGES, decoded
 from magnetosuture_thread.nodes.processes import graph_environment
-from magnetosuture_thread.nodes.rig.node import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
 from test.nodes.margins import no_margins
 
@@ -301,7 +301,7 @@ def test_a_bridge_that_is_heard_says_all_that_the_page_shows(graph, console):
 def program(domain: int, *parameters: str) -> subprocess.Popen[str]:
     """Run the node as a program."""
     given = [part for parameter in parameters for part in ("-p", parameter)]
-    command = [sys.executable, "-m", "magnetosuture_thread.nodes.console.node", "--ros-args", *given]
+    command = [sys.executable, "-m", "magnetosuture_thread.nodes.console", "--ros-args", *given]
     environment = graph_environment(domain)
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 

@@ -17,7 +17,7 @@ from rclpy.parameter import parameter_value_to_python
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.nodes import parameter_files
-from magnetosuture_thread.nodes.bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.resources import find_setup_file

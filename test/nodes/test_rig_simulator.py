@@ -18,8 +18,8 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.rig.devices import RigTime
-from magnetosuture_thread.nodes.rig.node import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_simulator.devices import RigTime
+from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from test.nodes.scenes import scene_told
 

@@ -169,7 +169,7 @@ def find_contacts(
     for i in range(len(points)):
         x, y = points[i, 0], points[i, 1]
         point = (x, y, points[i, 2] if points.shape[1] == 3 else 0.0)
-        if inner_square < x * x + y * y < np.inf:
+        if inner_square <= x * x + y * y < np.inf:
             wall_distance, wall_x, wall_y = wall_contact(x, y, data.wall_radius)
             before = count
             count = add_row(count, count, wall_distance, (wall_x, wall_y, 0.0), rows)

@@ -17,7 +17,7 @@ from magnetosuture_thread.coils.drivers import make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.bridge.report import (
+from magnetosuture_thread.nodes.coil_bridge.report import (
     BridgeServices,
     CoilReport,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -21,7 +20,6 @@ from magnetosuture_thread.messages.packing import packed_path
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.replay.clock import Timeline
-from magnetosuture_thread.nodes.rig.node import main
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
@@ -157,7 +155,3 @@ CLOCK_PERIOD = 0.005  # s of simulated time between two messages on /clock
 
 
 EPOCH = 1_000_000_000  # ns; simulated time begins here, as time 0 means "not set" in ROS
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.bridge.report import JITTER_KEYS, SCHEDULING
+from magnetosuture_thread.nodes.coil_bridge.report import JITTER_KEYS, SCHEDULING
 
 TIMEOUT = 10.0  # s for the bridge to be found and to answer
 DISCOVERY_TIME = 0.5  # s after the first message of the bridge, for it to have discovered this client

@@ -19,7 +19,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
-from magnetosuture_thread.nodes.rig.devices import (
+from magnetosuture_thread.nodes.rig_simulator.devices import (
     CLOCK_PERIOD,
     EARLY,
     EPOCH,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +18,6 @@ from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.bridge.node import main
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import MESSAGES
 
@@ -173,7 +171,3 @@ class CoilReport:
         if text != self._last_log:
             self._last_log = text
             self._node.get_logger().info(text)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,1 +1,0 @@
-"""The node `coil_bridge` and its client."""

@@ -1,0 +1,7 @@
+"""Runs the node `console`."""
+
+import sys
+
+from magnetosuture_thread.nodes.console import main
+
+sys.exit(main())
