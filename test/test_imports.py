@@ -33,7 +33,7 @@ ALLOWED = {
     "console": {*BASE, "geometry", "scene", "shared_parameters"},
     "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
     "bags": {*BASE, "interface", "messages"},
-    "messages": {"errors", "interface", "geometry", "scene", "model", "vision", "coils"},
+    "messages": {"barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils"},
     "evaluation": {"barrier", "messages", "errors", "geometry", "interface", "model", "scene"},
     "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation"},
     "nodes": {
