@@ -83,7 +83,7 @@ class Barrier(ABC):
     slack_weight: float = math.inf
 
     def set_time(self, time: float) -> None:  # noqa: B027 - most barriers do not move
-        """Take the time at which the rows are asked for next [s]; a barrier that moves overrides this."""
+        """Set the time of the next evaluation [s]; a barrier that moves overrides this."""
 
     @abstractmethod
     def value(self, positions: Points) -> NDArray[np.float64]:
@@ -154,7 +154,7 @@ class CompiledBarrier(Barrier):
 
 
 def check_barriers(barriers: tuple[Barrier, ...]) -> None:
-    """Refuse barriers that cannot be told apart.
+    """Refuse barriers that share a name.
 
     Raises:
         ConfigurationError: something is no barrier, or a name is missing, taken, or longer than `MAX_NAME_CHARS`.

@@ -45,7 +45,7 @@ class Quantity:
     multiple: int = 1
 
     def expectation(self, kind: type) -> str:
-        """Return what is accepted, in words."""
+        """Return the accepted values as text."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "text", tuple: "a list"}[kind]
@@ -91,7 +91,7 @@ class Configuration:
         self.check()
 
     def check(self) -> None:
-        """Raise `ConfigurationError` where fields that are valid apart don't fit together."""
+        """Raise `ConfigurationError` where fields that are valid apart contradict each other."""
 
     def refused(self, name: str, expected: str) -> ConfigurationError:
         """Return the error of a field whose value does not fit the others."""
@@ -266,7 +266,7 @@ def parse_parameter_value(text: str) -> Any:
 
 
 def suggest_names(name: str, known: list[str]) -> str:
-    """Return the known names in words, with the closest match as a hint."""
+    """Return the known names as text, with the closest match as a hint."""
     close = difflib.get_close_matches(name, known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"one of {', '.join(known)}{hint}"

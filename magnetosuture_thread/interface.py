@@ -1,4 +1,4 @@
-"""The graph's interface in words: nodes, frame, and each topic's name and type, the services, written down once.
+"""Names of the graph's interface: nodes, frame, topics with their types, services.
 
 Nothing of ROS is needed here: bags are read and written by the same names on machines without it.
 
@@ -22,7 +22,7 @@ CAMERA_FRAME = "camera"
 
 @dataclass(frozen=True)
 class Channel:
-    """A topic in words.
+    """A topic: its name and type.
 
     Attributes:
         name: without a leading slash, so that a namespace can come before it.

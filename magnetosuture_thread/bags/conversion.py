@@ -144,7 +144,7 @@ Convert = Callable[[Any, int], Any]
 
 
 class UnfitError(Exception):
-    """A message that says nothing that our graph could take; the text says why."""
+    """A message that cannot be converted to a type of our graph; the text gives the reason."""
 
 
 def pose_stamped(message: Any, time: int) -> Any:
@@ -153,7 +153,7 @@ def pose_stamped(message: Any, time: int) -> Any:
 
 
 def pose_with_covariance(message: Any, time: int) -> Any:
-    """Return a PoseWithCovarianceStamped of anything that holds one pose; zeros say that its errors are unknown."""
+    """Return a PoseWithCovarianceStamped of anything that holds one pose; a covariance of zeros means unknown."""
     holder = getattr(message, "pose", None)
     covariance = getattr(holder, "covariance", None)
     values = np.zeros(36) if covariance is None else np.array(covariance, dtype=float)

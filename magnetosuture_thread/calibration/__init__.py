@@ -1,1 +1,1 @@
-"""Calibration: the thread's parameters that recorded runs can tell, and which of them they cannot."""
+"""Calibration: fits the thread's parameters to recorded runs, and reports which are identifiable."""

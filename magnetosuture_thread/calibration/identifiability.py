@@ -134,7 +134,7 @@ def _own_effect(flat: Array, weights: Array, index: int) -> float:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data say of one number.
+    """Identifiability of one parameter, with its confidence interval.
 
     Attributes:
         reason: why it cannot be identified; empty if it can.
@@ -148,12 +148,12 @@ class Identifiability:
 
     @property
     def identified(self) -> bool:
-        """Whether the data tell the number."""
+        """Whether the data identify the parameter."""
         return not self.reason
 
 
 def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -> list[Identifiability]:
-    """Return what the data say of each of a solution's numbers.
+    """Return the identifiability of each parameter of a solution.
 
     Args:
         solution: of a fit to all that is unknown.

@@ -1,4 +1,4 @@
-"""A calibration as a ROS 2 parameter file that `thread_model` loads, as tables, and in words."""
+"""Output of a calibration: a ROS 2 parameter file for `thread_model`, tables, and text."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def bag_table(found: Mapping[str, Any]) -> Table:
 
 
 def calibration_lines(found: Mapping[str, Any]) -> list[str]:
-    """Return in words what the tables do not say."""
+    """Return the lines that complement the tables."""
     simulated = [row["name"] for row in found["bags"] if row["simulated"]]
     lines = [f"warning: {warning}" for warning in found["warnings"]]
     if simulated:

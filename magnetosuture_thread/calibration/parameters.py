@@ -89,7 +89,7 @@ class Parameter:
         return low, high
 
     def reset(self, settings: Settings, start: Settings) -> Settings:
-        """Return settings with what others say of this number."""
+        """Return settings with this parameter taken from other settings."""
         if self.setting == OFFSET:
             return self.write(settings, self.read(start))
         return _replaced(settings, self.setting, getattr(start, self.setting))

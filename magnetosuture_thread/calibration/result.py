@@ -22,7 +22,7 @@ IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "un
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the data say of one number.
+    """Identifiability of one parameter, with its confidence interval.
 
     Attributes:
         name: for a person.
@@ -103,7 +103,7 @@ class BagErrors:
 
     @property
     def warning(self) -> str:
-        """What a person should know of a bag whose nodes are farther off than before, in words; else empty."""
+        """Warning about a bag whose nodes fit worse than before; empty if there is none."""
         if not self.after > WORSE * self.before:
             return ""
         better = self.across_after <= self.across_before
@@ -177,7 +177,7 @@ class CalibrationResult:
 
     @property
     def warnings(self) -> list[str]:
-        """What a person should know, in words."""
+        """Warnings for the user."""
         lines = []
         for estimate in self.estimates:
             if estimate.status == STAND_IN:

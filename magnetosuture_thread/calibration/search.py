@@ -52,7 +52,7 @@ def calibrate(
     progress: Progress = lambda share: None,
     log: Log = lambda line: None,
 ) -> tuple[CalibrationResult, list[BagFit]]:
-    """Fit what the runs can tell of a thread.
+    """Fit a thread's parameters to recorded runs.
 
     1. Stiffnesses from a hundredth to a hundred times the material's are tried with each attachment, and the best
        of them fitted alone, by the whole distance of prediction and thread.

@@ -29,7 +29,7 @@ def printable(text: str) -> str:
 
 @contextmanager
 def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar, and give what sets the share done, 0 to 1."""
+    """Show a progress bar; the block gets a function that sets its fraction, 0 to 1."""
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=1.0)
@@ -37,6 +37,6 @@ def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
 
 
 def write_json(path: Path | None, figures: Any) -> None:
-    """Write figures to the file of --json, if one was asked for."""
+    """Write figures to the file given by --json, if any."""
     if path:
         path.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

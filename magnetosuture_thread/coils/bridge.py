@@ -175,7 +175,7 @@ class CoilBridge:
         self.watchdogs[source].update(velocity, stamp, number, now, arrival)
 
     def on_margins(self, stamp: float, valid: bool, slowdown: float, scene_version: str, arrival: float) -> None:
-        """Take the thread model's margins; see `PredictionMonitor.update`."""
+        """Register the thread model's margins; see `PredictionMonitor.update`."""
         self.prediction_monitor.update(stamp, valid, slowdown, scene_version, arrival)
 
     def arm(self, driver: DriverState) -> None:

@@ -53,7 +53,7 @@ class GraphCollector:
         self.health: dict[str, str] = {}
 
     def add(self, topic: str, message: Any) -> None:
-        """Add one message; topics that say nothing about a frame are ignored."""
+        """Add one message; topics that concern no frame are ignored."""
         if topic == interface.DIAGNOSTICS.recorded:
             self.health.update({status.name.split(":")[0]: status.message for status in message.status})
         if topic == interface.CURRENTS.recorded and not message.stop:

@@ -57,7 +57,7 @@ class CaseScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The scores of a set of trajectories; on simulated ones unless they are said to be others.
+    """The scores of a set of trajectories, simulated ones unless their metadata names another source.
 
     Attributes:
         formulation: its name.

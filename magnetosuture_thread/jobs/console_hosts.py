@@ -59,7 +59,7 @@ class BagRecording:
 
     @property
     def running(self) -> bool:
-        """Whether it has begun, and nobody has called `end`."""
+        """Whether it has begun and has not ended."""
         return self._tapping is not None
 
     @property

@@ -15,7 +15,7 @@ from magnetosuture_thread.errors import BagError
 
 @contextmanager
 def whole_folder(output: Path, *, is_recording: bool = False) -> Iterator[Path]:
-    """Give a folder to fill, which takes its name only when the block ends without an error.
+    """Yield a folder to fill; it is renamed to its final name only when the block ends without an error.
 
     Args:
         output: the folder to make; must not exist.
@@ -61,7 +61,7 @@ def whole_folder(output: Path, *, is_recording: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Give a file to write, which takes its name only when the block ends without an error.
+    """Yield a file to write; it is renamed to its final name only when the block ends without an error.
 
     Args:
         path: the file to make; one that is there is replaced then.

@@ -130,7 +130,7 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
 
 
 def scene_at(recording: Recording, start: float) -> Scene | None:
-    """Return the scene that a bag tells to be in force at a time into it [s], or tells first; None if it tells none.
+    """Return the scene in force at a time into a bag [s], else the first one; None if the bag has none.
 
     Raises:
         BagError: what it tells is no scene.

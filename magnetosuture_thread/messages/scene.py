@@ -35,7 +35,7 @@ def scene_fields(scene: Scene) -> dict[str, Any]:
 
 
 def parse_scene_message(message: Any) -> Scene:
-    """Return the scene that a message tells, once it is known to be whole.
+    """Parse a Scene message and validate it.
 
     Args:
         message: a magnetosuture_msgs/Scene of any library.

@@ -50,7 +50,7 @@ _DEEPEST = 20  # nodes under friction, from which on orange gets no deeper
 
 
 def friction_colour(friction: Friction) -> Colour:
-    """Return the colour that tells a friction: red, green and blue, 0 to 1.
+    """Return the display colour of a friction state: red, green and blue, 0 to 1.
 
     Green where free, orange where pulled, deeper with each node under friction, blue at rest, grey where unknown.
 
@@ -194,7 +194,7 @@ def node_clearance(margins: Margins, count: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Tells friction from the values of the obstacle barriers alone; no force is worked out.
+    """Classifies friction from the values of the obstacle barriers alone; no force is computed.
 
         index = {i >= 1 : h_obs,i,O < threshold for two obstacles O or more}
         slowdown = beta^|index|  where a node of the index moves faster than `stuck_speed`, else 1
@@ -263,5 +263,5 @@ class NodeMotion:
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", velocity, velocity)))
 
     def follow_on(self, other: NodeMotion) -> None:
-        """Go on from the motion of a thread that this one takes the place of."""
+        """Continue from the motion of the thread that this one replaces."""
         self._last, self._velocity = other._last, other._velocity

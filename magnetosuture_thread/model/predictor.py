@@ -1,4 +1,4 @@
-"""The predictor: follows the needle's poses by their stamps and says where the thread is."""
+"""The predictor: steps the thread model along the needle's stamped poses."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Prediction:
 
     @cached_property
     def margins(self) -> Margins:
-        """The margins of every barrier by its name, in SI units; computed when they are first asked for."""
+        """The margins of every barrier by its name, in SI units; computed at first access."""
         return self.compute_margins()
 
 
@@ -213,7 +213,7 @@ class ThreadPredictor:
 
     @property
     def started(self) -> bool:
-        """Whether the thread has a shape to go on from."""
+        """Whether the thread has a shape."""
         return self._state is not None
 
     def warm_up(self) -> None:
@@ -234,7 +234,7 @@ class ThreadPredictor:
         self._pose = self._state = None
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> Prediction:
-        """Take the thread's shape from a centreline, measured or assumed, from tail to end.
+        """Set the thread's shape from a centreline, measured or assumed, from tail to end.
 
         Args:
             pose: the needle at the same instant.
@@ -264,7 +264,7 @@ class ThreadPredictor:
         return self.start_at(pose, chain_inside(path, self.thread.segments, unit, self._room_radius))
 
     def start_at(self, pose: NeedlePose, vertices: Points) -> Prediction:
-        """Take the thread's nodes as they are.
+        """Set the thread's nodes.
 
         Args:
             pose: the needle at the same instant.
@@ -287,7 +287,7 @@ class ThreadPredictor:
         return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0), True)
 
     def follow_on(self, other: ThreadPredictor) -> None:
-        """Go on from where another predictor's thread is, and as it moves, if it has started."""
+        """Continue from the state of another predictor, if it has started."""
         self._pose = other._pose
         self._state = other._state.resampled(other.thread, self.thread) if other._state is not None else None
 

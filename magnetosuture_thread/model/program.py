@@ -1,4 +1,4 @@
-"""The quadratic program of a step, and a solution that is judged apart from its solver.
+"""The quadratic program of a step, and residuals of a solution, computed independently of the solver.
 
     minimise over u, s   1/2 u' P u + q' u + 1/2 sum_r s_r^2 / c_r
     subject to           lower_r <= a_r' u + s_r <= upper_r,    u_i = 0 for the known nodes
@@ -130,7 +130,7 @@ class Solver(Protocol):
     def solve(
         self, program: ChainProgram, velocities: Points, multipliers: Vector, wide: WideRows | None = None
     ) -> Solution:
-        """Return the solution with its residuals, whatever it is: the caller judges it.
+        """Return the solution with its residuals; the caller decides whether to accept it.
 
         Args:
             program: the program.

@@ -1,4 +1,4 @@
-"""A session: needle poses and seen threads come, predictions go; what `thread_model` does without ROS."""
+"""Streaming thread prediction from needle poses and measured centrelines; the core of the node `thread_model`."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ class PredictionResult:
 
     @property
     def waiting(self) -> bool:
-        """Whether the pose waits for the thread to be seen."""
+        """Whether the pose waits for the first measured thread."""
         return self.prediction is None and self.problem is None
 
 
 class ThreadSession:
-    """Predicts the thread over one run: from where it is first seen, by the poses that follow.
+    """Predicts the thread over one run: starts from its first measured centreline, then follows the poses.
 
     The node `thread_model` and the replay without a graph are both a shell around this, so that the same poses
     give the same predictions to the last bit.
@@ -119,7 +119,7 @@ class ThreadSession:
         return put_in_force
 
     def change(self, settings: ThreadModelSettings, scene: Scene | None) -> None:
-        """Go on with other settings or another scene, from where the thread is and as it moves.
+        """Change settings or scene, keeping the thread's state.
 
         Raises:
             ConfigurationError: they cannot be used; those before stay in force.
@@ -127,13 +127,13 @@ class ThreadSession:
         self.prepare(settings, scene)()
 
     def needs_measured_thread(self, stamp: int) -> bool:
-        """Return whether a seen thread of this stamp [ns] would be of use; most are not."""
+        """Return whether a measured thread of this stamp [ns] is needed; most are not."""
         if self.settings.initial_shape != "measured":
             return False
         return not self._predictor.started or self._last is None or stamp < self._last - MAX_LATENESS
 
     def on_measured_thread(self, stamp: int, centreline: Points) -> Iterator[PredictionResult]:
-        """Take the thread as the camera sees it, to start from.
+        """Start from a thread that the camera measured.
 
         Args:
             stamp: of the frame [ns].

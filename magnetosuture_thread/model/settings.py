@@ -40,7 +40,7 @@ MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its seg
 
 @dataclass(frozen=True)
 class ThreadModelSettings(Configuration):
-    """What the thread model must know of the thread and the liquid; the scene itself is told apart."""
+    """Parameters of the thread model: thread, liquid and numerical settings; the scene is given apart."""
 
     GROUP: ClassVar[str] = "thread_model"
 
@@ -266,7 +266,7 @@ class ThreadModelSettings(Configuration):
         return predictor
 
     def friction_law(self) -> FrictionLaw:
-        """Return what tells friction."""
+        """Return the friction law."""
         return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.stuck_speed)
 
     def node_motion(self) -> NodeMotion:
@@ -275,7 +275,7 @@ class ThreadModelSettings(Configuration):
 
 
 def parse_material(message: Any) -> dict[str, Any]:
-    """Return the settings, by name, that a ThreadMaterial changes, whoever decoded it.
+    """Return the settings, by name, that a ThreadMaterial message changes.
 
     What is 0, not a number or empty stays as it is; but a material that is named brings its own diameter, modulus
     and weight of the stiffness. The message has the units of the settings.

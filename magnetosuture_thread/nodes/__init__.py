@@ -1,1 +1,1 @@
-"""Nodes: the graph. The only room that knows ROS."""
+"""The ROS 2 nodes; the only subpackage that imports rclpy."""

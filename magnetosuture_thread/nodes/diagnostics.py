@@ -1,4 +1,4 @@
-"""What a node says of itself on /diagnostics."""
+"""A node's status on /diagnostics."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ class Health:
         self._late.cancel()
 
     def ok(self, text: str, **values: object) -> None:
-        """Say that all is well."""
+        """Report level OK."""
         self._set(DiagnosticStatus.OK, text, values)
 
     def warn(self, text: str, **values: object) -> None:
-        """Say that the node goes on but cannot do all of its work."""
+        """Report level WARN: the node continues but cannot do all of its work."""
         self._set(DiagnosticStatus.WARN, text, values)
 
     def error(self, text: str, **values: object) -> None:
-        """Say that the node cannot do its work."""
+        """Report level ERROR: the node cannot do its work."""
         self._set(DiagnosticStatus.ERROR, text, values)
 
     def note(self, **values: object) -> None:

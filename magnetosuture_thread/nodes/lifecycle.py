@@ -46,7 +46,7 @@ class ManagedNode(LifecycleNode, Generic[C]):
 
     @abstractmethod
     def begin(self, settings: C) -> None:
-        """Take what the settings ask for; raise `MagnetosutureError` where that cannot be."""
+        """Allocate what the settings require; raise `MagnetosutureError` if that is impossible."""
 
     @abstractmethod
     def resume(self) -> None:
@@ -92,7 +92,7 @@ class ManagedNode(LifecycleNode, Generic[C]):
             raise
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Check the parameters and take what they ask for."""
+        """Check the parameters and allocate what they require."""
         try:
             settings = declare(self, self._class, read_only=False)
             self.begin(settings)
@@ -135,7 +135,7 @@ class ManagedNode(LifecycleNode, Generic[C]):
         return self.on_cleanup(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """After an error that nobody foresaw, give all back; the node can be configured again."""
+        """After an unexpected error, release everything; the node can be configured again."""
         return self.on_shutdown(state)
 
     def destroy_node(self) -> None:

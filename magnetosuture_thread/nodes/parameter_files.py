@@ -36,7 +36,7 @@ _ARGUMENTS: WeakKeyDictionary[Context, list[str]] = WeakKeyDictionary()  # of ea
 
 @dataclass
 class RosArguments:
-    """What a command line says to ROS of parameters and names.
+    """The ROS arguments of a command line: parameters and names.
 
     Attributes:
         parameters: parameter files, and `-p` rules as (node, name, value), in their order.

@@ -60,7 +60,7 @@ def environment_of(environment: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def reserved_domain() -> Iterator[int]:
-    """Give a ROS domain that nobody on this machine uses.
+    """Yield a ROS domain that is unused on this machine.
 
     A bag that is replayed must never reach a robot's coils, so it gets a domain of its own: one whose discovery ports
     nobody has bound, and that no other call, in any process, holds at the time. All its ports are looked at: Fast DDS
@@ -85,7 +85,7 @@ def reserved_domain() -> Iterator[int]:
 
 
 def is_empty(domain: int) -> bool:
-    """Return whether nobody on this machine has a discovery port of a ROS domain."""
+    """Return whether no process on this machine uses a discovery port of a ROS domain."""
     return all(_is_free(7400 + 250 * domain + 10 + 2 * k) for k in range(_PARTICIPANTS))
 
 
@@ -135,7 +135,7 @@ class NodeProcesses:
         self.end()
 
     def check(self) -> None:
-        """Raise `GraphError`, with its last words, if a node has ended."""
+        """Raise `GraphError`, with its last line of output, if a node has ended."""
         for name, process in self._processes.items():
             if process.poll() is not None:
                 lines = (self._logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
@@ -168,7 +168,7 @@ class NodeProcesses:
         return raise_priority(priority, self._processes[name].pid)
 
     def kill(self, name: str) -> None:
-        """End a node without a word to it, as a crash would."""
+        """Kill a node, as a crash would."""
         process = self._processes.pop(name)
         process.kill()
         process.wait()

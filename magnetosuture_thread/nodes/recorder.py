@@ -1,4 +1,4 @@
-"""Takes what is said in a running graph."""
+"""Records messages of a running graph."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PERIOD = 0.005  # s between two looks at all topics
 
 
 class Recorder:
-    """A node that takes every message of some topics as it is.
+    """A node that records the serialised messages of some topics.
 
     It looks at its subscriptions itself, without an executor: with nearly a thousand messages a second
     rclpy's waiting for each would cost as much as the graph that is recorded. When a message arrived is
@@ -65,11 +65,11 @@ class Recorder:
         self._context.try_shutdown()
 
     def silent(self) -> list[str]:
-        """Return the topics that nobody publishes yet."""
+        """Return the topics without a publisher."""
         return [t.name for t, subscription in self._subscriptions if not subscription.get_publisher_count()]
 
     def spin(self, duration: float) -> None:
-        """Take messages for a while [s]."""
+        """Receive messages for a time [s]."""
         end = time.monotonic() + duration
         while time.monotonic() < end:
             for topic, subscription in self._subscriptions:

@@ -76,7 +76,7 @@ ORDINARY = "ordinary"
 
 
 def raise_priority(priority: int, process: int | None = None) -> str:
-    """Give all threads of a process a real-time priority, and say what came of it.
+    """Give all threads of a process a real-time priority, and return the result as text.
 
     Under the ordinary scheduling a process that wakes up waits for others that are busy, here by up to some
     milliseconds. Threads that begin later inherit the priority.

@@ -65,7 +65,7 @@ class SceneFollower:
         return self.scene
 
     def on_scene(self, data: bytes) -> None:
-        """Take a scene that was published."""
+        """Handle a published scene."""
         try:
             scene = received_scene(data)
             if scene.version == self.version:

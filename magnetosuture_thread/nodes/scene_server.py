@@ -20,7 +20,7 @@ from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
 
 
 class SceneServerNode(Node):
-    """Publishes a scene whenever it changes; a change that is refused changes nothing, and its caller is told why."""
+    """Publishes the scene whenever it changes; an invalid change is refused with its reason and changes nothing."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(SCENE_SERVER, automatically_declare_parameters_from_overrides=True, **options)

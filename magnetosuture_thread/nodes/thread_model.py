@@ -50,7 +50,7 @@ class ThreadSettings:
         topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
 
     def on_material(self, data: bytes) -> None:
-        """Take what is newly known of the thread and the liquid, or say why that cannot be."""
+        """Apply a ThreadMaterial message, or report why it is refused."""
         try:
             if len(data) > MAX_MESSAGE_BYTES:
                 raise InvalidInputError(
@@ -103,23 +103,23 @@ class ThreadModelNode(Node):
         )
 
     def listen(self) -> None:
-        """Take poses and seen threads from their topics."""
+        """Subscribe to needle poses and measured threads."""
         topics.MEASURED_THREAD.subscribe(self, self.on_measured_thread_message, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
 
     def on_scene(self, scene: Scene) -> None:
-        """Go on in another scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
+        """Change the scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
         self._session.change(self._session.settings, scene)
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Step the thread to a needle pose; where that cannot be done, say so.
+        """Step the thread to a needle pose, or report why that is impossible.
 
         No margin is published that is not proven.
         """
         self._step(message.header.stamp, lambda: reading.needle_pose(message))
 
     def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
-        """Take a pose that a tracker hands over, with the same result as that of its message."""
+        """Handle a pose handed over by a tracker in the same process, as its message would be."""
         self._step(stamp, lambda: reading.tracked_pose(stamp, tail, heading))
 
     def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
@@ -148,7 +148,7 @@ class ThreadModelNode(Node):
         self._start(stamp, centreline)
 
     def on_measured_thread(self, stamp: Time, centreline: np.ndarray) -> None:
-        """Take a seen thread that a tracker hands over."""
+        """Handle a measured thread handed over by a tracker in the same process."""
         self._start(reading.nanoseconds(stamp), centreline)
 
     def _start(self, stamp: int, centreline: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""The vision tracker node: camera frames in, needle pose and seen thread out."""
+"""The node `vision_tracker`: camera frames in, needle pose and measured thread out."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ SILENCE = 0.5  # s without a frame, after which the tracker says that it sees no
 
 
 class Follower(Protocol):
-    """Who gets poses and seen threads directly, being in the same process."""
+    """Receiver of poses and measured threads in the same process."""
 
     def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
-        """Take what is published on the topic of needle poses."""
+        """Receive what is published as needle pose."""
 
     def on_measured_thread(self, stamp: Time, centreline: np.ndarray) -> None:
-        """Take what is published on the topic of seen threads."""
+        """Receive what is published as measured thread."""
 
 
 class VisionTrackerNode(Node):
@@ -80,22 +80,22 @@ class VisionTrackerNode(Node):
             self._session.set_scene(scene)
 
     def hand_to(self, follower: Follower) -> None:
-        """Hand every pose and seen thread to a follower as well, right after it is published."""
+        """Hand every pose and measured thread to a follower in the same process, right after it is published."""
         self._followers.append(follower)
 
     def on_compressed(self, message: CompressedImage) -> None:
-        """Take a JPEG or PNG frame."""
+        """Track the needle in a JPEG or PNG frame."""
         self._take(message, lambda: decode_image(message.data))
 
     def on_image(self, message: Image) -> None:
-        """Take a raw frame."""
+        """Track the needle in a raw frame."""
         self._take(
             message,
             lambda: unpack_image(message.data, message.height, message.width, message.step, message.encoding),
         )
 
     def on_watch(self) -> None:
-        """Say so when no frame has come for too long."""
+        """Report when no frame has come for too long."""
         waited = self._arrival() - self._last_frame
         if self._session is not None and self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"

@@ -1,4 +1,4 @@
-"""What a bag says of scene and thread while it runs, as `thread_model` takes it."""
+"""Changes of scene and thread that a bag records, applied as `thread_model` applies them."""
 
 from __future__ import annotations
 

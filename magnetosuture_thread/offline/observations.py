@@ -1,4 +1,4 @@
-"""What each camera frame, or each recorded pose, of a bag says, with the thread that was seen and the true one."""
+"""Observations of a bag: each camera frame or recorded pose, with the measured thread and the ground truth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _NOTHING = np.empty((0, 2))
 
 
 class ObservationReader(Iterator[Observation]):
-    """Goes through a bag; see `sights`. A few sights are held at a time, however long the bag is.
+    """Iterates over a bag's observations; see `read_observations`. Only a few are in memory at a time.
 
     Attributes:
         source: `camera` or `poses`.
@@ -102,7 +102,7 @@ class ObservationReader(Iterator[Observation]):
         return next(self._going)
 
     def changes(self) -> list[RecordedMessage]:
-        """Return, once, what the bag says of scene and thread before the sight that was given last."""
+        """Return, once, the changes of scene and thread before the last observation."""
         changes, self._changes = self._changes, []
         for record in changes:
             if record.topic == SCENE.recorded:
@@ -110,7 +110,7 @@ class ObservationReader(Iterator[Observation]):
         return changes
 
     def thread_problem(self) -> str:
-        """Return in words that most of the seen threads are not of this setup; else empty."""
+        """Return a text if most of the measured threads are not of this setup; else empty."""
         if 2 * self._odd <= self._measured:
             return ""
         return (

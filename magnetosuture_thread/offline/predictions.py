@@ -36,7 +36,7 @@ def read_observations(
     duration: float | None = None,
     progress: Progress = lambda share: None,
 ) -> ObservationReader:
-    """Return what each camera frame, or each recorded pose, of a bag says, in their order.
+    """Return the observations of a bag: one for each camera frame, or recorded pose, in order.
 
     Args:
         recording: the bag.
@@ -74,7 +74,7 @@ def chosen_source(recording: Recording, source: str) -> str:
 
 @dataclass(frozen=True)
 class Step:
-    """What came of one sight with a needle.
+    """The prediction for one observation with a needle.
 
     Attributes:
         sight: the sight.

@@ -63,7 +63,7 @@ def thread_behavior(
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> list[BehaviorRun]:
-    """Run each scenario in a closed loop and put prediction, what was seen, and truth side by side.
+    """Run each setup in closed loop and compare prediction, measurement and ground truth.
 
     `output` is made at the end, whole or not at all: a bag for each scenario, `behaviour.json` and
     `behaviour.png`.

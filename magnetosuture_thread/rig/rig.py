@@ -73,7 +73,7 @@ class Rig:
         self._applied_at = 0.0
 
     def warm_up(self) -> None:
-        """Compile what a frame takes, on a needle and thread that are thrown away.
+        """Compile what a frame needs, on a temporary needle and thread.
 
         OpenCV gets one core for itself: the others belong to the nodes that are looked at.
         """
@@ -151,7 +151,7 @@ class Rig:
 
     @property
     def status(self) -> str:
-        """What the rig does, in words for the operator."""
+        """The rig's status as text for the operator."""
         faults = ", ".join(sorted(self.faults.kinds(self.running)))
         text = "running" if self.running >= 0.0 else "waiting for the first current"
         return f"{text}, with {faults}" if faults else text

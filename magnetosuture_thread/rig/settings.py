@@ -214,7 +214,7 @@ class RigSettings(Configuration):
         return StageProcess(self.power_stage_ports, self.supply_voltage, self.coil_resistance, self.coil_inductance)
 
     def surface(self, scene: Scene) -> Surface:
-        """Return what needle and thread can touch; the hole of a shape is seen but not felt."""
+        """Return the surfaces that needle and thread can touch; the hole of a shape is drawn but has no contact."""
         return Surface(
             discs=tuple(o for o in scene.obstacles if isinstance(o, Disc)),
             polygons=tuple(o.rings[0] for o in scene.obstacles if isinstance(o, Polygon)),

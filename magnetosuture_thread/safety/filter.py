@@ -1,4 +1,4 @@
-"""The needle's safety filter: the last thing that changes a velocity, whoever commanded it."""
+"""The needle's safety filter, the last stage of every velocity command."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Calibration:
 
 
 def calibrate_by_dish(images: Sequence[np.ndarray], dish_diameter: float) -> Calibration:
-    """Find the dish's circle in several frames and take the mean; the rotation is 0.
+    """Return the mean of the dish's circle over several frames; the rotation is 0.
 
     Args:
         images: of one size, BGR or grey, uint8.

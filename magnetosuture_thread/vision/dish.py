@@ -67,7 +67,7 @@ def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
 
 
 def find_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> DishView | None:
-    """Return the view: what of it is given, and the rest by the dish; None if no dish is seen."""
+    """Return the view, its unknown parts from the dish in the image; None if no dish is found."""
     fixed = settings.fixed_view()
     if fixed is not None:
         return fixed

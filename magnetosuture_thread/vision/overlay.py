@@ -20,7 +20,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: str = "") -> np.ndarray:
-    """Draw dish, thread and needle over a frame, and the state in words.
+    """Draw dish, thread and needle over a frame, and the state as text.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.

@@ -285,7 +285,7 @@ class FrameMeasurement:
 
     @property
     def tracked(self) -> bool:
-        """Whether there is a pose to tell."""
+        """Whether there is a pose."""
         return self.track.state is State.TRACKED
 
 
@@ -310,7 +310,7 @@ class TrackerSession:
 
     @property
     def missing(self) -> State:
-        """What to say of a frame that shows nothing: lost, or searching if there never was a needle."""
+        """State of a frame without a needle: lost, or searching if there never was one."""
         return State.LOST if self.tracked else State.SEARCHING
 
     def set_scene(self, scene: Scene) -> None:
@@ -333,7 +333,7 @@ class TrackerSession:
         return FrameMeasurement(track, centreline)
 
     def on_broken(self, problem: InvalidInputError) -> FrameMeasurement:
-        """Count a frame that cannot be looked at, and say why."""
+        """Count a frame that cannot be decoded, and report why."""
         self.frames += 1
         return FrameMeasurement(no_pose(self.missing, str(problem), None), np.empty((0, 2)), problem)
 
@@ -349,7 +349,7 @@ def _length(points: np.ndarray) -> float:
 
 
 def warm_up() -> bool:
-    """Look at a drawn dish, needle and thread; the first look takes seconds where nothing is compiled yet.
+    """Track a drawn frame once; the first frame takes seconds where nothing is compiled yet.
 
     From now on OpenCV stays on one thread in this process: at these sizes it costs more to wake others.
 

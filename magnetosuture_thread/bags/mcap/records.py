@@ -54,7 +54,7 @@ _lz4 = import_module("lz4.frame")  # which has no types
 
 
 class CorruptRecordError(Exception):
-    """Bytes that are no valid record; the text says what is wrong."""
+    """Bytes that are no valid record; the text gives the reason."""
 
 
 def is_opcode(opcode: int) -> bool:

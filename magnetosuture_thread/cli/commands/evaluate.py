@@ -225,7 +225,7 @@ def track_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def track_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a summary in words."""
+    """Return a summary as text."""
     import numpy as np
 
     if not rows:

@@ -22,7 +22,7 @@ AGAINST = {"truth": "the truth", "seen": "the seen centreline"}
 
 @dataclass(frozen=True)
 class LiveFigures:
-    """What a recording of the running graph says of it.
+    """Figures of the running graph, from its recording.
 
     Attributes:
         latency: of each stage, from stamp to the time of recording [s]; without one that is not in the bag.
@@ -234,7 +234,7 @@ def _holds(about: BagDetails, least: MinimumMargin) -> bool:
 
 
 def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
-    """Return in words whether a barrier held."""
+    """Return as text whether a barrier held."""
     if not _holds(about, margin):
         return "broken"
     return "holds" if margin.clearance >= -1e-9 else "holds within the tolerance"

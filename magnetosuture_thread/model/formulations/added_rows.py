@@ -78,7 +78,7 @@ class AddedBarriers:
         return [barrier.rows(positions) for barrier in self._barriers]
 
     def set_time(self, time: float) -> None:
-        """Take the time at which the rows are asked for next [s]."""
+        """Set the time of the next evaluation [s]."""
         for barrier in self._barriers:
             barrier.set_time(time)
 

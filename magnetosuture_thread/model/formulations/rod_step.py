@@ -322,7 +322,7 @@ def solve_step(
 def accept_step(
     buffers: StepBuffers, motion: MotionBuffers, velocities: Points, multipliers: Vector, interval: float
 ) -> None:
-    """Take a solution: its velocities, where they lead, and its multipliers as a guess for the next one."""
+    """Accept a solution: velocities, end positions, and multipliers as the guess for the next step."""
     keep_multipliers(buffers, multipliers, len(velocities) - 1)
     motion.velocities[:] = velocities
     motion.about[:] = motion.start + interval * velocities  # known nodes have moved, and have no velocity

@@ -54,7 +54,7 @@ class ThreadState:
         return cls(positions, np.zeros_like(positions))
 
     def resampled(self, before: Thread, thread: Thread) -> ThreadState:
-        """Return the state of a thread that takes another's place: it lies where that lay and moves as that moved.
+        """Resample the state for another thread: same curve, same velocities along it.
 
         A longer one goes on straight at its end. Where segments and length are the same, nothing changes.
 

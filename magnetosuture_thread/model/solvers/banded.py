@@ -219,7 +219,7 @@ def multiplier_of(program: ChainProgram, r: int, image: float, weight: float, ce
 def forces(
     axes: Axes, program: ChainProgram, smooth: Vector, multipliers: Vector, force: Vector
 ) -> tuple[float, float]:
-    """Write F; return the largest force out of balance on a node that is free, and the largest of all pushes."""
+    """Write F; return the largest residual force on a free node, and the largest constraint force."""
     d, width = len(axes), SPAN * len(axes)
     for j in range(len(smooth)):
         force[j] = smooth[j]
@@ -383,6 +383,6 @@ def solve_and_check(
     multipliers: Vector,
     buffers: SolverBuffers,
 ) -> tuple[int, int, tuple[float, float, float]]:
-    """Solve, and judge by code that knows nothing of how it was solved; once into compiled code is cheaper."""
+    """Solve, and compute the residuals by independent code; one call into compiled code is cheaper than two."""
     status, taken = solve(axes, program, u, multipliers, buffers)
     return status, taken, compiled_residuals(program, u, multipliers)

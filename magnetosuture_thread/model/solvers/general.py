@@ -47,7 +47,7 @@ class _GeneralSolver(ABC):
 
     @abstractmethod
     def unpack(self, general: QuadraticProgram, found: Any) -> tuple[Vector | None, Vector, str, int]:
-        """Return the variables, None without any, the multipliers, the solver's own word and its iterations."""
+        """Return the variables, None without any, the multipliers, the solver's status and its iterations."""
 
     def read(
         self, program: ChainProgram, general: QuadraticProgram, found: Any, wide: WideRows | None = None

@@ -1,4 +1,4 @@
-"""The graph's messages as what the operator's page is told: pure functions, plain types."""
+"""Converts ROS messages to the operator page's state: pure functions, plain types."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
 
 
 def tracker(message: TrackerState) -> dict[str, Any]:
-    """Return what the tracker says, and where the dish is in the image if it knows."""
+    """Return the tracker's state, and the dish's place in the image if known."""
     view = None
     if len(message.dish_centre) == 2 and message.metres_per_pixel > 0.0:
         view = {
@@ -74,7 +74,7 @@ def tracker(message: TrackerState) -> dict[str, Any]:
 
 
 def measured_thread(message: Path) -> list[list[float]]:
-    """Return the vertices of the seen centreline [m]."""
+    """Return the vertices of the measured centreline [m]."""
     places = (placed.pose.position for placed in message.poses)
     return [[place.x, place.y] for place in places]
 
@@ -176,7 +176,7 @@ def bridge(message: CoilBridgeState) -> dict[str, Any]:
 
 
 def node_state(status: DiagnosticStatus) -> dict[str, Any]:
-    """Return what a node says of itself."""
+    """Return a node's diagnostic status."""
     return {
         "level": LEVELS.get(status.level, "error"),
         "message": status.message,

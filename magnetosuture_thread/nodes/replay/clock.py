@@ -32,7 +32,7 @@ class Timeline:
         return self._paused is not None
 
     def pause(self, still: bool) -> None:
-        """Let it stand still, or go on from where it stood."""
+        """Pause the time, or resume it."""
         now = time.perf_counter()
         if still and self._paused is None:
             self._paused = now

@@ -62,7 +62,7 @@ class Losses:
             self._answered.add(stamp)
 
     def count_diagnostics(self, data: bytes) -> None:
-        """Take what a node says of itself on /diagnostics."""
+        """Count a node's status on /diagnostics."""
         for status in deserialize_message(data, DiagnosticArray).status:
             values = {value.key: value.value for value in status.values}
             node = status.name.split(":")[0]

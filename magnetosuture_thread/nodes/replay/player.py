@@ -1,4 +1,4 @@
-"""Plays recorded messages into the running graph and takes what comes out."""
+"""Plays recorded messages into the running graph and records its outputs."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class RigTime:
         return self._epoch + round((elapsed + (0.0 if self._simulated else self._stood)) * 1e9)
 
     def pause(self, still: bool) -> None:
-        """Let it stand still, or go on from where it stood."""
+        """Pause the time, or resume it."""
         self._timeline.pause(still)
         if not still:
             self._stood = time.perf_counter() - self._began - self._timeline.running()
@@ -95,7 +95,7 @@ class FramePublisher:
         self._camera = MESSAGES.camera_info(Time().to_msg(), camera.size, camera.view, self._distance)
 
     def publish(self, nanoseconds: int, frame: RigFrame) -> None:
-        """Publish a frame with its stamp [ns]; one that got lost has its truth all the same."""
+        """Publish a frame with its stamp [ns]; the ground truth is published also for a lost frame."""
         stamp = Time(nanoseconds=nanoseconds).to_msg()
         if frame.image is not None:
             data = encode_jpeg(frame.image, self._quality)
@@ -139,11 +139,11 @@ class RigCurrents:
             node.create_timer(PERIOD, lambda: apply(stage.currents()), clock=clock)
 
     def on_currents(self, message: CoilCurrents) -> None:
-        """Take currents that came as a message."""
+        """Apply currents from a message."""
         self._apply(np.asarray(message.current, dtype=float))
 
     def close(self) -> None:
-        """Take the boards' lines away."""
+        """Remove the boards' serial lines."""
         if self.stage is not None:
             self.stage.close()
 

@@ -73,18 +73,18 @@ class RigSimulatorNode(Node):
         self._publisher.take(self.rig.camera)
 
     def on_fault(self, message: String) -> None:
-        """Take a fault that begins now."""
+        """Apply a fault that begins now."""
         try:
             self.rig.faults.add(Fault.parse_request(message.data, max(0.0, self.rig.running)))
         except InvalidInputError as error:
             self._health.refuse(error)
 
     def on_clock(self) -> None:
-        """Say what time it is in the simulation."""
+        """Publish the simulated time."""
         self._clocks.publish(ClockMessage(clock=Time(nanoseconds=self.time.stamp(self.time.elapsed())).to_msg()))
 
     def on_frame(self) -> None:
-        """Take the frame that is due; one that nobody had time for is left out."""
+        """Capture the frame that is due; a missed one is left out."""
         if self.time.paused:
             self._health.ok("paused")
             return
@@ -103,7 +103,7 @@ class RigSimulatorNode(Node):
             self._publisher.publish(stamp, frame)
 
     def destroy_node(self) -> None:
-        """Take away the lines of simulated boards."""
+        """Remove the serial lines of simulated boards."""
         try:
             self.currents.close()
         finally:

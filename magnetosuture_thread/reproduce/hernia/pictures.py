@@ -147,7 +147,7 @@ def draw_hernia_dish(axes: Axes, scene: Scene) -> None:
 
 
 def draw_thread(axes: Axes, instant: SteeredInstant) -> None:
-    """Draw the thread in the colour of its friction, and the needle as a point with what is asked of it."""
+    """Draw the thread in the colour of its friction, and the needle as a point with its commanded velocity."""
     points, friction = 1e3 * instant.prediction.positions, instant.margins.friction
     colour = friction_colour(friction)
     axes.plot(points[:, 0], points[:, 1], color="white", linewidth=4.0, solid_capstyle="round", alpha=0.8)
@@ -167,7 +167,7 @@ def draw_thread(axes: Axes, instant: SteeredInstant) -> None:
 
 
 def caption(instant: SteeredInstant) -> str:
-    """Return the state of friction at an instant in words."""
+    """Return the friction state at an instant as text."""
     friction = instant.margins.friction
     count = f"{len(friction.nodes)} node{'s' if len(friction.nodes) != 1 else ''}"
     return {

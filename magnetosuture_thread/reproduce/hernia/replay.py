@@ -80,7 +80,7 @@ def replay_hernia(
 
 
 def read_steering(bag: Bag) -> RecordedCommands:
-    """Return what an operator asked for in a bag, by the stamps.
+    """Return the operator's velocity commands recorded in a bag.
 
     Raises:
         BagError: it holds none, or one that cannot be used.

@@ -132,7 +132,7 @@ class RecordedCommands:
         return float(self.times[-1]) if len(self.times) else 0.0
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """Return what is asked for at a time [s], shape (2,) [m/s]; zero where no command holds."""
+        """Return the velocity commanded at a time [s], shape (2,) [m/s]; zero where no command is valid."""
         index = int(np.searchsorted(self.times, time + 1e-9, side="right")) - 1
         if index < 0 or time - self.times[index] > COMMAND_TIMEOUT + 1e-9:
             return np.zeros(2)

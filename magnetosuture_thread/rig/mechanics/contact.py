@@ -207,7 +207,7 @@ def _find_clearances(shapes: Shapes) -> None:
 
 @compiled
 def clear(x: float, y: float, reach: float, grid: Array, clearances: Array) -> bool:
-    """Return whether nothing is within reach, as far as the grid tells; from beyond the grid all is as far or farther.
+    """Return whether nothing is within reach, by the grid's clearance; beyond the grid it is a lower bound.
 
     All but the wall, that is, which is in the cells at the border already.
     """

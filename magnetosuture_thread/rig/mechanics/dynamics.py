@@ -171,7 +171,7 @@ class RigDynamics:
         self._integrate(span, amperes, None)
 
     def drive(self, tail: ArrayLike, heading: float, dt: float) -> None:
-        """Move the needle as told, at constant speed and turn, and the thread with it.
+        """Move the needle at constant velocity and turn rate, and the thread with it.
 
         Args:
             tail: where the tail is after dt, (x, y) [m].

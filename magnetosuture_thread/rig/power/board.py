@@ -64,7 +64,7 @@ class RoboClawBoard:
         self.power_cycle()
 
     def receive(self, data: bytes, time: float) -> bytes:
-        """Take bytes from the line and return the answers to them."""
+        """Receive bytes from the line and return the answers."""
         self.advance(time)
         answers = b""
         for packet in self._parser.feed(data, time):

@@ -99,7 +99,7 @@ class Line:
         self._thread.start()
 
     def unplug(self) -> None:
-        """Take the line away; its boards stay as they are. Harmless if it is not there."""
+        """Remove the line; its boards keep their state. No effect if there is none."""
         if self._thread is None:
             return
         self._ends.set()

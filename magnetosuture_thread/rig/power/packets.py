@@ -70,7 +70,7 @@ class Parser:
         self._heard = 0.0
 
     def feed(self, data: bytes, time: float) -> list[bytes]:
-        """Take bytes that came at a time [s] and return the packets that they complete, checksums not yet checked."""
+        """Receive bytes at a time [s] and return the packets that they complete, checksums not yet verified."""
         if time - self._heard > PACKET_GAP:
             self._bytes = b""
         self._heard = time

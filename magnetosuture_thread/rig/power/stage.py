@@ -67,7 +67,7 @@ class PowerStage:
             raise
 
     def close(self) -> None:
-        """Take the lines away."""
+        """Remove the lines."""
         for line in self.lines:
             line.unplug()
 
@@ -120,7 +120,7 @@ class StageProcess:
             raise ConfigurationError(*problem)
 
     def close(self) -> None:
-        """Take the boards away; harmless if there are none."""
+        """Remove the boards; no effect if there are none."""
         if self._process is None:
             return
         process, self._process = self._process, None

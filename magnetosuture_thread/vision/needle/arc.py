@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Arc:
-    """An arc that goes on from a point.
+    """A circular arc from a point.
 
     Attributes:
         start: point of length 0, shape (2,) [px].

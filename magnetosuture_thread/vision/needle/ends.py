@@ -78,7 +78,7 @@ def find_tail(strip: Strip, body: float) -> tuple[float, float] | None:
 
 
 def find_tip(strip: Strip, last: float, body: float) -> float:
-    """Return where the tip is along the strip: where the steel gets too thin to be seen."""
+    """Return the tip's position along the strip: where the steel gets too thin to detect."""
     start = int(np.searchsorted(strip.along, (1.0 - TAPER) * last))
     core = np.abs(strip.aside) < 0.3 * body + 1.0
     width = strip.steel[start:, core].sum(axis=1) * STEP_ASIDE_PX

@@ -254,7 +254,7 @@ def measure_shown_length(path, count):
 
 @compiled
 def follow_ridge(ridge, start, dish, max_length):
-    """Walk along the ridge from the tail to its end; where much less of the thread is seen than there is, try forks.
+    """Walk along the ridge from the tail to its end; try forks where much of the thread is missing.
 
     Args:
         ridge: to walk along.
