@@ -78,7 +78,7 @@ def test_the_scene_of_the_parameter_is_latched(graph):
 
 def test_shapes_are_added_replaced_and_removed_and_scenes_loaded(graph, tmp_path: Path):
     server = Server(graph, scene="dish_35mm_post")
-    graph.wait(lambda: bool(server.scenes), "the scene")
+    graph.wait(lambda: bool(server.scenes and server.markers), "the scene")
     shape, wider = ({"disc": {"center": [0.001, 0.002], "radius": r}, "kind": "instrument"} for r in (0.001, 0.002))
     added = POST.add(shape_from_mapping("pin", shape))
     assert server.change("add", name="pin", shape=DISC) == added
