@@ -31,7 +31,7 @@ from magnetosuture_thread.messages.packing import packed_margins, packed_path, p
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationReader
 from magnetosuture_thread.offline.predictions import Step, predictions, read_observations
-from magnetosuture_thread.vision.tracker import FrameMeasurement
+from magnetosuture_thread.vision.session import FrameMeasurement
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -22,11 +22,12 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA
-from magnetosuture_thread.vision.frame import State, Track, no_pose
 from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker, warm_up
+from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.warm_up import warm_up
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own

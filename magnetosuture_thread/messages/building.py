@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.coils.bridge import BridgeOutput
     from magnetosuture_thread.coils.coil_system import CoilSystem
     from magnetosuture_thread.coils.drivers import DriverState
-    from magnetosuture_thread.vision.frame import Track
+    from magnetosuture_thread.vision.look import Track
 
 Make = Callable[..., Any]
 Vector = NDArray[np.float64]

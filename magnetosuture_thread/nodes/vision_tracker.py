@@ -24,10 +24,11 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
-from magnetosuture_thread.vision.frame import State, no_pose
 from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.look import State, no_pose
+from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import TrackerSession, warm_up
+from magnetosuture_thread.vision.warm_up import warm_up
 
 NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing

@@ -22,12 +22,11 @@ DIM_GAIN, BRIGHT_GAIN = 0.3, 1.9
 DROPPED_SHARE = 0.5  # of the frames
 LATENESS = 0.12  # s; of a late frame
 LIFT_TIME = 0.6  # s in which the needle is carried over the rim
-COVERS = {  # width as a share of the dish's diameter, colour (blue, green, red), blur [px]
-    HAND: (0.28, (120.0, 145.0, 195.0), 3.0),
-    TOOL: (0.07, (115.0, 112.0, 108.0), 1.5),
-    GLARE: (0.0, (265.0, 265.0, 265.0), 4.0),
-}
+SKIN_BGR = (120.0, 145.0, 195.0)
+STEEL_BGR = (115.0, 112.0, 108.0)
+GLARE_BGR = (265.0, 265.0, 265.0)
 MAX_FAULTS = 100
+HAND_WIDTH, TOOL_WIDTH = 0.28, 0.07  # of the dish's diameter
 GLARE_SIZE = (0.3, 0.55)  # least and greatest radius, of the needle's length
 
 
@@ -47,7 +46,7 @@ class Fault:
 
     @classmethod
     def parse(cls, text: str) -> Fault:
-        """Parse `KIND START DURATION`, in seconds.
+        """Read `KIND START DURATION`, in seconds.
 
         >>> Fault.parse("glare 2 0.5")
         Fault(kind='glare', start=2.0, duration=0.5)
@@ -66,10 +65,10 @@ class Fault:
         return cls(words[0], start, duration)
 
     @classmethod
-    def parse_request(cls, text: str, time: float) -> Fault:
-        """Parse `KIND DURATION` as a fault that begins at a time [s].
+    def requested_faults(cls, text: str, time: float) -> Fault:
+        """Read `KIND DURATION` as a fault that begins at a time [s].
 
-        >>> Fault.parse_request("glare 0.5", 7.0)
+        >>> Fault.asked_for("glare 0.5", 7.0)
         Fault(kind='glare', start=7.0, duration=0.5)
 
         Raises:
@@ -104,11 +103,11 @@ class FaultSchedule:
         self._seed = seed
 
     def set_dish(self, diameter: float) -> None:
-        """Replace the dish by one of this inner diameter [m]."""
+        """Take another dish, of this inner diameter [m]."""
         self._dish = diameter
 
     def add(self, fault: Fault) -> None:
-        """Add a fault, and forget those that are over."""
+        """Take one more fault, and forget those that are over."""
         self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-MAX_FAULTS:]
 
     def kinds(self, time: float) -> frozenset[str]:
@@ -151,19 +150,21 @@ class FaultSchedule:
         """
         result = []
         for fault in self.faults:
-            if not fault.holds(time) or fault.kind not in COVERS:
+            if not fault.holds(time) or fault.kind not in (GLARE, HAND, TOOL):
                 continue
             random = self._random(fault)
             place = tail + random.uniform(0.0, 1.0) * (tip - tail)
             angle = random.uniform(0.0, 2.0 * np.pi)
             sway = 0.03 * self._dish * np.sin(5.0 * (time - fault.start) + angle)
-            width, bgr, blur_px = COVERS[fault.kind]
             if fault.kind == GLARE:
                 radius = self._needle * random.uniform(*GLARE_SIZE)
                 outline = _ellipse(place, radius, random.uniform(0.5, 1.0) * radius, angle)
+                result.append(Cover(outline, GLARE_BGR, blur_px=4.0))
             else:
-                outline = _finger(place, angle, width * self._dish, sway, 3.0 * self._dish)
-            result.append(Cover(outline, bgr, blur_px))
+                width = (HAND_WIDTH if fault.kind == HAND else TOOL_WIDTH) * self._dish
+                bgr = SKIN_BGR if fault.kind == HAND else STEEL_BGR
+                outline = _finger(place, angle, width, sway, 3.0 * self._dish)
+                result.append(Cover(outline, bgr, blur_px=3.0 if fault.kind == HAND else 1.5))
         return tuple(result)
 
     def _random(self, fault: Fault) -> np.random.Generator:

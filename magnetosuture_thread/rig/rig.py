@@ -20,7 +20,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RigFrame:
-    """One frame and the ground truth of its moment.
+    """One frame and the truth of its moment.
 
     Attributes:
         time: since the start [s].
@@ -118,7 +118,10 @@ class Rig:
         currents = np.clip(currents, -limit, limit)
         if np.any(currents):
             self.began = min(self.began, self.time)
-        self._switch(currents)
+        stuck = self.currents[0]
+        self.currents = currents.copy()
+        if COIL_STUCK in self.faults.kinds(self.running):
+            self.currents[0] = stuck
         self._applied_at = time
 
     def advance(self, time: float) -> None:
@@ -131,13 +134,9 @@ class Rig:
 
     def switch_off(self) -> None:
         """Set all currents to zero, but that of a stuck coil."""
-        self._switch(np.zeros_like(self.currents))
-
-    def _switch(self, currents: Vector) -> None:
-        stuck = self.currents[0]
-        self.currents = currents.copy()
-        if COIL_STUCK in self.faults.kinds(self.running):
-            self.currents[0] = stuck
+        stuck = self.currents[0] if COIL_STUCK in self.faults.kinds(self.running) else 0.0
+        self.currents = np.zeros_like(self.currents)
+        self.currents[0] = stuck
 
     def _move(self, time: float) -> None:
         if time > self.time:
@@ -151,13 +150,13 @@ class Rig:
 
     @property
     def status(self) -> str:
-        """The rig's status as text for the operator."""
+        """What goes on, for a person."""
         faults = ", ".join(sorted(self.faults.kinds(self.running)))
         text = "running" if self.running >= 0.0 else "waiting for the first current"
         return f"{text}, with {faults}" if faults else text
 
-    def capture_frame(self, time: float) -> RigFrame:
-        """Advance to a time since the start, and return the frame that the camera takes then [s]."""
+    def look(self, time: float) -> RigFrame:
+        """Take a frame at a time since the start [s]."""
         self.advance(time)
         faults, dynamics, running = self.faults, self._dynamics, self.running
         away = faults.lifted(running)

@@ -22,8 +22,8 @@ from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
-from magnetosuture_thread.rig.power.stage import StageProcess
+from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
+from magnetosuture_thread.rig.power.process import StageProcess
 from magnetosuture_thread.scene import Scene, find_collision
 from magnetosuture_thread.shared_parameters import shared_parameter
 

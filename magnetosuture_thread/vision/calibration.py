@@ -12,7 +12,7 @@ import yaml
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.parameter_files import EVERY_NODE
-from magnetosuture_thread.vision.dish import find_dish
+from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 

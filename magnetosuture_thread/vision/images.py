@@ -1,4 +1,4 @@
-"""Images: from bytes to pixels, what of them is measured on, and the brightness between pixels."""
+"""Images: from bytes to pixels, and what of them is measured on."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
@@ -118,38 +117,3 @@ def check_image(image: np.ndarray) -> None:
 def measured_channel(image: np.ndarray) -> np.ndarray:
     """Return the channel to measure on: green, which a colour sensor samples twice as densely."""
     return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, 1])
-
-
-def middle(values: np.ndarray) -> float:
-    """Return the median of values of any shape, the upper one of two; numpy's own takes ten times as long."""
-    half = values.size // 2
-    return float(np.partition(values, half, axis=None)[half])
-
-
-@compiled
-def sample(image, u, v):
-    """Return an image at a point, bilinear; 0 outside."""
-    column, row = int(np.floor(u)), int(np.floor(v))
-    if column < 0 or row < 0 or column >= image.shape[1] - 1 or row >= image.shape[0] - 1:
-        return 0.0
-    x, y = u - column, v - row
-    upper = image[row, column] * (1.0 - x) + image[row, column + 1] * x
-    lower = image[row + 1, column] * (1.0 - x) + image[row + 1, column + 1] * x
-    return upper * (1.0 - y) + lower * y
-
-
-@compiled
-def sample_grid(image, points):
-    """Return an image at points (u, v), bilinear; outside, at the nearest point of its border, shape (n, m).
-
-    Args:
-        image: shape (rows, columns), uint8.
-        points: shape (n, m, 2) [px].
-    """
-    values = np.empty(points.shape[:2])
-    for i in range(points.shape[0]):
-        for j in range(points.shape[1]):
-            u = min(max(points[i, j, 0], 0.0), image.shape[1] - 1.001)
-            v = min(max(points[i, j, 1], 0.0), image.shape[0] - 1.001)
-            values[i, j] = sample(image, u, v)
-    return values

@@ -1,20 +1,24 @@
-"""Draws the measured dish, needle and thread over a frame."""
+"""Draws what was seen over the frame, for a person to judge."""
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from pathlib import Path
+from types import TracebackType
 
 import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
-from magnetosuture_thread.vision.frame import State, Track
+from magnetosuture_thread.scene.scene import Scene
+from magnetosuture_thread.vision.look import State, Track
+from magnetosuture_thread.vision.scene_mask import mask_outlines
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
 SHIFT = 4  # binary places of a coordinate
 NEEDLE, TIP, THREAD, DISH = (40, 140, 255), (40, 200, 255), (70, 190, 60), (200, 170, 60)
+SHAPE = (190, 90, 170)
 PLATES = {State.TRACKED: (70, 150, 50), State.LOST: (50, 50, 200), State.SEARCHING: (160, 120, 40)}
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -51,12 +55,20 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
     return drawn
 
 
+def draw_scene(image: np.ndarray, view: DishView, scene: Scene) -> None:
+    """Draw the dish's circle and the outlines of the shapes into a BGR image."""
+    _circle(image, np.asarray(view.centre_px), scene.dish.radius / view.metres_per_pixel, DISH, 1)
+    for geometry in scene.obstacles:
+        for ring in mask_outlines(geometry):
+            _line(image, view.to_pixels(np.vstack([ring, ring[:1]])), SHAPE, 1)
+
+
 def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: float) -> None:
     """Draw the dish's circle into a BGR image."""
     _circle(image, np.asarray(centre_px), radius_px, DISH, 1)
 
 
-class OverlayWriter(AbstractContextManager["OverlayWriter"]):
+class OverlayWriter:
     """Writes overlays as a video or as PNG files in a folder.
 
     Args:
@@ -102,7 +114,13 @@ class OverlayWriter(AbstractContextManager["OverlayWriter"]):
             image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
         self._video.write(image)
 
-    def __exit__(self, *error: object) -> None:
+    def __enter__(self) -> OverlayWriter:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """End the video."""
         if self._video is not None:
             self._video.release()

@@ -11,7 +11,7 @@ height, parallax, calibration):
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -58,18 +58,21 @@ class SceneMask:
 
     def part(self, left: int, top: int, right: int, bottom: int) -> SceneMask:
         """Return the mask of a part of the frame; left and top are multiples of `factor` and `cell` [px]."""
-
-        def cropped(image: np.ndarray, size: int) -> np.ndarray:
-            return image[top // size : -(-bottom // size), left // size : -(-right // size)]
-
-        first_cell = np.array([left // self.cell, top // self.cell], np.int16)
-        return replace(
-            self,
-            solid=cropped(self.solid, self.factor),
-            inside=cropped(self.inside, self.factor),
-            depth=cropped(self.depth, 1),
-            rim=self.rim - (left, top, 0.0),
-            floor_cells=cropped(self.floor_cells, self.cell) - first_cell,
+        full = (slice(top, bottom), slice(left, right))
+        small = (
+            slice(top // self.factor, -(-bottom // self.factor)),
+            slice(left // self.factor, -(-right // self.factor)),
+        )
+        cells = (slice(top // self.cell, -(-bottom // self.cell)), slice(left // self.cell, -(-right // self.cell)))
+        return SceneMask(
+            self.solid[small],
+            self.inside[small],
+            self.depth[full],
+            self.tolerance_px,
+            self.rim - (left, top, 0.0),
+            self.factor,
+            self.floor_cells[cells] - np.array([left // self.cell, top // self.cell], np.int16),
+            self.cell,
         )
 
     @property
@@ -126,7 +129,7 @@ class SceneMask:
         return self.depth[np.clip(at[:, 1], 0, rows - 1), np.clip(at[:, 0], 0, columns - 1)]
 
 
-def make_scene_mask(
+def scene_mask(
     scene: Scene, view: DishView, shape: tuple[int, ...], factor: int, tolerance: float, cell: int
 ) -> SceneMask | None:
     """Return the mask of a frame; None for a scene without shapes.

@@ -25,7 +25,7 @@ from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.track import FrameSource, settings_with, track
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.vision.frame import State
+from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"

@@ -28,7 +28,7 @@ from magnetosuture_thread.model.settings import parse_material
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES, serialised_velocity
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.vision.frame import State, no_pose
+from magnetosuture_thread.vision.look import State, no_pose
 
 STAMP = Time(sec=3, nanosec=500_000_000)
 TAIL, HEADING = np.array([1e-3, -2e-3]), np.array([-0.6, 0.8])

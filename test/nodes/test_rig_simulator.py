@@ -131,7 +131,7 @@ def test_where_the_simulation_fails_the_coils_go_off_and_it_is_said(graph, monke
     def fail(*_: object) -> None:
         raise SolverError("rig", "no convergence", 1.0, 1e-8)
 
-    monkeypatch.setattr(node.rig, "capture_frame", fail)
+    monkeypatch.setattr(node.rig, "look", fail)
     graph.wait(lambda: any("no convergence" in d.status[0].message for d in diagnostics), "the error")
     assert node.rig.currents.tolist() == [0.0] * 4
 

@@ -29,11 +29,11 @@ def rig(*geometries: Disc | Polygon, diameter: float = 0.035, **changes: Any) ->
 
 def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
     made = rig()
-    before = made.capture_frame(0.0)
+    before = made.look(0.0)
     made.apply(EASTWARDS, 0.1)
     for time in np.arange(0.2, 0.7, 0.1):
         made.apply(EASTWARDS, time)
-    after = made.capture_frame(0.7)
+    after = made.look(0.7)
     assert after.tail[0] > before.tail[0] + 1e-3
     assert abs(after.tail[1]) < 1e-5
     np.testing.assert_allclose(after.thread[0], after.tail)
@@ -46,7 +46,7 @@ def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
 
 def test_without_current_nothing_moves():
     made = rig()
-    before, after = made.capture_frame(0.0), made.capture_frame(2.0)
+    before, after = made.look(0.0), made.look(2.0)
     np.testing.assert_allclose(after.tail, before.tail, atol=1e-7)
 
 
@@ -54,10 +54,10 @@ def test_a_power_stage_that_hears_nothing_switches_off():
     made = rig(driver_timeout=0.2)
     made.apply(EASTWARDS, 0.0)
     made.advance(0.2)
-    there = made.capture_frame(0.2).tail
+    there = made.look(0.2).tail
     made.advance(0.21)
     assert made.currents.tolist() == [0.0] * 4
-    np.testing.assert_allclose(made.capture_frame(2.0).tail, there, atol=2e-5)
+    np.testing.assert_allclose(made.look(2.0).tail, there, atol=2e-5)
 
 
 def test_the_time_of_switching_off_does_not_depend_on_when_one_looks():
@@ -66,7 +66,7 @@ def test_the_time_of_switching_off_does_not_depend_on_when_one_looks():
         made.apply(EASTWARDS, 0.0)
     for time in np.arange(0.01, 1.0, 0.01):
         often.advance(float(time))
-    np.testing.assert_allclose(often.capture_frame(1.0).tail, once.capture_frame(1.0).tail, atol=1e-6)
+    np.testing.assert_allclose(often.look(1.0).tail, once.look(1.0).tail, atol=1e-6)
 
 
 def test_a_stuck_coil_keeps_its_current_whatever_it_is_told():
@@ -91,29 +91,29 @@ def test_the_power_stage_has_a_limit():
     made = rig(coil_max_current=5.0)
     made.apply(np.array([1e160, -80.0, 3.0, 0.0]), 0.0)
     assert made.currents.tolist() == [5.0, -5.0, 3.0, 0.0]
-    assert np.all(np.isfinite(made.capture_frame(0.05).tail))
+    assert np.all(np.isfinite(made.look(0.05).tail))
 
 
 def test_a_stopped_camera_gives_no_image_but_the_truth():
     made = rig(faults=("camera_stopped 0 1",))
     made.apply(EASTWARDS, 0.0)
-    frame = made.capture_frame(0.5)
+    frame = made.look(0.5)
     assert frame.image is None
     assert frame.tail.shape == (2,)
-    assert made.capture_frame(1.5).image is not None
+    assert made.look(1.5).image is not None
 
 
 def test_the_times_of_faults_count_from_the_first_current():
     made = rig(faults=("camera_stopped 1 1",))
-    assert made.capture_frame(1.5).image is not None
+    assert made.look(1.5).image is not None
     made.apply(EASTWARDS, 2.0)
-    assert [made.capture_frame(time).image is None for time in (2.5, 3.5, 4.5)] == [False, True, False]
+    assert [made.look(time).image is None for time in (2.5, 3.5, 4.5)] == [False, True, False]
 
 
 def test_a_lifted_needle_is_out_of_the_dish_in_picture_and_truth():
     made = rig(faults=("needle_out 0 4",))
     made.apply(1e-9 * EASTWARDS, 0.0)
-    frame = made.capture_frame(2.0)
+    frame = made.look(2.0)
     assert np.linalg.norm(frame.tail) > 0.03
     np.testing.assert_allclose(frame.thread[0], frame.tail)
 
@@ -145,8 +145,8 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"power_stage": "roboclaw", "power_stage_ports": ("/tmp/a",)}, "a path for two of the 4 coils"),
     ],
 )
-def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], words: str):
-    with pytest.raises(ConfigurationError, match=words):
+def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], status: str):
+    with pytest.raises(ConfigurationError, match=status):
         RigSettings(**changes)
 
 
@@ -162,9 +162,9 @@ def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], words: s
     ],
 )
 def test_a_start_or_looks_that_do_not_fit_the_scene_are_refused(
-    shapes: tuple[Disc | Polygon, ...], changes: dict[str, Any], words: str
+    shapes: tuple[Disc | Polygon, ...], changes: dict[str, Any], status: str
 ):
-    with pytest.raises(ConfigurationError, match=words):
+    with pytest.raises(ConfigurationError, match=status):
         rig(*shapes, **changes)
 
 
@@ -172,11 +172,11 @@ def test_obstacles_are_drawn_and_felt():
     made = rig(Disc((0.013, 0.0), 0.002), Polygon(((-0.01, 0.005), (0.0, 0.005), (-0.005, 0.01))))
     for time in np.arange(0.0, 3.0, 0.1):
         made.apply(EASTWARDS, float(time))
-    frame = made.capture_frame(3.0)
+    frame = made.look(3.0)
     tip = frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)])
     assert np.linalg.norm(tip - (0.013, 0.0)) > 0.002 - 1e-5
     assert frame.image is not None
-    plain = rig().capture_frame(0.0).image
+    plain = rig().look(0.0).image
     assert plain is not None
     inside = made.camera.view.to_pixels(np.array([-0.005, 0.007])).round().astype(int)
     assert frame.image[inside[1], inside[0], 0] < plain[inside[1], inside[0], 0] - 15
@@ -186,16 +186,16 @@ def push(made: Rig, begin: float, end: float) -> np.ndarray:
     """Push the needle east for a while; return its tip."""
     for time in np.arange(begin, end, 0.1):
         made.apply(EASTWARDS, float(time))
-    frame = made.capture_frame(end)
+    frame = made.look(end)
     return np.asarray(frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)]))
 
 
 def test_new_scene_changes_contact_camera_image_and_dish():
     made = rig()
-    plain = made.capture_frame(0.0).image
+    plain = made.look(0.0).image
     made.set_scene(scene(Disc((0.0135, 0.0), 0.001), diameter=0.04))
     assert push(made, 0.1, 3.0)[0] == pytest.approx(0.0125, abs=3e-4)  # 0.0175 m without the post
-    drawn = made.capture_frame(3.0).image
+    drawn = made.look(3.0).image
     assert plain is not None
     assert drawn is not None
     u, v = made.camera.view.to_pixels(np.array([0.0135, 0.0])).round().astype(int)
@@ -209,13 +209,13 @@ def test_new_scene_changes_contact_camera_image_and_dish():
 def test_a_scene_in_which_needle_or_thread_would_be_in_something_is_refused_and_nothing_changes():
     made = rig()
     before, camera = made.scene, made.camera
-    for other, words in (
+    for other, status in (
         (scene(Disc((0.005, 0.0), 0.001)), "got shape_0 where the needle is"),
         (scene(Disc((-0.01, 0.0005), 0.001)), "got shape_0 where the thread is"),
         (scene(diameter=0.03), "got wall where the thread is"),
         (scene(diameter=0.019), "got wall where the needle is"),
     ):
-        with pytest.raises(InvalidInputError, match=words):
+        with pytest.raises(InvalidInputError, match=status):
             made.set_scene(other)
         assert made.scene is before
         assert made.camera is camera
@@ -240,11 +240,11 @@ def test_a_hole_is_seen_and_nothing_gets_into_it():
     made = rig(holed)
     for time in np.arange(0.0, 3.0, 0.1):
         made.apply(EASTWARDS, float(time))
-    frame = made.capture_frame(3.0)
+    frame = made.look(3.0)
     tip = frame.tail + 0.007 * np.array([np.cos(frame.heading), np.sin(frame.heading)])
     assert tip[0] == pytest.approx(0.011, abs=3e-4)
-    solid = rig(Polygon(square(0.002))).capture_frame(0.0).image
-    plain, ring = rig().capture_frame(0.0).image, rig(holed).capture_frame(0.0).image
+    solid = rig(Polygon(square(0.002))).look(0.0).image
+    plain, ring = rig().look(0.0).image, rig(holed).look(0.0).image
     assert plain is not None
     assert solid is not None
     assert ring is not None
@@ -269,10 +269,10 @@ def test_tissue_is_pink_and_a_hernia_darker_and_redder_but_neither_is_dark_to_th
     u, v = made["tissue"].camera.view.to_pixels(np.array([0.0002, 0.0087])).round().astype(int)
     seen = {}
     for look, one in made.items():
-        image = one.capture_frame(0.0).image
+        image = one.look(0.0).image
         assert image is not None
         seen[look] = image[v - 4 : v + 5, u - 4 : u + 5].reshape(-1, 3).mean(axis=0)
-    plain = rig().capture_frame(0.0).image
+    plain = rig().look(0.0).image
     assert plain is not None
     floor = plain[v - 4 : v + 5, u - 4 : u + 5].reshape(-1, 3).mean(axis=0)
     redness = {look: bgr[2] / bgr[1] for look, bgr in seen.items()}

@@ -14,7 +14,7 @@ from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.rig.camera.dish_camera import Cover, DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.scene import Scene as TrackedScene
-from magnetosuture_thread.vision.frame import Track
+from magnetosuture_thread.vision.look import Track
 
 SCENE = TrackedScene()  # a dish of 35 mm with nothing in it
 VIEW = DishView((322.0, 238.0), 8e-5)

@@ -8,8 +8,8 @@ import pytest
 
 from magnetosuture_thread.rig.camera.dish_camera import Cover
 from magnetosuture_thread.rig.camera.scene import Lighting
-from magnetosuture_thread.vision import dish
-from magnetosuture_thread.vision.needle import body, ends
+from magnetosuture_thread.vision.dish import find as dish
+from magnetosuture_thread.vision.needle import body, covers
 from magnetosuture_thread.vision.needle import find as needle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -149,13 +149,13 @@ class TestGuards:
     def test_rows_of_another_width(self, monkeypatch: pytest.MonkeyPatch):
         pose = Pose(np.zeros(2), 0.5)
         frame = render(pose, covers=(blob(pose.at(0.4) + np.array([-2e-4, 3.4e-4]), 4e-4, (50.0, 50.0, 50.0)),))
-        self.expect(monkeypatch, frame, "over it or against it", ends, EVEN_SHARE=0.0)
+        self.expect(monkeypatch, frame, "over it or against it", covers, EVEN_SHARE=0.0)
 
     def test_another_ground_beside_it(self, monkeypatch: pytest.MonkeyPatch):
         pose = Pose(np.zeros(2), 0.5)
         across = np.array([-np.sin(0.5), np.cos(0.5)])
         near = finger(pose.at(0.5) + 6.5 * PIXEL * across, 0.5 + 0.5 * np.pi, 0.02, (115.0, 115.0, 115.0))
-        self.expect(monkeypatch, render(pose, covers=(near,)), "something beside it", ends, GROUND_SLACK=1.0)
+        self.expect(monkeypatch, render(pose, covers=(near,)), "something beside it", covers, GROUND_SLACK=1.0)
 
     def test_a_tail_that_fades(self, monkeypatch: pytest.MonkeyPatch):
         pose = Pose(np.zeros(2), 0.5)
@@ -168,13 +168,13 @@ class TestGuards:
         """As where a tool goes on along the needle's arc, or faint glare lies over it."""
         pose = Pose(np.zeros(2), 0.5)
         frame = render(pose, covers=(blob(pose.at(0.45), 9e-4, WHITE, 0.22),))
-        self.expect(monkeypatch, frame, "over it or against it", ends, DARKNESS_SLACK=9.0)
+        self.expect(monkeypatch, frame, "over it or against it", covers, DARKNESS_SLACK=9.0)
 
     def test_a_dark_thing_that_leaves_it_at_a_small_angle(self, monkeypatch: pytest.MonkeyPatch):
         frame = render(Pose(np.array([-0.002, 0.0]), 0.0))
         cv2.line(frame, (305, 238), (345, 248), (45, 45, 45), 2, cv2.LINE_AA)
-        monkeypatch.setattr(ends, "EVEN_SHARE", 0.5)
-        self.expect(monkeypatch, frame, "something dark against it", ends, DARK_ROWS=1.0)
+        monkeypatch.setattr(covers, "EVEN_SHARE", 0.5)
+        self.expect(monkeypatch, frame, "something dark against it", covers, DARK_ROWS=1.0)
 
     def test_what_branches_off_a_needle(self, monkeypatch: pytest.MonkeyPatch):
         pose = Pose(np.zeros(2), 0.0)

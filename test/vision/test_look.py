@@ -15,7 +15,7 @@ from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.scene import Scene as DishScene
-from magnetosuture_thread.vision.frame import State
+from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +15,9 @@ from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import Look
 from magnetosuture_thread.scene import Scene, read_scene, scene_from_mapping
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.vision.frame import Track
-from magnetosuture_thread.vision.scene_mask import SceneMask, make_scene_mask
+from magnetosuture_thread.vision.look import Track, mask_of
+from magnetosuture_thread.vision.overlay import draw_scene
+from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, VIEW, Pose, line_error, random_thread
@@ -117,11 +117,11 @@ def test_a_thread_that_ends_at_a_dark_outline_is_not_followed_around_it():
 def test_the_mask_is_made_once_for_a_view_and_a_scene(monkeypatch: pytest.MonkeyPatch):
     made: list[Scene] = []
 
-    def counted(scene: Scene, *of_view: Any) -> SceneMask | None:
+    def counted(gray: np.ndarray, view: DishView, settings: VisionTrackerSettings, scene: Scene) -> SceneMask | None:
         made.append(scene)
-        return make_scene_mask(scene, *of_view)
+        return mask_of(gray, view, settings, scene)
 
-    monkeypatch.setattr("magnetosuture_thread.vision.tracker.make_scene_mask", counted)
+    monkeypatch.setattr("magnetosuture_thread.vision.tracker.mask_of", counted)
     scene = read_scene("dish_35mm_post")
     pose = Pose(np.array([0.0, -0.003]), 0.3)
     frame = frame_of(scene, SILICONE, pose, random_thread(np.random.default_rng(0), pose))
@@ -154,7 +154,7 @@ def test_a_scene_with_another_dish_gives_another_scale():
 def test_solid_and_depth_agree_with_the_geometry(factor: int):
     scene = read_scene("hernia_ring")
     view = DishView((322.3, 238.4), 1.1e-4, rotation=0.3)
-    mask = make_scene_mask(scene, view, (481, 641), factor, 3e-4, 8)
+    mask = scene_mask(scene, view, (481, 641), factor, 3e-4, 8)
     assert mask is not None
     random = np.random.default_rng(0)
     pixels = np.column_stack([random.integers(160, 500, 400), random.integers(100, 400, 400)]).astype(float)
@@ -170,7 +170,14 @@ def test_solid_and_depth_agree_with_the_geometry(factor: int):
 
 
 def test_an_empty_scene_has_no_mask():
-    assert make_scene_mask(Scene(), VIEW, (480, 640), 2, 3e-4, 8) is None
+    assert scene_mask(Scene(), VIEW, (480, 640), 2, 3e-4, 8) is None
+
+
+def test_outlines_are_drawn_where_the_shapes_are():
+    image = np.zeros((480, 640, 3), np.uint8)
+    draw_scene(image, VIEW, read_scene("dish_35mm_post"))
+    u, v = np.round(VIEW.to_pixels(np.add(POST.centre, (POST.radius, 0.0)))).astype(int)
+    assert image[v - 1 : v + 2, u - 1 : u + 2].max() > 100
 
 
 def test_the_set_ups_camera_sees_the_needle_among_dark_tissue():

@@ -7,9 +7,9 @@ import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.vision.frame import State
+from magnetosuture_thread.vision.look import State
+from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import TrackerSession
 
 TAIL = np.array([0.002, 0.001])
 

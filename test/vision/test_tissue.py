@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.vision.frame import State
+from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 PLACES = {  # tail [m] and heading [rad]

@@ -7,7 +7,7 @@ import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.rig.camera.dish_camera import Cover
-from magnetosuture_thread.vision.frame import State, Track
+from magnetosuture_thread.vision.look import State, Track
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import NOWHERE, PIXEL, SCENE, VIEW, Pose, blob, line_error, random_thread, render

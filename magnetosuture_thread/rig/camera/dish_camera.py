@@ -12,20 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.background import (
-    OVERSAMPLING,
-    Background,
-    Box,
-    Light,
-    box_around,
-    covered,
-    on_canvas,
-)
+from magnetosuture_thread.rig.camera.coverage import Box, Light, blurred, box_around, covered, lay, line_covered
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
+from magnetosuture_thread.rig.camera.still_life import StillLife
 
 Image = NDArray[np.uint8]
 
@@ -33,12 +25,11 @@ STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
 LAMP = (-0.5, 0.86)  # direction towards the lamp, in the dish frame
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
-SHADOW_ANCHOR = (15, 16)  # the middle of the blur's 26 px, shifted by 2.5 and 3.5 px
+SHADOW_BEGIN_PX = (-10, -9)  # shifted by 2.5 and 3.5 px, less 12.5 of the blur
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 NOISE_FIELDS = 12  # drawn once; a frame takes one of them
 NOISE_LEVEL = 1.6  # of white light of level 90, before the sensor's interpolation spreads it
 REACH_PX = 24.0  # of shadows and blur around what moves
-TILE_PX = 60.0  # a long line is drawn in pieces of this length: a large, nearly empty canvas would be slow
 
 
 @dataclass(frozen=True)
@@ -93,7 +84,7 @@ class DishCamera:
         self.size = size
         self._lighting = lighting or Lighting()
         self._random = np.random.default_rng(seed)
-        self._background = Background(scene, self._lighting, view, size, self._random).draw()
+        self._background = StillLife(scene, self._lighting, view, size, self._random).draw()
         self._still = self._through_lens(self._background)
         self._noise = [self._noise_field() for _ in range(NOISE_FIELDS)]
         self._exposed = [self._expose(self._still, noise, 1.0) for noise in self._noise]
@@ -124,8 +115,7 @@ class DishCamera:
             region = self._background[box].copy()
             self._add_strand_and_needle(region, box, line, outline, tail, heading)
             for cover, edge in zip(covers, edges, strict=True):
-                hidden = cv2.GaussianBlur(covered(box, edge), (0, 0), cover.blur_px)
-                lay(region, np.asarray(hidden, dtype=np.float32), cover.opacity, cover.bgr)
+                self._add_cover(region, box, cover, edge)
             image[box] = self._expose(self._through_lens(region), noise[box], gain)
         return image
 
@@ -136,17 +126,22 @@ class DishCamera:
         strand = line_covered(box, line, MENISCUS * scene.thread_diameter / scale)
         shade = np.float32(0.35) * strand
         near = box_around(outline, self.size, REACH_PX)
+        needle = None
         if near is not None:
-            needle, inside = covered(near, outline), _within(near, box)
+            needle = covered(near, lambda canvas, at: cv2.fillPoly(canvas, [at(outline)], 255, cv2.LINE_8, 4))
+            inside = _within(near, box)
             np.maximum(shade[inside], needle, out=shade[inside])
-        zeros = cv2.BORDER_CONSTANT
-        shadow = cv2.sepFilter2D(shade, cv2.CV_32F, SHADOW, SHADOW, anchor=SHADOW_ANCHOR, borderType=zeros)
-        lay(region, np.asarray(shadow, dtype=np.float32), 0.16, (0.0, 0.0, 0.0))
+        lay(region, blurred(shade, SHADOW, *SHADOW_BEGIN_PX), 0.16, (0.0, 0.0, 0.0))
         lay(region, strand, 1.0, scene.thread_bgr)
-        if near is not None:
-            gleam = line_covered(near, self.view.to_pixels(self._gleam(tail, heading)), 1.0)
+        if near is not None and needle is not None:
             lay(region[inside], needle, 1.0, STEEL_BGR)
-            lay(region[inside], gleam, 1.0, GLEAM_BGR)
+            lay(
+                region[inside], line_covered(near, self.view.to_pixels(self._gleam(tail, heading)), 1.0), 1.0, GLEAM_BGR
+            )
+
+    def _add_cover(self, region: Light, box: Box, cover: Cover, edge: Points) -> None:
+        hidden = covered(box, lambda canvas, at: cv2.fillPoly(canvas, [at(edge)], 255, cv2.LINE_8, 4))
+        lay(region, cv2.GaussianBlur(hidden, (0, 0), cover.blur_px), cover.opacity, cover.bgr)
 
     def _needle_outline(self, tail: Points, heading: float) -> Points:
         """Return the needle's outline in pixels: a body of one width, the last fifth tapering to a fine point."""
@@ -184,48 +179,3 @@ def _within(inner: Box, outer: Box) -> Box:
     """Return a box in the coordinates of one that holds it."""
     rows, columns = (slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer, strict=True))
     return rows, columns
-
-
-def line_covered(box: Box, line: Points, width_px: float) -> Light:
-    """Return the share of each pixel in a box that a line of a given width covers, shape (rows, columns).
-
-    Args:
-        box: rows and columns.
-        line: vertices, shape (m, 2) [px].
-        width_px: of the line; less than a quarter of a pixel is drawn as that and fainter.
-    """
-    rows, columns = box
-    result = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
-    wide = max(1, round(width_px * OVERSAMPLING))
-    fainter = min(1.0, width_px * OVERSAMPLING / wide)
-    line = line - (columns.start, rows.start)
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    starts = np.searchsorted(length, np.arange(0.0, length[-1], TILE_PX), side="right") - 1
-    ends = np.append(starts[1:], len(line) - 1)
-    low = np.minimum(np.minimum.reduceat(line, starts), line[ends]) - (2.0 + width_px)
-    high = np.maximum(np.maximum.reduceat(line, starts), line[ends]) + (3.0 + width_px)
-    parts = np.clip(np.column_stack([low, high]), 0.0, [*result.shape[::-1]] * 2).astype(int).tolist()
-    at = on_canvas(line)
-    for first, last, (left, top, right, bottom) in zip(starts, ends, parts, strict=True):
-        if left < right and top < bottom:
-            canvas = np.zeros(((bottom - top) * OVERSAMPLING, (right - left) * OVERSAMPLING), np.uint8)
-            piece = at[first : last + 1] - (left * OVERSAMPLING * 16, top * OVERSAMPLING * 16)
-            cv2.polylines(canvas, [piece], False, 255, wide, cv2.LINE_8, 4)
-            part = result[top:bottom, left:right]
-            small = cv2.resize(canvas, part.shape[::-1], interpolation=cv2.INTER_AREA)
-            np.maximum(part, small, out=part)
-    return np.asarray(result * np.float32(fainter / 255.0), dtype=np.float32)
-
-
-@compiled
-def lay(region: Light, share: Light, strength: float, bgr: tuple[float, float, float]) -> None:
-    """Cover a region with a colour by a share of each pixel, times a strength, where the share is not zero."""
-    scale = np.float32(strength)
-    b, g, r = np.float32(bgr[0]), np.float32(bgr[1]), np.float32(bgr[2])
-    for i in range(share.shape[0]):
-        for j in range(share.shape[1]):
-            if share[i, j] != 0.0:
-                part = scale * share[i, j]
-                region[i, j, 0] += part * (b - region[i, j, 0])
-                region[i, j, 1] += part * (g - region[i, j, 1])
-                region[i, j, 2] += part * (r - region[i, j, 2])

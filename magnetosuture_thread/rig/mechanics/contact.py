@@ -17,8 +17,6 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 
-Array = NDArray[np.float64]
-
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
 MAX_CLEARANCE = 8.0  # cells; clearances are not found beyond
@@ -42,15 +40,15 @@ class Shapes(NamedTuple):
         stiffness: k of every contact [N/m].
     """
 
-    discs: Array
-    corners: Array
+    discs: NDArray[np.float64]
+    corners: NDArray[np.float64]
     starts: NDArray[np.int64]
-    boxes: Array
-    runs: Array
+    boxes: NDArray[np.float64]
+    runs: NDArray[np.float64]
     first_runs: NDArray[np.int64]
-    grid: Array
-    clearances: Array
-    convex: Array
+    grid: NDArray[np.float64]
+    clearances: NDArray[np.float64]
+    convex: NDArray[np.float64]
     wall: float
     stiffness: float
 
@@ -72,7 +70,7 @@ class Surface:
     """
 
     discs: tuple[Disc, ...] = ()
-    polygons: tuple[Array, ...] = ()
+    polygons: tuple[NDArray[np.float64], ...] = ()
     wall_radius: float | None = None
     stiffness: float = 500.0
     skin: float = 1.5e-6
@@ -112,11 +110,11 @@ class Surface:
         return shapes
 
 
-def _boxes(parts: list[Array]) -> Array:
+def _boxes(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.array([(*part.min(axis=0), *part.max(axis=0)) for part in parts], dtype=np.float64).reshape(-1, 4)
 
 
-def _directed(given: Array) -> Array:
+def _directed(given: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a ring counter-clockwise and open, once it is known to bound an area."""
     ring = np.array(given, dtype=np.float64)
     if ring.ndim != 2 or ring.shape[1] != 2 or not np.isfinite(ring).all():
@@ -129,7 +127,7 @@ def _directed(given: Array) -> Array:
     return ring if area > 0.0 else np.ascontiguousarray(ring[::-1])
 
 
-def _convex(ring: Array) -> Array:
+def _convex(ring: NDArray[np.float64]) -> NDArray[np.float64]:
     before, after = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
     return np.where(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0.0, 1.0, 0.0)
 
@@ -206,8 +204,8 @@ def _find_clearances(shapes: Shapes) -> None:
 
 
 @compiled
-def clear(x: float, y: float, reach: float, grid: Array, clearances: Array) -> bool:
-    """Return whether nothing is within reach, by the grid's clearance; beyond the grid it is a lower bound.
+def clear(x: float, y: float, reach: float, grid: NDArray[np.float64], clearances: NDArray[np.float64]) -> bool:
+    """Return whether nothing is within reach, as far as the grid tells; from beyond the grid all is as far or farther.
 
     All but the wall, that is, which is in the cells at the border already.
     """
@@ -218,7 +216,7 @@ def clear(x: float, y: float, reach: float, grid: Array, clearances: Array) -> b
 
 
 @compiled
-def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: Array) -> int:
+def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: NDArray[np.float64]) -> int:
     """Write what a round point sinks into; return how many.
 
     Args:
@@ -271,7 +269,14 @@ def _segment_gap(ax: float, ay: float, bx: float, by: float, cx: float, cy: floa
 
 @compiled
 def segment_contacts(
-    ax: float, ay: float, bx: float, by: float, length: float, radius: float, shapes: Shapes, rows: Array
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    length: float,
+    radius: float,
+    shapes: Shapes,
+    rows: NDArray[np.float64],
 ) -> int:
     """Write what the inner part of a segment sinks into: discs, and corners that stick out; return how many.
 

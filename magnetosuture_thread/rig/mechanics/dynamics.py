@@ -9,15 +9,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.polyline import Points, chain_along
-from magnetosuture_thread.rig.mechanics.contact import Array, Shapes, Surface
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
 from magnetosuture_thread.rig.mechanics.field import CoilField
 from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody
 from magnetosuture_thread.rig.mechanics.newton import advance, make_buffers
-from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, Rod, ThreadProperties
+from magnetosuture_thread.rig.mechanics.rod import Rod
+from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
 
 __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 
@@ -77,8 +78,9 @@ class RigDynamics:
             raise InvalidInputError("rig.thread_points", "one place", "points that differ")
         if not largest_step > 0.0:
             raise ConfigurationError("rig.largest_step", largest_step, "a positive number [s]")
-        angle = _number("rig.heading", heading)
-        self._q = np.concatenate([[angle], chain_along(points, thread.segments, length).ravel()])
+        self._q = np.concatenate(
+            [[_number("rig.heading", heading)], chain_along(points, thread.segments, length).ravel()]
+        )
         self._q[1:3] = start
         self._before, self._last_dt = self._q.copy(), 0.0
         self._largest_step = largest_step
@@ -86,7 +88,10 @@ class RigDynamics:
         self._shapes = surface.packed()
         self._rod = Rod(
             length,
-            *(thread.stretching_stiffness, thread.bending_stiffness, thread.drag_across, thread.drag_along),
+            thread.stretching_stiffness,
+            thread.bending_stiffness,
+            thread.drag_across,
+            thread.drag_along,
             thread.rest_curvature * length,
             0.5 * thread.diameter + surface.skin,
         )
@@ -107,7 +112,7 @@ class RigDynamics:
         self.iterations = self.substeps = self.halvings = 0
 
     @property
-    def tail(self) -> Array:
+    def tail(self) -> NDArray[np.float64]:
         """The needle's tail, shape (2,) [m]."""
         return np.array(self._q[1:3])
 
@@ -117,7 +122,7 @@ class RigDynamics:
         return float(self._q[0])
 
     @property
-    def tip(self) -> Array:
+    def tip(self) -> NDArray[np.float64]:
         """The needle's tip, shape (2,) [m]."""
         return self._tip_of(self._q)
 
@@ -132,10 +137,22 @@ class RigDynamics:
         return np.array(self._q[1:].reshape(-1, 2))
 
     @property
-    def tension(self) -> Array:
+    def tension(self) -> NDArray[np.float64]:
         """Tension of each segment, positive when pulled, shape (n,) [N]."""
         chords = np.linalg.norm(np.diff(self._q[1:].reshape(-1, 2), axis=0), axis=1)
         return np.asarray(self._rod.stretching * (chords / self._rod.segment - 1.0))
+
+    @property
+    def energy(self) -> float:
+        """Elastic energy of the thread, with the clamp's [J]."""
+        rod, nodes = self._rod, self.thread
+        edges = np.diff(nodes, axis=0)
+        stretch = 0.5 * rod.segment / rod.stretching * float(self.tension @ self.tension)
+        cross = edges[:-1, 0] * edges[1:, 1] - edges[:-1, 1] * edges[1:, 0]
+        turns = np.arctan2(cross, np.sum(edges[:-1] * edges[1:], axis=1)) - rod.rest_turn
+        bend = rod.bending / rod.segment * float(np.sum(1.0 - np.cos(turns)))
+        gap = edges[0] + self._turned(self._q, np.array([rod.segment, self._needle.clamp[1]]))
+        return stretch + bend + self._needle.clamp[0] * float(gap @ gap)
 
     def set_surface(self, surface: Surface) -> None:
         """Touch other things from now on; needle and thread must be outside of them.
@@ -164,7 +181,7 @@ class RigDynamics:
                 step that did.
         """
         amperes = _finite("rig.currents", currents, (len(self.field.coils) if self.field else 0,))
-        span = _number("rig.dt", dt, above=0.0)
+        span = _positive("rig.dt", dt)
         if not np.array_equal(amperes, self._held):
             # Speeds jump with currents: a formula that looks back over the jump would lag by part of a step.
             self._held, self._last_dt = amperes.copy(), 0.0
@@ -184,9 +201,9 @@ class RigDynamics:
         """
         goal = np.concatenate([[_number("rig.heading", heading)], _finite("rig.tail", tail, (2,))])
         goal[0] = self._q[0] + math.remainder(goal[0] - self._q[0], 2.0 * math.pi)
-        self._integrate(_number("rig.dt", dt, above=0.0), None, goal)
+        self._integrate(_positive("rig.dt", dt), None, goal)
 
-    def _integrate(self, dt: float, currents: Array | None, goal: Array | None) -> None:
+    def _integrate(self, dt: float, currents: NDArray[np.float64] | None, goal: NDArray[np.float64] | None) -> None:
         """Take steps until dt is over; a step that does not converge is halved."""
         regular = dt / math.ceil(dt / self._largest_step - 1e-9)
         done, h, tries = 0.0, regular, 0
@@ -210,7 +227,7 @@ class RigDynamics:
             self.halvings += 1
             h *= 0.5
 
-    def _take(self, h: float, currents: Array | None) -> bool:
+    def _take(self, h: float, currents: NDArray[np.float64] | None) -> bool:
         """Take one step; return whether it converged, and change nothing if not."""
         ratio = h / self._last_dt if self._last_dt > 0.0 else 0.0
         if currents is not None and self.field is not None:
@@ -219,7 +236,15 @@ class RigDynamics:
             self._flux[:] = (currents @ self.field.per_current(self._poles).reshape(-1, 6)).reshape(2, 3)[:, :2]
         start = self._q.copy()
         iterations, self._move, residual = advance(
-            *(self._q, self._before, h, ratio, self._flux, self._needle, self._rod, self._shapes, self._buffers),
+            self._q,
+            self._before,
+            h,
+            ratio,
+            self._flux,
+            self._needle,
+            self._rod,
+            self._shapes,
+            self._buffers,
             currents is None,
             TOLERANCE,
         )
@@ -230,11 +255,11 @@ class RigDynamics:
         self.iterations, self.substeps = self.iterations + iterations, self.substeps + 1
         return True
 
-    def _tip_of(self, q: Array) -> Array:
+    def _tip_of(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(q[1:3] + self._turned(q, self.needle.tip))
 
     @staticmethod
-    def _turned(q: Array, vector: Array) -> Array:
+    def _turned(q: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
         c, s = math.cos(q[0]), math.sin(q[0])
         return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
@@ -244,14 +269,20 @@ def _contacts(shapes: Shapes) -> int:
     return len(shapes.discs) + len(shapes.corners) + 2
 
 
-def _finite(name: str, given: ArrayLike, shape: tuple[int, ...]) -> Array:
+def _finite(name: str, given: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     values = np.asarray(given, dtype=np.float64)
     if values.shape != shape or not np.isfinite(values).all():
         raise InvalidInputError(name, values.tolist(), f"{shape[0]} finite numbers")
     return values
 
 
-def _number(name: str, given: float, above: float = -math.inf) -> float:
-    if not above < given < math.inf:
-        raise InvalidInputError(name, given, "a positive number" if above == 0.0 else "a finite number")
+def _number(name: str, given: float) -> float:
+    if not math.isfinite(given):
+        raise InvalidInputError(name, given, "a finite number")
+    return float(given)
+
+
+def _positive(name: str, given: float) -> float:
+    if not (math.isfinite(given) and given > 0.0):
+        raise InvalidInputError(name, given, "a positive number")
     return float(given)

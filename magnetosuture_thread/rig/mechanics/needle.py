@@ -8,10 +8,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.mechanics.contact import Array, Shapes, clear, point_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts
 
 NODES = 16  # of the integration along the body
 
@@ -58,11 +59,11 @@ class NeedleBody:
         return self.magnetisation * math.pi * self.diameter**2 / 4.0
 
     @cached_property
-    def tip(self) -> Array:
+    def tip(self) -> NDArray[np.float64]:
         """The tip in the needle's frame, shape (2,) [m]."""
         return np.asarray(self.points(np.array([self.length]))[0])
 
-    def points(self, along: Array) -> Array:
+    def points(self, along: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points of the body in its frame.
 
             x = s sinc(c s),    y = c s^2 / 2 sinc(c s / 2)^2,    sinc(u) = sin(u) / u
@@ -76,7 +77,7 @@ class NeedleBody:
         turn = self.curvature * along / math.pi
         return np.column_stack([along * np.sinc(turn), 0.5 * math.pi * turn * along * np.sinc(0.5 * turn) ** 2])
 
-    def outline(self, count: int) -> Array:
+    def outline(self, count: int) -> NDArray[np.float64]:
         """Return equally spaced points of the body in its frame, tail first, shape (count, 2) [m]."""
         return self.points(np.linspace(0.0, self.length, count))
 
@@ -99,7 +100,7 @@ class NeedleBody:
         return along, across, turn
 
     @cached_property
-    def resistance(self) -> Array:
+    def resistance(self) -> NDArray[np.float64]:
         """Resistance to (v_x, v_y, omega) of the tail in the needle's frame, shape (3, 3).
 
             R = integral over s of J' (along / L t t' + across / L n n') J,    J = [1, 0, -y; 0, 1, x]
@@ -121,6 +122,25 @@ class NeedleBody:
         total[2, 2] += turn - across * self.length**2 / 12.0
         return np.asarray(total)
 
+    def wrench(
+        self, field_tail: NDArray[np.float64], field_tip: NDArray[np.float64], heading: float
+    ) -> tuple[NDArray[np.float64], float]:
+        """Return force and torque about the tail of the field on the poles.
+
+            F = q (B_tip - B_tail),    T = q (x_tip - x_tail) x B_tip
+
+        Args:
+            field_tail: flux density at the tail in the plane, shape (2,) [T].
+            field_tip: the same at the tip.
+            heading: [rad].
+
+        Returns:
+            Force, shape (2,) [N]; torque, positive to the left [N m].
+        """
+        c, s = math.cos(heading), math.sin(heading)
+        x, y = c * self.tip[0] - s * self.tip[1], s * self.tip[0] + c * self.tip[1]
+        return self.pole * (field_tip - field_tail), float(self.pole * (x * field_tip[1] - y * field_tip[0]))
+
 
 class Needle(NamedTuple):
     """A needle as kernels read it.
@@ -134,16 +154,16 @@ class Needle(NamedTuple):
         clamp: (d, c) of the stiffness d |x_1 - x_0 + R (D, c)|^2 of a clamped thread, d = 0 when pinned [N/m, m].
     """
 
-    resistance: Array
-    tip: Array
+    resistance: NDArray[np.float64]
+    tip: NDArray[np.float64]
     pole: float
-    outline: Array
+    outline: NDArray[np.float64]
     radius: float
     clamp: tuple[float, float]
 
 
 @compiled
-def turn_resistance(needle: Needle, heading: float, scale: float, turned: Array) -> None:
+def turn_resistance(needle: Needle, heading: float, scale: float, turned: NDArray[np.float64]) -> None:
     """Write the resistance to (omega, v_x, v_y) in the dish's frame, times a factor, shape (3, 3)."""
     c, s = math.cos(heading), math.sin(heading)
     r = needle.resistance
@@ -158,15 +178,15 @@ def turn_resistance(needle: Needle, heading: float, scale: float, turned: Array)
 
 @compiled
 def add_needle(
-    q: Array,
-    field: Array,
+    q: NDArray[np.float64],
+    field: NDArray[np.float64],
     needle: Needle,
     shapes: Shapes,
-    rest: Array,
-    turned: Array,
-    rows: Array,
-    gradient: Array,
-    band: Array,
+    rest: NDArray[np.float64],
+    turned: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
     convex: bool,
 ) -> float:
     """Add the needle's terms: drag, poles in a given field, contact of its outline.
@@ -220,7 +240,14 @@ def add_needle(
 
 
 @compiled
-def add_clamp(q: Array, needle: Needle, segment: float, gradient: Array, band: Array, convex: bool) -> float:
+def add_clamp(
+    q: NDArray[np.float64],
+    needle: Needle,
+    segment: float,
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
     """Add d |x_1 - x_0 + R (D, c)|^2, the half cell of bending at a clamped tail.
 
     With d = EI / D^3 and c = D^2 rest_curvature / 2 that is EI D / 4 (curvature - rest)^2, the curvature from a

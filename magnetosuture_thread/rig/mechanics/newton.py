@@ -6,9 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Array, Shapes
+from magnetosuture_thread.rig.mechanics.contact import Shapes
 from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle, turn_resistance
 from magnetosuture_thread.rig.mechanics.rod import (
     WIDTH,
@@ -34,39 +35,47 @@ FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere els
 class NewtonBuffers(NamedTuple):
     """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows."""
 
-    trial: Array
-    step: Array
-    gradient: Array
-    band: Array
-    chol: Array
-    rest: Array
-    drag: Array
-    turned: Array
-    rows: Array
+    trial: NDArray[np.float64]
+    step: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    band: NDArray[np.float64]
+    chol: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    drag: NDArray[np.float64]
+    turned: NDArray[np.float64]
+    rows: NDArray[np.float64]
 
 
 def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
-    """Return buffers for a thread of n segments and for so many contacts of one point or segment."""
+    """Return memory for a thread of n segments and for so many contacts of one point or segment."""
     size = 2 * segments + 3
-    bands, drag, rows = (size, WIDTH), (segments + 1, 3), (contacts, 5)
-    shapes: tuple[int | tuple[int, int], ...] = (size, size, size, bands, bands, size, drag, (3, 3), rows)
-    return NewtonBuffers(*(np.zeros(shape) for shape in shapes))
+    return NewtonBuffers(
+        trial=np.zeros(size),
+        step=np.zeros(size),
+        gradient=np.zeros(size),
+        band=np.zeros((size, WIDTH)),
+        chol=np.zeros((size, WIDTH)),
+        rest=np.zeros(size),
+        drag=np.zeros((segments + 1, 3)),
+        turned=np.zeros((3, 3)),
+        rows=np.zeros((contacts, 5)),
+    )
 
 
 @compiled
 def assemble_energy(
-    q: Array,
-    field: Array,
+    q: NDArray[np.float64],
+    field: NDArray[np.float64],
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
     buffers: NewtonBuffers,
-    prescribed: bool,
+    driven: bool,
     convex: bool,
 ) -> float:
     """Write gradient and band of what a step makes least, and return its value [J].
 
-    Where the needle is prescribed, its three unknowns are known: they get no force and no coupling.
+    Where the needle is driven, its three unknowns are known: they get no force and no coupling.
     """
     buffers.gradient[:] = 0.0
     buffers.band[:, :] = 0.0
@@ -75,7 +84,7 @@ def assemble_energy(
     energy += add_stretching(q, rod, g, band, convex) + add_bending(q, rod, g, band, convex)
     energy += add_contact(q, rod, shapes, buffers.rows, g, band, convex)
     energy += add_clamp(q, needle, rod.segment, g, band, convex)
-    if not prescribed:
+    if not driven:
         rest, turned, rows = buffers.rest, buffers.turned, buffers.rows
         energy += add_needle(q, field, needle, shapes, rest, turned, rows, g, band, convex)
         return energy
@@ -83,57 +92,67 @@ def assemble_energy(
         g[i] = 0.0
         band[i, :] = 0.0
         band[i, 0] = 1.0
-        for j in range(3, i + WIDTH):
-            band[j, j - i] = 0.0
+        for j in range(3, 9):
+            if j - i < band.shape[1] and j < band.shape[0]:
+                band[j, j - i] = 0.0
     return energy
 
 
 @compiled
-def _largest(gradient: Array, arm: float) -> float:
+def _largest(gradient: NDArray[np.float64], arm: float) -> float:
     """Return the largest force, the needle's torque as one at its tip [N]."""
-    return float(max(abs(gradient[0]) / arm, np.abs(gradient[1:]).max()))
+    largest = abs(gradient[0]) / arm
+    for i in range(1, gradient.shape[0]):
+        largest = max(largest, abs(gradient[i]))
+    return float(largest)
 
 
 @compiled
 def _minimise(
-    start: Array,
-    field: Array,
+    start: NDArray[np.float64],
+    field: NDArray[np.float64],
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
     buffers: NewtonBuffers,
-    prescribed: bool,
+    driven: bool,
     tolerance: float,
     search: bool,
 ) -> tuple[int, float, float]:
-    """Find in `buffers.trial` where a step's value is least; see `advance`.
+    """Find in `memory.trial` where a step's value is least; see `advance`.
 
     Newton, with the convex part of the second derivatives where they are not positive definite. Without a line
     search a contact is found in one or two steps; with one, steps end short of every new contact. So the first way is
     given few steps of at most half a segment, and must end below where it started.
     """
-    trial, step = buffers.trial, buffers.step
+    trial, size = buffers.trial, start.shape[0]
     arm = math.sqrt(needle.tip[0] ** 2 + needle.tip[1] ** 2)
     current = start.copy()
-    first = energy = assemble_energy(start, field, needle, rod, shapes, buffers, prescribed, False)
+    first = energy = assemble_energy(start, field, needle, rod, shapes, buffers, driven, False)
     move, force = np.inf, _largest(buffers.gradient, arm)
     for iteration in range(1, (MAX_ITERATIONS if search else MAX_FULL_STEPS) + 1):
         buffers.chol[:, :] = buffers.band
         if not factor(buffers.chol):
-            assemble_energy(current, field, needle, rod, shapes, buffers, prescribed, True)
+            assemble_energy(current, field, needle, rod, shapes, buffers, driven, True)
             buffers.chol[:, :] = buffers.band
             if not factor(buffers.chol):
                 return -1, np.inf, force
-        step[:] = -buffers.gradient
-        back_substitute(buffers.chol, step)
-        slope = (buffers.gradient * step).sum()
-        move = max(abs(step[0]) * arm, np.abs(step[1:]).max())
+        for i in range(size):
+            buffers.step[i] = -buffers.gradient[i]
+        back_substitute(buffers.chol, buffers.step)
+        slope = 0.0
+        move = abs(buffers.step[0]) * arm
+        for i in range(size):
+            slope += buffers.gradient[i] * buffers.step[i]
+            if i > 0:
+                move = max(move, abs(buffers.step[i]))
         if not move < (np.inf if search else 0.5 * rod.segment):
             return -1, move, force
         part = 1.0
         while True:
-            trial[:] = current + part * step
-            new = assemble_energy(trial, field, needle, rod, shapes, buffers, prescribed, False)
+            for i in range(size):
+                trial[i] = current[i] + part * buffers.step[i]
+            new = assemble_energy(trial, field, needle, rod, shapes, buffers, driven, False)
             force = _largest(buffers.gradient, arm)
             if move <= tolerance:
                 lower = search or new <= first + FALSE_RISE * abs(first) + MIN_ENERGY
@@ -150,16 +169,16 @@ def _minimise(
 
 @compiled
 def advance(
-    q: Array,
-    before: Array,
+    q: NDArray[np.float64],
+    before: NDArray[np.float64],
     dt: float,
     ratio: float,
-    field: Array,
+    field: NDArray[np.float64],
     needle: Needle,
     rod: Rod,
     shapes: Shapes,
     buffers: NewtonBuffers,
-    prescribed: bool,
+    driven: bool,
     tolerance: float,
 ) -> tuple[int, float, float]:
     """Find the state after a step of the second backward difference formula with variable steps.
@@ -171,8 +190,8 @@ def advance(
     contacts begin and end. Where they do not, the search starts again with a line search.
 
     Args:
-        q: state at the start, shape (N,); replaced by the state at the end. Of a prescribed needle its first three
-            values are in `buffers.trial` [rad, m].
+        q: state at the start, shape (N,); replaced by the state at the end. Of a driven needle its first three
+            values are in `memory.trial` [rad, m].
         before: the state one step earlier.
         dt: step [s].
         ratio: w, 0 for a first step, which is backward Euler.
@@ -181,7 +200,7 @@ def advance(
         rod: the thread.
         shapes: what can be touched.
         buffers: to work in.
-        prescribed: whether the needle's motion is given.
+        driven: whether the needle's motion is given.
         tolerance: the largest last move of a node [m].
 
     Returns:
@@ -189,17 +208,18 @@ def advance(
 
     Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section III.5. Deviation: none.
     """
-    trial = buffers.trial
+    trial, size = buffers.trial, q.shape[0]
     beta = (1.0 + ratio) / (1.0 + 2.0 * ratio)
-    buffers.rest[:] = ((1.0 + ratio) ** 2 * q - ratio**2 * before) / (1.0 + 2.0 * ratio)
-    free = 3 if prescribed else 0  # the first unknown that is not given
-    trial[free:] = q[free:] + ratio * (q[free:] - before[free:])
+    for i in range(size):
+        buffers.rest[i] = ((1.0 + ratio) ** 2 * q[i] - ratio**2 * before[i]) / (1.0 + 2.0 * ratio)
+        if not driven or i > 2:
+            trial[i] = q[i] + ratio * (q[i] - before[i])
     drag_matrices(trial, rod, 1.0 / (beta * dt), buffers.drag)
     turn_resistance(needle, trial[0], 1.0 / (beta * dt), buffers.turned)
     start = trial.copy()
-    done, move, force = _minimise(start, field, needle, rod, shapes, buffers, prescribed, tolerance, False)
+    done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, False)
     if done < 0:
-        done, move, force = _minimise(start, field, needle, rod, shapes, buffers, prescribed, tolerance, True)
+        done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, True)
     if done > 0:
         q[:] = trial
     return done, move, force

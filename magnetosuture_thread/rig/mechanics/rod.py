@@ -1,4 +1,4 @@
-"""The thread in its liquid, as a discrete elastic rod: energies with gradient and band of second derivatives.
+"""The thread as a discrete elastic rod: energies with gradient and band of second derivatives.
 
 Unknowns are q = [theta, x_0, y_0, x_1, y_1, ... x_n, y_n]: the needle's heading, its tail, which is node 0, and the
 thread's nodes. Every term touches three nodes in a row at most, so second derivatives have the half-width 5. They
@@ -8,68 +8,15 @@ are kept as B[i, k] = d2E / dq_i dq_{i-k}, shape (2n + 3, 6).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.mechanics.contact import Array, Shapes, clear, point_contacts, segment_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts, segment_contacts
 
 WIDTH = 6  # of the band: half-width and diagonal
-
-
-class NeedleJoint(str, Enum):
-    """How the thread is tied to the needle's tail."""
-
-    PINNED = "pinned"
-    CLAMPED = "clamped"
-
-
-@dataclass(frozen=True)
-class ThreadProperties:
-    """The thread in its liquid.
-
-    Attributes:
-        length: L [m].
-        segments: n.
-        bending_stiffness: EI, 0 for a chain [N m^2].
-        stretching_stiffness: EA [N].
-        drag_across: per length, across the thread [Pa s].
-        drag_along: the same along it.
-        attachment: pinned, it turns freely at the needle's tail, or clamped, it leaves against the heading.
-        rest_curvature: of the thread when nothing acts, positive to the left from the tail on [1/m].
-        diameter: for contact [m].
-
-    Raises:
-        ConfigurationError: a value is not finite, or out of bounds.
-    """
-
-    length: float
-    segments: int
-    bending_stiffness: float
-    stretching_stiffness: float
-    drag_across: float
-    drag_along: float
-    attachment: NeedleJoint
-    rest_curvature: float = 0.0
-    diameter: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check what was given."""
-        for name in ("length", "stretching_stiffness", "drag_across", "drag_along"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ConfigurationError(f"thread.{name}", getattr(self, name), "a positive number")
-        if not self.segments >= 3:
-            raise ConfigurationError("thread.segments", self.segments, "at least 3")
-        if not (math.isfinite(self.bending_stiffness) and self.bending_stiffness >= 0.0):
-            raise ConfigurationError("thread.bending_stiffness", self.bending_stiffness, "0 or more [N m^2]")
-        if not abs(self.rest_curvature) * self.length / self.segments < 1.0:
-            raise ConfigurationError("thread.rest_curvature", self.rest_curvature, "a turn of less than 1 a segment")
-        if not 0.0 <= self.diameter < self.length:
-            raise ConfigurationError("thread.diameter", self.diameter, "from 0 to less than the length [m]")
 
 
 class Rod(NamedTuple):
@@ -95,7 +42,7 @@ class Rod(NamedTuple):
 
 
 @compiled
-def drag_matrices(q: Array, rod: Rod, scale: float, drag: Array) -> None:
+def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float, drag: NDArray[np.float64]) -> None:
     """Write each node's drag: half of each segment beside it, so that a free end carries half a cell.
 
         Z_i = scale sum D / 2 (across I - (across - along) t t')
@@ -121,7 +68,13 @@ def drag_matrices(q: Array, rod: Rod, scale: float, drag: Array) -> None:
 
 
 @compiled
-def add_drag(q: Array, rest: Array, drag: Array, gradient: Array, band: Array) -> float:
+def add_drag(
+    q: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    drag: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+) -> float:
     """Add sum (x_i - rest_i)' Z_i (x_i - rest_i) / 2, the work of a step against the liquid."""
     energy = 0.0
     for i in range(drag.shape[0]):
@@ -138,7 +91,13 @@ def add_drag(q: Array, rest: Array, drag: Array, gradient: Array, band: Array) -
 
 
 @compiled
-def add_stretching(q: Array, rod: Rod, gradient: Array, band: Array, convex: bool) -> float:
+def add_stretching(
+    q: NDArray[np.float64],
+    rod: Rod,
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
     """Add sum EA / (2 D) (l_i - D)^2; `convex` leaves out what makes second derivatives indefinite."""
     energy = 0.0
     k = rod.stretching / rod.segment
@@ -168,7 +127,13 @@ def add_stretching(q: Array, rod: Rod, gradient: Array, band: Array, convex: boo
 
 
 @compiled
-def add_bending(q: Array, rod: Rod, gradient: Array, band: Array, convex: bool) -> float:
+def add_bending(
+    q: NDArray[np.float64],
+    rod: Rod,
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
     """Add sum EI / D (1 - cos(phi_i - rest)) at inner nodes, phi_i the turn from segment to segment.
 
         = EI / D^3 sum (cos(rest) |x_{i+1} - 2 x_i + x_{i-1}|^2 / 2 - sin(rest) e_i x e_{i+1}) + const
@@ -205,7 +170,15 @@ def add_bending(q: Array, rod: Rod, gradient: Array, band: Array, convex: bool) 
 
 
 @compiled
-def add_contact(q: Array, rod: Rod, shapes: Shapes, rows: Array, gradient: Array, band: Array, convex: bool) -> float:
+def add_contact(
+    q: NDArray[np.float64],
+    rod: Rod,
+    shapes: Shapes,
+    rows: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+    convex: bool,
+) -> float:
     """Add k / 2 depth^2 of every contact of nodes 1 ... n and of segments.
 
     For a segment the gap's second derivative is that of the distance between a point and a line.
@@ -255,7 +228,7 @@ def add_contact(q: Array, rod: Rod, shapes: Shapes, rows: Array, gradient: Array
 
 
 @compiled
-def factor(band: Array) -> bool:
+def factor(band: NDArray[np.float64]) -> bool:
     """Replace a band by its Cholesky factor, row by row; return whether it was positive definite."""
     for i in range(band.shape[0]):
         low = max(0, i - WIDTH + 1)
@@ -274,7 +247,7 @@ def factor(band: Array) -> bool:
 
 
 @compiled
-def back_substitute(band: Array, right: Array) -> None:
+def back_substitute(band: NDArray[np.float64], right: NDArray[np.float64]) -> None:
     """Solve in place with the factor that `factor` left."""
     size = band.shape[0]
     for i in range(size):

@@ -55,13 +55,16 @@ class RoboClawBoard:
         self.supply, self.resistance, self.inductance = supply, resistance, inductance
         self.duties = (0, 0)
         self.currents = (0.0, 0.0)
+        self.timeout = FACTORY_TIMEOUT
+        self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
         self.errors = self.warnings = 0
         self.ignored: set[int] = set()
         self.mismeasured = 0.0
         self.broken: set[int] = set()
         self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=KEPT)
-        self.heard = self._time = -math.inf
-        self.power_cycle()
+        self.heard = -math.inf
+        self._parser = Parser()
+        self._time = -math.inf
 
     def receive(self, data: bytes, time: float) -> bytes:
         """Receive bytes from the line and return the answers."""
@@ -75,16 +78,16 @@ class RoboClawBoard:
     def advance(self, time: float) -> None:
         """Let the coils' currents follow up to a time; nothing happens for one that is past."""
         if self.errors:
-            self._set((0, 0))
+            self._set((0, 0), self._time)
         off_at = self.heard + 0.1 * self.timeout
         if self.timeout and any(self.duties) and off_at <= time:
             self._move(off_at)
-            self._set((0, 0))
+            self._set((0, 0), self._time)
         self._move(time)
 
     def power_cycle(self) -> None:
         """Let its supply go and come back at once: duties zero, timeout and limits as it was delivered."""
-        self._set((0, 0))
+        self._set((0, 0), self._time)
         self.timeout = FACTORY_TIMEOUT
         self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
         self._parser = Parser()
@@ -92,32 +95,32 @@ class RoboClawBoard:
     @property
     def outputs(self) -> tuple[int, int]:
         """What is left of the duties where a coil is at its limit."""
-        return self._output(0), self._output(1)
+        first, second = (self._output(channel) for channel in (0, 1))
+        return first, second
 
     def _output(self, channel: int) -> int:
         duty, limit = self.duties[channel], 0.01 * self.limits[channel]
         if abs(self.currents[channel]) < AT_LIMIT * limit or duty * self.currents[channel] <= 0.0:
             return duty
-        bound = FULL * limit * self.resistance / self.supply
-        return round(max(-bound, min(bound, duty)))
+        most = FULL * limit * self.resistance / self.supply
+        return round(max(-most, min(most, duty)))
 
     def _move(self, time: float) -> None:
         if time <= self._time:
             return
         share = math.exp(-(time - self._time) * self.resistance / self.inductance)
-        self.currents = (self._moved(0, share), self._moved(1, share))
+        moved = []
+        for channel, (current, duty, limit) in enumerate(zip(self.currents, self.duties, self.limits, strict=True)):
+            goal = duty / FULL * self.supply / self.resistance
+            limited = max(-0.01 * limit, min(0.01 * limit, goal + (current - goal) * share))
+            moved.append(0.0 if channel in self.broken else limited)
+        self.currents = (moved[0], moved[1])
         self._time = time
 
-    def _moved(self, channel: int, share: float) -> float:
-        """Return a coil's current when a share of its distance from the goal is left."""
-        limit, goal = 0.01 * self.limits[channel], self.duties[channel] / FULL * self.supply / self.resistance
-        limited = max(-limit, min(limit, goal + (self.currents[channel] - goal) * share))
-        return 0.0 if channel in self.broken else limited
-
-    def _set(self, duties: tuple[int, int]) -> None:
+    def _set(self, duties: tuple[int, int], time: float) -> None:
         if duties != self.duties:
             self.duties = duties
-            self.timeline.append((self._time, duties))
+            self.timeline.append((time, duties))
 
     def _handle(self, packet: bytes) -> bytes:
         command = packet[1]
@@ -141,19 +144,24 @@ class RoboClawBoard:
         elif not self.errors:
             first = values[0] if command != packets.SET_DUTY_2 else self.duties[0]
             second = values[-1] if command != packets.SET_DUTY_1 else self.duties[1]
-            self._set((first, second))
+            self._set((first, second), self._time)
 
     def _data(self, command: int) -> bytes:
-        """Return what the answer to a question holds."""
+        """Return what the answer to a question says."""
+        if command == packets.GET_VERSION:
+            return VERSION
+        if command == packets.GET_TIMEOUT:
+            return bytes((self.timeout,))
+        if command == packets.GET_STATUS:
+            return struct.pack(">I", self.warnings << 16 | self.errors)
+        if command in (packets.GET_LIMIT_1, packets.GET_LIMIT_2):
+            return struct.pack(">II", self.limits[command - packets.GET_LIMIT_1], 0)
+        if command == packets.GET_DUTIES:
+            return struct.pack(">hh", *self.outputs)
+        if command == packets.GET_CURRENTS:
+            return struct.pack(">hh", *(self._reported(channel) for channel in (0, 1)))
         volts, logic = struct.pack(">H", round(10.0 * self.supply)), struct.pack(">H", 50)
         return {
-            packets.GET_VERSION: VERSION,
-            packets.GET_TIMEOUT: bytes((self.timeout,)),
-            packets.GET_STATUS: struct.pack(">I", self.warnings << 16 | self.errors),
-            packets.GET_LIMIT_1: struct.pack(">II", self.limits[0], 0),
-            packets.GET_LIMIT_2: struct.pack(">II", self.limits[1], 0),
-            packets.GET_DUTIES: struct.pack(">hh", *self.outputs),
-            packets.GET_CURRENTS: struct.pack(">hh", self._reported(0), self._reported(1)),
             packets.GET_MAIN_VOLTAGE: volts,
             packets.GET_LOGIC_VOLTAGE: logic,
             packets.GET_VOLTAGES: volts + logic,

@@ -23,7 +23,7 @@ CHUNK = 4096
 
 @dataclass
 class LineFaults:
-    """The faults of a serial line; may be set at any time.
+    """What goes wrong on a line; may be set at any time.
 
     Attributes:
         deaf: whether nothing gets to the boards, as if they were off.
@@ -131,8 +131,7 @@ class Line:
 
     def _serve(self) -> None:
         while not self._ends.is_set():
-            wait = max(0.0, min(TICK, self._late[0][0] - self._clock())) if self._late else TICK
-            readable, _, _ = select.select([self._host], [], [], wait)
+            readable, _, _ = select.select([self._host], [], [], self._patience())
             if readable:
                 with suppress(OSError):
                     self._receive(os.read(self._host, CHUNK))
@@ -140,6 +139,9 @@ class Line:
             while self._late and self._late[0][0] <= self._clock():
                 with suppress(OSError):  # nobody reads, and the line is full
                     os.write(self._host, self._late.popleft()[1])
+
+    def _patience(self) -> float:
+        return max(0.0, min(TICK, self._late[0][0] - self._clock())) if self._late else TICK
 
     def _receive(self, data: bytes) -> None:
         now, faults = self._clock(), self.faults

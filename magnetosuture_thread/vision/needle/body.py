@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.axis import fit_axis
-from magnetosuture_thread.vision.needle.ends import FULL, find_cover, find_tail, find_tip, is_glaring, turn_tail_first
-from magnetosuture_thread.vision.needle.strip import TAPER, Strip, measure_body_width, straight_strip
+from magnetosuture_thread.vision.needle.covers import is_glaring, what_covers
+from magnetosuture_thread.vision.needle.ends import FULL, tail_at, tip_at, turned_tail_first
+from magnetosuture_thread.vision.needle.strip import TAPER, Strip, body_width, fit_axis, straight_strip
 
 SHARPEST_PX = 4.5  # a tail fades within
 LENGTH_SLACK_PX, LENGTH_SLACK = 1.4, 0.007  # that the seen length may differ from the known one, and share of it
@@ -89,7 +89,7 @@ def measure_body(
         toward: where it must point, u right and v down; see `find_needles`.
 
     Returns:
-        The needle as `MeasuredNeedle`, or in words why this is none.
+        The needle as `SeenNeedle`, or in words why this is none.
     """
     rows, columns = gray.shape
     arc = guess.moved(first, 0.0, 0.0, 0.0)
@@ -110,10 +110,10 @@ def measure_body(
     corners = arc.at(np.array([0.0, last]))
     if corners.min() < 3.0 or (corners > np.array([columns, rows]) - 4.0).any():
         return "cut by the image's border"
-    body = measure_body_width(strip, last)
+    body = body_width(strip, last)
     if not (0.65 * width - 0.5 < body < 1.35 * width + 1.2):
         return f"{body:.1f} px wide"
-    turned = turn_tail_first(strip, last, body, toward)
+    turned = turned_tail_first(strip, last, body, toward)
     if turned is None:
         return "ends that look alike"
     strip, last = turned
@@ -134,7 +134,7 @@ def measure_body(
             return f"{seen:.1f} px long instead of {length:.1f}, with glare at an end"
     if fading > SHARPEST_PX:
         return "a tail that fades away"
-    reason = find_cover(strip, tail, tip, body)
+    reason = what_covers(strip, tail, tip, body)
     if reason:
         return reason
     axis = _body_axis(strip, tail, tip, body)
@@ -153,12 +153,12 @@ def measure_body(
 
 def _ends(strip: Strip, last: float, body: float, width: float) -> tuple[float, float, float] | None:
     """Return where tail and tip are along a strip, and how far the tail fades; None without a tail."""
-    tail = find_tail(strip, body)
+    tail = tail_at(strip, body)
     if tail is None:
         return None
     # What lets the sides look wider than they are, the lens or the liquid's edge, does so at the tail too.
     bloom = min(max(0.5 * (body - width), -MAX_BLOOM_PX), MAX_BLOOM_PX)
-    return tail[0] + bloom, find_tip(strip, last, body), tail[1]
+    return tail[0] + bloom, tip_at(strip, last, body), tail[1]
 
 
 def _body_axis(strip: Strip, tail: float, tip: float, body: float) -> tuple[Arc, float, np.ndarray] | None:

@@ -1,14 +1,13 @@
-"""A needle's two ends, tail and tip, and what covers or touches it: glare, a tool, a hand, another dark thing."""
+"""A needle's two ends: which is the blunt tail, which the pointed tip, and where each is."""
 
 from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 
-from magnetosuture_thread.vision.images import middle
 from magnetosuture_thread.vision.needle.strip import STEP_ASIDE_PX, TAPER, Strip
+from magnetosuture_thread.vision.sampling import middle
 
 TIP_LEVEL = 0.13  # of the body's width: a point thinner than this isn't seen
 UNSEEN_TIP, UNSEEN_TIP_PX = 1.3, -0.55  # of the blur, and beside it: what of a point is too fine to be seen
@@ -18,18 +17,8 @@ MIN_FADE = 0.25  # of the taper that the tip must take to fade
 ACROSS_QUANTILE = 0.35  # of the darkness across a tail
 TOWARD = 0.8  # cosine between a needle and where it must point
 
-WIDTH_SLACK_PX, WIDTH_SLACK = 0.7, 0.2  # that the width may differ from row to row
-THREAD_PX = 12.0  # from the tail on, beside which a thread that turns back sharply makes the body look wider
-DARKNESS_SLACK = 0.16  # of the body's darkness, that it may differ by from row to row
-EVEN_SHARE = 0.93  # of the body's rows must have its width and darkness
-AS_DARK, DARK_ROWS = 0.8, 0.06  # of the body's darkness, beside the body; and in how many rows at most
-GROUND_SLACK = 0.28  # of the ground's brightness, that it may differ by beside and beyond the needle
-GLARE_SLACK = 0.07  # of the ground's brightness, that it may be brighter by at an end
-GLARE_NOISES = 2.5  # and at least so many times the noise
-NOISE_OF_STEPS = 1.05  # noise by the median step between neighbours: 1.4826 / sqrt 2
 
-
-def turn_tail_first(strip: Strip, last: float, body: float, toward: np.ndarray | None) -> tuple[Strip, float] | None:
+def turned_tail_first(strip: Strip, last: float, body: float, toward: np.ndarray | None) -> tuple[Strip, float] | None:
     """Turn a strip so that its blunt end comes first; None unless the other takes much longer to fade."""
     middle = int(np.searchsorted(strip.along, 0.5 * last))
     halves = ((strip.along[middle::-1], strip.width[middle::-1]), (strip.along[middle:], strip.width[middle:]))
@@ -59,7 +48,7 @@ def turn_tail_first(strip: Strip, last: float, body: float, toward: np.ndarray |
     return turned, last
 
 
-def find_tail(strip: Strip, body: float) -> tuple[float, float] | None:
+def tail_at(strip: Strip, body: float) -> tuple[float, float] | None:
     """Return where the tail is along the strip, half-way from steel to what lies behind, and how far it fades.
 
     A low quantile across the axis passes over the thread, which is thinner than the needle.
@@ -77,8 +66,8 @@ def find_tail(strip: Strip, body: float) -> tuple[float, float] | None:
     return crossings[1], crossings[0] - crossings[2]
 
 
-def find_tip(strip: Strip, last: float, body: float) -> float:
-    """Return the tip's position along the strip: where the steel gets too thin to detect."""
+def tip_at(strip: Strip, last: float, body: float) -> float:
+    """Return where the tip is along the strip: where the steel gets too thin to be seen."""
     start = int(np.searchsorted(strip.along, (1.0 - TAPER) * last))
     core = np.abs(strip.aside) < 0.3 * body + 1.0
     width = strip.steel[start:, core].sum(axis=1) * STEP_ASIDE_PX
@@ -102,45 +91,3 @@ def _falls_below(along: np.ndarray, profile: np.ndarray, level: float) -> float:
         return float(along[-1] if profile[0] >= level else along[0])
     part = (profile[after - 1] - level) / max(float(profile[after - 1] - profile[after]), 1e-9)
     return float(along[after - 1] + part * (along[after] - along[after - 1]))
-
-
-def is_glaring(strip: Strip, tail: float, tip: float, body: float) -> bool:
-    """Return whether the lamp is reflected at an end."""
-    wide = np.abs(strip.aside) < 0.5 * body + 3.0
-    usual = middle(strip.ground[(strip.along > tail) & (strip.along < tip)])
-    light = ((1.0 - strip.dark) * strip.ground.mean(axis=1, keepdims=True) / usual).astype(np.float32)
-    noise = middle(np.abs(np.diff(light[:, wide], axis=0))) * NOISE_OF_STEPS
-    bound = 1.0 + max(GLARE_SLACK, GLARE_NOISES * noise)
-    return any(
-        float(cv2.blur(light[np.ix_(np.abs(strip.along - at) < 5.0, wide)], (5, 3)).max()) > bound for at in (tail, tip)
-    )
-
-
-def find_cover(strip: Strip, tail: float, tip: float, body: float) -> str:
-    """Return what covers or touches the needle; empty if nothing does."""
-    along, length = strip.along, tip - tail
-    rows = (along > tail + 2.0) & (along < tail + (1.0 - TAPER) * length - 2.0)
-    core = np.abs(strip.aside) < max(0.42 * body, 0.6)
-    if rows.sum() < 0.5 * length or along[0] > tail - 7.0 or along[-1] < tip + 4.0:
-        return "an end out of place"
-    even = np.abs(strip.width[rows] - body) < WIDTH_SLACK_PX + WIDTH_SLACK * body
-    even |= (along[rows] < tail + min(THREAD_PX, 0.35 * length)) & (strip.width[rows] > body)
-    # Steel is equally dark all along, at the darkest place across it: beside the gleam.
-    darkest = strip.dark[np.ix_(rows, core)].max(axis=1) / strip.depth
-    steel = np.abs(cv2.blur(darkest, (1, 5)).ravel() - 1.0) < DARKNESS_SLACK
-    if (even & steel).mean() < EVEN_SHARE:
-        return "something over it or against it"
-    around = np.abs(np.abs(strip.aside) - 0.5 * body - 3.5) < 1.5
-    dark = strip.dark[np.ix_((along > tail - 8.0) & (along < tip + 4.0), around)] > AS_DARK * strip.depth
-    if dark.any(axis=1).mean() > DARK_ROWS:
-        return "something dark against it"
-    beside = strip.ground[(along > tail) & (along < tip)]
-    usual = middle(beside)
-    if (np.abs(beside / usual - 1.0) > GROUND_SLACK).mean() > 0.1:
-        return "something beside it"
-    wide = np.abs(strip.aside) < 0.5 * body + 3.0
-    light = (1.0 - strip.dark) * strip.ground.mean(axis=1, keepdims=True) / usual
-    for name, low, high in (("tail", tail - 7.0, tail - 3.0), ("tip", tip + 2.0, tip + 5.0)):
-        if abs(middle(light[np.ix_((along > low) & (along < high), wide)]) - 1.0) > GROUND_SLACK:
-            return f"something at its {name}"
-    return ""

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.images import Picture, middle
+from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle, measure_body
+from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
@@ -101,7 +102,7 @@ def _measured(
 def _dark_components(
     picture: Picture, view: DishView, dish_radius: float, area: float, tight: bool
 ) -> list[np.ndarray]:
-    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2)."""
+    """Return the pixels of each dark component of at least a part `LEAST_AREA` of an area [px^2], shape (m, 2)."""
     factor = picture.factor
     shift = 0.5 * (factor - 1)
     u, v = ((c - shift) / factor for c in view.centre_px)
@@ -135,7 +136,7 @@ def _dark_components(
 
 
 def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
-    """Return whether a needle's axis lies in shapes: a real one stays half its width off their outlines [px]."""
+    """Say whether a needle's axis lies in shapes: that of a real one stays half its width off their outlines [px]."""
     depths = mask.depths(needle.arc.at(np.linspace(0.0, needle.length_px, AXIS_POINTS)))
     return middle(depths) > mask.tolerance_px - 0.5 * width
 

@@ -75,21 +75,6 @@ def rig(
     return RigDynamics(needle, thread, surface, field or coils(), points[0], heading, points, largest_step=largest_step)
 
 
-def elastic_energy(made: RigDynamics) -> float:
-    """Return the elastic energy of a rig's thread, with the clamp's [J]."""
-    thread, edges = made.properties, np.diff(made.thread, axis=0)
-    length = thread.length / thread.segments
-    stretch = 0.5 * length / thread.stretching_stiffness * float(made.tension @ made.tension)
-    cross = edges[:-1, 0] * edges[1:, 1] - edges[:-1, 1] * edges[1:, 0]
-    turns = np.arctan2(cross, np.sum(edges[:-1] * edges[1:], axis=1)) - thread.rest_curvature * length
-    bend = thread.bending_stiffness / length * float(np.sum(1.0 - np.cos(turns)))
-    if thread.attachment is NeedleJoint.PINNED:
-        return stretch + bend
-    c, s, aside = math.cos(made.heading), math.sin(made.heading), 0.5 * thread.rest_curvature * length**2
-    gap = edges[0] + [c * length - s * aside, s * length + c * aside]
-    return stretch + bend + thread.bending_stiffness / length**3 * float(gap @ gap)
-
-
 def steered(made: RigDynamics, seconds: float, strength: float = 1.0) -> RigDynamics:
     """Let smoothly changing currents move a rig."""
     for k in range(round(seconds / FRAME)):
@@ -166,7 +151,7 @@ def test_a_curved_thread_comes_to_rest_in_its_own_shape():
         made.drive((0.0, 0.0), 0.0, 8.0)
     expected = behind(curved, 60.0, count=61)
     assert np.abs(made.thread - expected).max() < 1e-3 * curved.length
-    assert elastic_energy(made) < 1e-5 * elastic_energy(rig(curved, curvature=30.0))
+    assert made.energy < 1e-5 * rig(curved, curvature=30.0).energy
 
 
 @pytest.mark.parametrize("attachment", [NeedleJoint.PINNED, NeedleJoint.CLAMPED])
@@ -174,10 +159,10 @@ def test_without_currents_the_energy_only_falls(attachment: NeedleJoint):
     made = rig(
         replace(POLYAMIDE, attachment=attachment), curvature=120.0, surface=Surface((Disc((-5e-3, 1e-3), 1e-3),))
     )
-    energies = [elastic_energy(made)]
+    energies = [made.energy]
     for _ in range(60):
         made.step(np.zeros(4), FRAME)
-        energies.append(elastic_energy(made))
+        energies.append(made.energy)
     assert (np.diff(energies) < 0.0).all()
     assert energies[-1] < 0.7 * energies[0]
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
-from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody, add_needle
+from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 
 FIELD = CoilField([Coil((0.05, 0.02, 0.0), (-1.0, 0.3, 0.0), 0.025, 0.03, 480.0)])
 
@@ -68,12 +67,7 @@ def test_a_small_needle_is_a_dipole():
         return 2.0 * FIELD.per_current(np.array([[*place, 0.0]]))[0, 0, :2]
 
     half, h = 0.5 * needle.length * direction, 1e-4
-    packed = Needle(np.zeros((3, 3)), needle.tip, needle.pole, np.zeros((0, 2)), 0.0, (0.0, 0.0))
-    q, gradient = np.array([heading, *(middle - half), 0.0, 0.0]), np.zeros(5)
-    poles, nothing = np.array([at(middle - half), at(middle + half)]), np.zeros((3, 3))
-    shapes, rows, band = Surface().packed(), np.zeros((1, 5)), np.zeros((5, 6))
-    add_needle(q, poles, packed, shapes, q.copy(), nothing, rows, gradient, band, False)
-    torque, *force = -gradient[:3]
+    force, torque = needle.wrench(at(middle - half), at(middle + half), heading)
     slopes = np.array([(at(middle + h * e) - at(middle - h * e)) / (2.0 * h) for e in np.eye(2)])
     np.testing.assert_allclose(force, moment @ slopes, rtol=1e-4)
     about_middle = torque - (half[0] * force[1] - half[1] * force[0])

@@ -9,7 +9,8 @@ import pytest
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
-from magnetosuture_thread.vision.dish import AGREEING, RIM_RAYS, DishTracker, find_dish, rim_shift
+from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_dish, rim_shift
+from magnetosuture_thread.vision.dish.watch import AGREEING, DishWatch
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import NOWHERE, Pose, finger, render
 
@@ -60,29 +61,29 @@ def test_the_quick_check_tells_how_far_the_rim_has_moved():
 
 def test_a_bumped_camera_is_believed_only_after_several_frames():
     before, after = gray_of((322.0, 238.0), 8e-5, 3), gray_of((330.0, 235.0), 8e-5, 3)
-    watch = DishTracker(VisionTrackerSettings(), 0.035)
-    assert watch.update(before) == ""
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
+    assert watch.look(before) == ""
     seen = watch.view
-    assert [watch.update(after) != "" for _ in range(AGREEING)] == [True] * (AGREEING - 1) + [False]
+    assert [watch.look(after) != "" for _ in range(AGREEING)] == [True] * (AGREEING - 1) + [False]
     assert watch.view is not None
     assert np.linalg.norm(np.subtract(watch.view.centre_px, (330.0, 235.0))) < 0.5
-    assert watch.update(before) != ""  # and one odd frame later changes nothing
-    assert watch.update(after) == ""
+    assert watch.look(before) != ""  # and one odd frame later changes nothing
+    assert watch.look(after) == ""
     assert seen is not None
 
 
 def test_a_dark_frame_gives_no_view_and_changes_none():
     gray = gray_of((322.0, 238.0), 8e-5, 3)
-    watch = DishTracker(VisionTrackerSettings(), 0.035)
-    watch.update(gray)
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
+    watch.look(gray)
     view = watch.view
-    assert watch.update(0 * gray) == "too little of the dish is seen"
-    assert watch.update(gray) == ""
+    assert watch.look(0 * gray) == "too little of the dish is seen"
+    assert watch.look(gray) == ""
     assert watch.view is view
 
 
 def test_a_given_view_needs_no_dish():
     settings = VisionTrackerSettings(dish_centre_px=(320.0, 240.0), metres_per_pixel=8e-5, camera_rotation=0.1)
-    watch = DishTracker(settings, 0.035)
-    assert watch.update(np.zeros((480, 640), np.uint8)) == ""
+    watch = DishWatch(settings, 0.035)
+    assert watch.look(np.zeros((480, 640), np.uint8)) == ""
     assert watch.view == DishView((320.0, 240.0), 8e-5, 0.1)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.axis import fit_edges
-from magnetosuture_thread.vision.needle.strip import Strip
+from magnetosuture_thread.vision.needle.edges import fit_edges
 
 ALONG = np.arange(0.0, 30.0)
 ASIDE = np.arange(-9.0, 9.1, 0.5)
@@ -26,9 +24,11 @@ def strip(hidden: float, first: float, last: float) -> np.ndarray:
 
 def fit(steel: np.ndarray) -> tuple[np.ndarray, tuple[int, int, int, float]]:
     """Return c_0 to c_2 and h in pixels, and what the fit says of itself."""
-    image = Strip(Arc(np.zeros(2), 0.0, 0.0), ALONG, ASIDE, steel, np.empty(0), 1.0, steel, steel.sum(axis=1) * 0.5)
-    found = fit_edges(image, (-1.0, 30.0, 0.85 * WIDTH, WIDTH + 0.6), 0.0, 1.0, 0.5 * WIDTH)
-    return found.values, (found.rows, found.taken, found.kept, found.square)
+    values, inverse = np.empty(4), np.empty((4, 4))
+    width = steel.sum(axis=1) * 0.5
+    span = (-1.0, 30.0, 0.85 * WIDTH, WIDTH + 0.6, 0.0)
+    said = fit_edges(ALONG, ASIDE, steel, width, span, 1.0, 0.5 * WIDTH, values, inverse)
+    return values, said
 
 
 def test_without_a_thread_every_edge_counts():

@@ -29,9 +29,9 @@ def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 1
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.8) + rough, 0, 255).astype(np.uint8)
 
 
-def walk(image: np.ndarray, longest: float = 400.0, reach: float = 230.0) -> np.ndarray:
+def walk(image: np.ndarray, max_length: float = 400.0, reach: float = 230.0) -> np.ndarray:
     """Follow the thread."""
-    return find_centreline(prepare(image, 2), NEEDLE, longest, (320.0, 240.0), reach)
+    return find_centreline(prepare(image, 2), NEEDLE, max_length, (320.0, 240.0), reach)
 
 
 def wave(length: float = 150.0) -> np.ndarray:
@@ -46,11 +46,11 @@ def winding(turn: np.ndarray, length: float = 237.0, start: tuple[float, float] 
     return np.vstack([start, np.array(start) + np.cumsum(steps, axis=0)])
 
 
-def check_order(found: np.ndarray, truth: np.ndarray, most: float = 4.0) -> None:
+def check_order(found: np.ndarray, truth: np.ndarray, max_shift: float = 4.0) -> None:
     """Assert that a line goes along the true one, at the same length in the same place."""
     at = np.linspace(0.0, 0.94 * arc_lengths(truth)[-1], 60)
     assert arc_lengths(found)[-1] > 0.95 * arc_lengths(truth)[-1]
-    assert np.linalg.norm(points_at(found, at) - points_at(truth, at), axis=1).max() < most
+    assert np.linalg.norm(points_at(found, at) - points_at(truth, at), axis=1).max() < max_shift
 
 
 @pytest.mark.parametrize(("noise", "level"), [(2.0, 140), (7.0, 140), (2.0, 195)], ids=["usual", "noisy", "faint"])
@@ -81,7 +81,7 @@ def test_under_glare_the_thread_may_go_on():
 
 
 def test_it_stops_at_the_longest_length_and_at_the_wall():
-    assert walk(drawn(wave()), longest=60.0)[-1, 0] > 240.0
+    assert walk(drawn(wave()), max_length=60.0)[-1, 0] > 240.0
     near_wall = walk(drawn(wave()), reach=100.0)
     assert np.linalg.norm(near_wall - (320.0, 240.0), axis=1).max() <= 100.0
     assert np.linalg.norm(near_wall[-1] - (320.0, 240.0)) > 96.0
@@ -104,7 +104,7 @@ def test_the_thread_may_leave_the_tail_at_any_angle_but_the_needles(angle: float
 def test_the_walk_goes_straight_through_its_own_crossing(sign: float, radius: float):
     turned = np.clip((np.linspace(0.0, 237.0, 800) - 50.0) / radius, 0.0, 1.6 * np.pi)
     line = winding(np.pi + sign * turned)
-    check_order(walk(drawn(line), longest=250.0), line)
+    check_order(walk(drawn(line), max_length=250.0), line)
 
 
 def test_where_straight_on_shows_less_of_the_thread_the_loop_is_taken():
@@ -112,7 +112,7 @@ def test_where_straight_on_shows_less_of_the_thread_the_loop_is_taken():
     s = np.linspace(0.0, 237.0, 800)
     line = winding(np.pi - 0.15 + np.clip((s - 60.0) / 15.0, 0.0, 2.0 * np.pi + 0.3))
     image = drawn(line)
-    found = walk(image, longest=250.0)
+    found = walk(image, max_length=250.0)
     assert arc_lengths(found)[-1] > 0.93 * 237.0
     assert line_error(found, line)[1] > 0.95
 
@@ -121,14 +121,14 @@ def test_the_walk_crosses_under_the_needle():
     turned = np.clip((np.linspace(0.0, 237.0, 800) - 25.0) / 26.0, 0.0, 1.5 * np.pi)
     line = winding(np.pi + turned)
     assert line[:, 0].max() > 330.0 or line[:, 1].min() < 200.0
-    check_order(walk(drawn(line), longest=250.0), line)
+    check_order(walk(drawn(line), max_length=250.0), line)
 
 
 def test_a_near_pass_beside_an_earlier_part_does_not_capture_it():
     """A hairpin whose arms are 7 px apart."""
     s = np.linspace(0.0, 237.0, 1200)
     line = winding(np.pi + np.clip((s - 110.0) / 7.0, 0.0, np.pi) - 0.25 * np.clip((s - 140.0) / 90.0, 0.0, 1.0))
-    check_order(walk(drawn(line), longest=250.0), line)
+    check_order(walk(drawn(line), max_length=250.0), line)
 
 
 def test_the_thread_is_followed_past_posts():

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.bridge.drive_watch import DriveWatch
 from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power.watch import DriveWatch
 
 
 def test_coils_are_driven_while_any_board_is(tmp_path: Path):

@@ -1,71 +1,27 @@
-"""Draws what does not move before the simulated camera: table, dish, rim, obstacles, glare, dust.
-
-Shapes are drawn larger than the image, which gives how much of each pixel they cover.
-"""
+"""Draws what does not move before the simulated camera: table, dish, rim, obstacles, glare, dust."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.rig.camera.coverage import Light, box_around, covered
 from magnetosuture_thread.rig.camera.scene import SILICONE, CameraScene, Lighting, Look
 
-OVERSAMPLING = 4
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
 RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
 DROP_SHADOW_PX = np.array([3.0, 4.0])
 LAMP_PX = (-0.5, -0.86)  # direction towards the lamp, in the image
 GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]
 
-Light = NDArray[np.float32]
-Box = tuple[slice, slice]
 
-
-def box_around(points: Points, size: tuple[int, int], margin: float) -> Box | None:
-    """Return the rows and columns of an image that hold points, with a margin; None if none does.
-
-    Args:
-        points: shape (m, 2) [px].
-        size: width and height of the image [px].
-        margin: [px].
-    """
-    points = points[np.all(np.isfinite(points), axis=1)]
-    if not len(points):
-        return None
-    low = np.maximum(np.floor(points.min(axis=0) - margin), 0.0)
-    high = np.minimum(np.ceil(points.max(axis=0) + margin), size)
-    if np.any(high <= low):
-        return None
-    (left, top), (right, bottom) = low.astype(int), high.astype(int)
-    return slice(int(top), int(bottom)), slice(int(left), int(right))
-
-
-def covered(box: Box, *rings: Points) -> Light:
-    """Return the share of each pixel in a box that a shape covers, shape (rows, columns).
-
-    Args:
-        box: rows and columns.
-        rings: outlines of the shape and of its holes, each of shape (m, 2) [px].
-    """
-    rows, columns = box[0].stop - box[0].start, box[1].stop - box[1].start
-    canvas = np.zeros((rows * OVERSAMPLING, columns * OVERSAMPLING), np.uint8)
-    outlines = [on_canvas(ring - (box[1].start, box[0].start)) for ring in rings]
-    cv2.fillPoly(canvas, outlines, 255, cv2.LINE_8, 4)
-    small = cv2.resize(canvas, (columns, rows), interpolation=cv2.INTER_AREA)
-    return np.asarray(small * np.float32(1.0 / 255.0), dtype=np.float32)
-
-
-def on_canvas(pixels: Points) -> NDArray[np.int32]:
-    """Return pixels (u, v) in the coordinates of a canvas that begins with (0, 0), in sixteenths."""
-    return np.asarray(np.round(((pixels + 0.5) * OVERSAMPLING - 0.5) * 16.0), dtype=np.int32)
-
-
-class Background:
-    """Draws the background of all frames once.
+class StillLife:
+    """Draws the background once.
 
     Args:
         scene: what stands there.
@@ -78,7 +34,11 @@ class Background:
     def __init__(
         self, scene: CameraScene, lighting: Lighting, view: DishView, size: tuple[int, int], random: np.random.Generator
     ) -> None:
-        self._scene, self._lighting, self._view, self._size, self._random = scene, lighting, view, size, random
+        self._scene = scene
+        self._lighting = lighting
+        self._view = view
+        self._size = size
+        self._random = random
 
     def draw(self) -> Light:
         """Return the light that falls on the sensor before lens and exposure, shape (rows, columns, 3)."""
@@ -120,19 +80,25 @@ class Background:
     def _add_obstacle(self, image: Light, obstacle: Obstacle, look: Look) -> None:
         """Add a solid: a soft shadow, its top, a highlight on a disc."""
         rings = [self._view.to_pixels(ring) for ring in still_outlines(obstacle)]
-        box = box_around(np.vstack(rings), self._size, margin=24.0)
+        corners = np.vstack(rings)
+        box = box_around(corners, self._size, margin=24.0)
         if box is None:
             return
         region = image[box]
-        shade = cv2.GaussianBlur(covered(box, *(ring + DROP_SHADOW_PX for ring in rings)), (0, 0), 4.0)
+
+        def solid(of: Sequence[Points]) -> Light:
+            return covered(box, lambda canvas, to: cv2.fillPoly(canvas, [to(r) for r in of], 255, cv2.LINE_8, 4))
+
+        shade = cv2.GaussianBlur(solid([ring + DROP_SHADOW_PX for ring in rings]), (0, 0), 4.0)
         region *= 1.0 - 0.2 * shade[:, :, None]
-        top = covered(box, *rings)
+        top = solid(rings)
         colour = self._surface(top, look) + (self._smear(look.mottle, 9.0)[box][:, :, None] if look.mottle else 0.0)
         region += top[:, :, None] * (colour - region)
         if isinstance(obstacle, Disc):
             radius = obstacle.radius / self._view.metres_per_pixel
             small = self._view.to_pixels(np.asarray(obstacle.centre)) - 0.35 * radius
-            shine = cv2.GaussianBlur(covered(box, small + 0.25 * radius * _circle(128)), (0, 0), 0.15 * radius + 0.5)
+            ring = small + 0.25 * radius * circle(128)
+            shine = cv2.GaussianBlur(solid([ring]), (0, 0), 0.15 * radius + 0.5)
             region += shine[:, :, None] * 40.0
 
     def _surface(self, top: Light, look: Look) -> Light:
@@ -184,7 +150,7 @@ class Background:
             image -= float(self._random.uniform(4.0, 16.0)) * cv2.GaussianBlur(speck, (0, 0), 0.9)[:, :, None]
 
 
-def _circle(corners: int) -> Points:
+def circle(corners: int) -> Points:
     """Return a unit circle as a polygon, shape (corners, 2)."""
     angles = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
     return np.column_stack([np.cos(angles), np.sin(angles)])
@@ -197,7 +163,7 @@ def still_outlines(obstacle: Obstacle) -> list[Points]:
         ValueError: a mesh has no outline in the plane.
     """
     if isinstance(obstacle, Disc):
-        return [np.asarray(obstacle.centre) + obstacle.radius * _circle(256)]
+        return [np.asarray(obstacle.centre) + obstacle.radius * circle(256)]
     if isinstance(obstacle, Mesh):
         raise ValueError("the camera sees discs and polygons; a mesh is of space")
     return obstacle.rings

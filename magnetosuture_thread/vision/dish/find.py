@@ -1,15 +1,12 @@
-"""Finds the petri dish, a bright disc within a dark rim, and notices over time when the camera was bumped."""
+"""Finds the petri dish: a bright disc within a dark rim."""
 
 from __future__ import annotations
-
-import math
 
 import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.images import sample_grid
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.sampling import rim_along_rays
 
 RAYS = 180
 SHARE_OF_RAYS = 0.6  # of the rays must meet the fitted circle
@@ -23,9 +20,6 @@ RIM_RAYS = 72  # of the quick check
 RIM_REACH_PX = 7.0  # how far the quick check looks in and out
 STILL_PX = 1.0  # a rim seen this near to where it was stands still
 RIM_SHARE = 0.4  # of the quick check's rays must see the rim
-SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
-AGREEING = 3  # frames in a row that must agree on a new view
-VIEW_AGREEMENT_PX, VIEW_AGREEMENT = 1.0, 0.005  # of centres, and of scales
 
 
 def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
@@ -66,21 +60,6 @@ def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
     return None
 
 
-def find_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> DishView | None:
-    """Return the view, its unknown parts from the dish in the image; None if no dish is found."""
-    fixed = settings.fixed_view()
-    if fixed is not None:
-        return fixed
-    found = find_dish(gray, diameter)
-    if found is None:
-        return None
-    scale = settings.metres_per_pixel or found.metres_per_pixel
-    if abs(found.metres_per_pixel / scale - 1.0) > SCALE_SLACK:
-        return None
-    centre = settings.dish_centre_px
-    return DishView((centre[0], centre[1]) if centre else found.centre_px, scale, settings.camera_rotation)
-
-
 def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> tuple[float, int]:
     """Look quickly whether the rim is where it was.
 
@@ -116,16 +95,16 @@ def _first_guess(gray: np.ndarray, rows: int) -> tuple[float, float, float] | No
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if factor > 1 else gray
     size = (gray.shape[1] // factor, gray.shape[0] // factor)
     small = cv2.resize(half, size, interpolation=cv2.INTER_AREA)
-    least = min(small.shape)
+    minimum = min(small.shape)
     circles = cv2.HoughCircles(
         small,
         cv2.HOUGH_GRADIENT,
         dp=1,
-        minDist=least,
+        minDist=minimum,
         param1=60,
         param2=0.2 * rows,
-        minRadius=int(0.25 * least),
-        maxRadius=int(0.55 * least),
+        minRadius=int(0.25 * minimum),
+        maxRadius=int(0.55 * minimum),
     )
     if circles is None:
         return None
@@ -137,42 +116,15 @@ def _first_guess(gray: np.ndarray, rows: int) -> tuple[float, float, float] | No
 def _edge_points(
     gray: np.ndarray, u: float, v: float, radius: float, reach: float, step: float, rays: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where rays from the centre meet the rim's inner edge, and its darkest ring, both of shape (m, 2).
-
-    Args:
-        gray: shape (rows, columns), uint8.
-        u: of the centre, about [px].
-        v: the same.
-        radius: about [px].
-        reach: how far inside and outside of the radius to look [px].
-        step: between samples [px].
-        rays: their number.
-    """
-    count, angles = int(2.0 * reach / step), 2.0 * np.pi * np.arange(rays) / rays
-    at, ways = np.arange(count), np.column_stack([np.cos(angles), np.sin(angles)])
-    centre, begin = np.array([u, v]), radius - reach
-    profiles = sample_grid(gray, centre + (begin + step * at)[:, None] * ways[:, None])
-    inside, dark = np.median(profiles[:, : max(3, count // 8)], axis=1), profiles.min(axis=1)
-    half = 0.5 * (inside + dark)
-    first = np.argmax(profiles < half[:, None], axis=1)  # sample beyond the edge
-    found = (inside - dark >= np.maximum(MIN_CONTRAST, CONTRAST * inside)) & (first > 0)
-    profiles, half, first, ways = profiles[found], half[found], first[found], ways[found]
-    ray = np.arange(len(first))
-    before, after = profiles[ray, first - 1], profiles[ray, first]
-    edges = centre + (begin + step * (first - 1 + (before - half) / (before - after)))[:, None] * ways
-    end = np.minimum(first + int(max(4.0, BAND * radius) / step) + 1, count - 1)[:, None]
-    lowest = np.where((at >= first[:, None]) & (at <= end), profiles, np.inf).argmin(axis=1)
-    beyond = np.where((at >= lowest[:, None]) & (at <= end), profiles, -np.inf).max(axis=1)
-    left, low, right = (profiles[ray, np.clip(lowest + shift, 0, count - 1)] for shift in (-1, 0, 1))
-    bend = left - 2.0 * low + right
-    # Beyond its darkest ring a rim is brighter again; a plain edge has no such ring.
-    ring = (lowest < end[:, 0]) & (bend > 0.0) & (beyond > low + 0.5 * MIN_CONTRAST)
-    place = lowest[ring] + 0.5 * (left - right)[ring] / bend[ring]
-    return edges, centre + (begin + step * place)[:, None] * ways[ring]
+    """Return where rays from the centre meet the rim's inner edge, and its darkest ring, both of shape (m, 2)."""
+    edges, darkest = np.empty((rays, 2)), np.empty((rays, 2))
+    band = max(4.0, BAND * radius)
+    counts = rim_along_rays(gray, (u, v, radius), reach, step, band, MIN_CONTRAST, CONTRAST, edges, darkest)
+    return edges[: counts[0]], darkest[: counts[1]]
 
 
 def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:
-    """Return whether the floor near the rim is as bright as the image can show."""
+    """Say whether the floor near the rim is as bright as the image can show."""
     angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     at = np.column_stack([u + 0.93 * radius * np.cos(angles), v + 0.93 * radius * np.sin(angles)])
     columns, rows = np.clip(at.round().astype(int), 0, np.array(gray.shape[::-1]) - 1).T
@@ -195,62 +147,3 @@ def _fit_circle(points: np.ndarray, agreement: float) -> tuple[float, float, flo
         distance = np.abs(np.hypot(points[:, 0] - u, points[:, 1] - v) - radius)
         kept = points[distance < tolerance]
     return float(u), float(v), radius, len(kept)
-
-
-class DishTracker:
-    """Tracks the view of the dish from frame to frame.
-
-    The dish is found once. In every frame its rim is looked at again: as long as it is where it was, the
-    view stays as it is. Where it is not, there is no view until several frames in a row agree on a new one.
-
-    Args:
-        settings: what to look for.
-        diameter: inner diameter of the dish [m].
-    """
-
-    def __init__(self, settings: VisionTrackerSettings, diameter: float) -> None:
-        self._settings = settings
-        self._diameter = diameter
-        self._fixed = settings.fixed_view()
-        self.view = self._fixed
-        self._anew: list[DishView] = []
-
-    def reset(self) -> None:
-        """Begin anew, as with a camera of another size."""
-        self.view, self._anew = self._fixed, []
-
-    def update(self, gray: np.ndarray) -> str:
-        """Check in the next frame whether the rim is where it was.
-
-        Args:
-            gray: image, shape (rows, columns), uint8.
-
-        Returns:
-            Why the view must not be used in this frame; empty if it may.
-        """
-        if self._fixed is not None:
-            return ""
-        if self.view is None:
-            self.view = find_view(gray, self._settings, self._diameter)
-            return "" if self.view is not None else "no dish in the image"
-        shift, rays = rim_shift(gray, self.view.centre_px, 0.5 * self._diameter / self.view.metres_per_pixel)
-        seen = rays >= RIM_SHARE * RIM_RAYS
-        if seen and shift < STILL_PX:
-            self._anew = []
-            return ""
-        found = find_view(gray, self._settings, self._diameter)
-        if found is None:
-            self._anew = []
-            return "too little of the dish is seen"
-        if self._anew and not _agree(found, self._anew[-1]):
-            self._anew = []
-        self._anew.append(found)
-        if len(self._anew) < AGREEING:
-            return "the dish is not where it was"
-        self.view, self._anew = found, []
-        return ""
-
-
-def _agree(one: DishView, other: DishView) -> bool:
-    apart = math.dist(one.centre_px, other.centre_px)
-    return apart < VIEW_AGREEMENT_PX and abs(one.metres_per_pixel / other.metres_per_pixel - 1.0) < VIEW_AGREEMENT

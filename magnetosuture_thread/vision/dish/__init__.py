@@ -1,0 +1,1 @@
+"""The dish in a camera frame."""

@@ -1,0 +1,185 @@
+"""One frame looked at: where the dish, the needle and the thread are in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.scene.scene import Scene
+from magnetosuture_thread.vision.dish.find import find_dish
+from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, prepare
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.find import find_needles, search_factor
+from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.thread.centreline import find_centreline
+
+MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
+WALL_PX = 4.0  # before which the walk ends
+SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
+SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
+
+
+class State(Enum):
+    """What is known of the needle in a frame."""
+
+    SEARCHING = "searching"
+    TRACKED = "tracked"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class Track:
+    """What one frame shows.
+
+    Attributes:
+        state: TRACKED when there is a pose; LOST when this frame gives none; SEARCHING while the needle is
+            found anew, or seen but not yet often enough.
+        reason: why there is no pose; empty when tracked.
+        confidence: of the pose, 0 to 1; 0 without one.
+        tail: the needle's blunt end, shape (2,) [m]; empty without a pose.
+        tip: its point, shape (2,) [m]; empty without a pose.
+        heading: unit tangent at the tail, towards the tip, shape (2,); empty without a pose.
+        curvature: of the needle's axis, positive to the left of the heading [1/m]; 0 without a pose.
+        covariance: of (x, y, heading angle), shape (3, 3) [m, m, rad]; empty without a pose.
+        centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
+        view: where the dish is in the image; None when it is not found.
+    """
+
+    state: State
+    reason: str
+    confidence: float
+    tail: np.ndarray
+    tip: np.ndarray
+    heading: np.ndarray
+    curvature: float
+    covariance: np.ndarray
+    centreline: np.ndarray
+    view: DishView | None
+
+
+def no_pose(state: State, reason: str, view: DishView | None) -> Track:
+    """Return what is said of a frame without a pose."""
+    nothing = np.empty(0)
+    return Track(state, reason, 0.0, nothing, nothing, nothing, 0.0, np.empty((0, 0)), np.empty((0, 2)), view)
+
+
+def find_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> DishView | None:
+    """Return the view: what of it is given, and the rest by the dish; None if no dish is seen."""
+    fixed = settings.fixed_view()
+    if fixed is not None:
+        return fixed
+    found = find_dish(gray, diameter)
+    if found is None:
+        return None
+    scale = settings.metres_per_pixel or found.metres_per_pixel
+    if abs(found.metres_per_pixel / scale - 1.0) > SCALE_SLACK:
+        return None
+    centre = settings.dish_centre_px
+    return DishView((centre[0], centre[1]) if centre else found.centre_px, scale, settings.camera_rotation)
+
+
+def picture_of(
+    gray: np.ndarray,
+    view: DishView,
+    settings: VisionTrackerSettings,
+    mask: SceneMask | None,
+    box: tuple[int, int, int, int] | None = None,
+) -> Picture:
+    """Make a frame ready to measure on, or the part of it in a box (left, top, right, bottom) [px]."""
+    factor = search_factor(settings.needle_width / view.metres_per_pixel)
+    if box is None:
+        return prepare(gray, factor, mask=mask)
+    left, top, right, bottom = box
+    part = mask.part(left, top, right, bottom) if mask is not None else None
+    # Copied: compiled code is compiled once more for each other layout of memory.
+    return prepare(np.ascontiguousarray(gray[top:bottom, left:right]), factor, (left, top), part)
+
+
+def mask_of(gray: np.ndarray, view: DishView, settings: VisionTrackerSettings, scene: Scene) -> SceneMask | None:
+    """Return where the shapes of a scene are in a frame; None if it has none."""
+    factor = search_factor(settings.needle_width / view.metres_per_pixel)
+    return scene_mask(scene, view, gray.shape, factor, settings.outline_tolerance, FLOOR_FACTOR)
+
+
+def needles_in(
+    picture: Picture,
+    view: DishView,
+    settings: VisionTrackerSettings,
+    diameter: float,
+    toward: np.ndarray | None = None,
+) -> tuple[list[MeasuredNeedle], list[str]]:
+    """Find the needles in a picture, in its own pixels; see `find_needles`."""
+    radius, length, width = 0.5 * diameter, settings.needle_length, settings.needle_width
+    return find_needles(picture, _local(view, picture), radius, length, width, toward)
+
+
+def why_none(refused: list[str]) -> str:
+    """Say in words why no needle was found."""
+    return "no needle in the dish" + (f"; dark things: {', '.join(refused)}" if refused else "")
+
+
+def tracked(
+    picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needle: MeasuredNeedle
+) -> Track:
+    """Return what a frame shows whose needle is known, in the picture's own pixels, with the thread's centreline."""
+    local = _local(view, picture)
+    reach = 0.5 * diameter / view.metres_per_pixel - WALL_PX
+    max_length = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
+    walk = find_centreline(picture, needle, max_length, local.centre_px, reach)
+    heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
+    covariance = _in_dish(needle, view)
+    if not settings.metres_per_pixel:  # A wrong scale shifts what is far from the dish's centre.
+        covariance[:2, :2] += SCALE_ERROR**2 * np.outer(tail, tail)
+    return Track(
+        state=State.TRACKED,
+        reason="",
+        confidence=needle.confidence,
+        tail=tail,
+        tip=local.to_dish(needle.tip_px),
+        heading=heading,
+        curvature=-needle.curvature_px / view.metres_per_pixel,
+        covariance=covariance,
+        centreline=local.to_dish(walk),
+        view=view,
+    )
+
+
+def look_once(
+    gray: np.ndarray,
+    settings: VisionTrackerSettings,
+    scene: Scene,
+    masked: Callable[[DishView], SceneMask | None] | None = None,
+) -> Track:
+    """Look at one frame alone; `masked` gives the scene's mask for a view, if somebody keeps it."""
+    diameter = scene.dish.diameter
+    view = find_view(gray, settings, diameter)
+    if view is None:
+        return no_pose(State.LOST, "no dish in the image", None)
+    mask = masked(view) if masked is not None else mask_of(gray, view, settings, scene)
+    picture = picture_of(gray, view, settings, mask)
+    needles, refused = needles_in(picture, view, settings, diameter)
+    if len(needles) == 1:
+        return tracked(picture, view, settings, diameter, needles[0])
+    return no_pose(State.LOST, f"{len(needles)} needles in the dish" if needles else why_none(refused), view)
+
+
+def _local(view: DishView, picture: Picture) -> DishView:
+    """Return the view in the pixels of a part of the frame."""
+    u, v = view.centre_px
+    return DishView((u - picture.origin[0], v - picture.origin[1]), view.metres_per_pixel, view.rotation)
+
+
+def _in_dish(needle: MeasuredNeedle, view: DishView) -> np.ndarray:
+    """Return the covariance of tail and heading in the dish frame, shape (3, 3)."""
+    along = view.directions_to_dish(needle.direction_px)
+    aside = view.directions_to_dish(np.array([-needle.direction_px[1], needle.direction_px[0]]))
+    scale = view.metres_per_pixel
+    turn = np.zeros((3, 3))
+    turn[:2, 0], turn[:2, 1], turn[2, 2] = scale * along, scale * aside, -1.0  # the dish's y goes up
+    assert needle.covariance is not None
+    return np.asarray(turn @ needle.covariance @ turn.T)

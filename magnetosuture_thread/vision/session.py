@@ -1,0 +1,86 @@
+"""A session: camera frames as they come, what is told of each as it goes; what `vision_tracker` does without ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.scene.scene import Scene
+from magnetosuture_thread.vision.look import State, Track, no_pose
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import VisionTracker
+
+CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
+
+
+@dataclass(frozen=True)
+class FrameMeasurement:
+    """What is told of one frame.
+
+    Attributes:
+        track: what was seen.
+        centreline: of the thread, equally spaced from the needle's tail on, shape (64, 2) [m]; shape (0, 2) where
+            there is none to tell.
+        problem: why the frame was refused, if it was.
+    """
+
+    track: Track
+    centreline: Points
+    problem: InvalidInputError | None = None
+
+    @property
+    def tracked(self) -> bool:
+        """Whether there is a pose to tell."""
+        return self.track.state is State.TRACKED
+
+
+class TrackerSession:
+    """Tracks needle and thread over one run.
+
+    The node `vision_tracker` and the replay without a graph are both a shell around this, so that the same
+    frames give the same poses to the last bit.
+
+    Args:
+        settings: what to look for.
+        scene: the dish, and the shapes in which neither needle nor thread can be.
+
+    Attributes:
+        frames: that came.
+        tracked: those with a pose.
+    """
+
+    def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
+        self._tracker = VisionTracker(settings, scene)
+        self.frames = self.tracked = 0
+
+    @property
+    def missing(self) -> State:
+        """What to say of a frame that shows nothing: lost, or searching if there never was a needle."""
+        return State.LOST if self.tracked else State.SEARCHING
+
+    def set_scene(self, scene: Scene) -> None:
+        """Take another scene; see `VisionTracker.set_scene`."""
+        self._tracker.set_scene(scene)
+
+    def on_image(self, time_s: float, image: np.ndarray) -> FrameMeasurement:
+        """Look at the next frame, taken at a time [s]; see `VisionTracker.track`."""
+        try:
+            track = self._tracker.track(image, time_s)
+        except InvalidInputError as error:
+            return self.on_broken(error)
+        self.frames += 1
+        centreline = np.empty((0, 2))
+        if track.state is State.TRACKED:
+            self.tracked += 1
+            if len(track.centreline) > 1:
+                at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
+                centreline = points_at(track.centreline, at)
+        return FrameMeasurement(track, centreline)
+
+    def on_broken(self, problem: InvalidInputError) -> FrameMeasurement:
+        """Count a frame that cannot be looked at, and say why."""
+        self.frames += 1
+        return FrameMeasurement(no_pose(self.missing, str(problem), None), np.empty((0, 2)), problem)
