@@ -22,7 +22,7 @@ from test.evaluation.test_reference_scores import write
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run the command as a user does."""
     command = [sys.executable, "-m", "magnetosuture_thread.cli", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 def test_help_names_every_command_and_the_exit_codes():
@@ -61,7 +61,7 @@ def test_every_command_of_every_file_is_in_the_parser():
 def test_help_waits_for_no_package_of_a_command():
     slow = "numpy", "numba", "cv2", "scipy", "matplotlib", "rclpy"
     look = f"import sys; from magnetosuture_thread import cli; print([name for name in {slow} if name in sys.modules])"
-    shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, timeout=60, check=True)
+    shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, timeout=300, check=True)
     assert shown.stdout == "[]\n"
 
 

@@ -68,7 +68,7 @@ class Fault:
     def requested_faults(cls, text: str, time: float) -> Fault:
         """Read `KIND DURATION` as a fault that begins at a time [s].
 
-        >>> Fault.asked_for("glare 0.5", 7.0)
+        >>> Fault.requested_faults("glare 0.5", 7.0)
         Fault(kind='glare', start=7.0, duration=0.5)
 
         Raises:

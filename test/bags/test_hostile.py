@@ -140,7 +140,7 @@ def test_a_file_whose_name_is_no_text(tmp_path: Path, ending: str):
     shutil.copy(folder / f"bag.{ending}", odd)
     assert read(Bag(odd)) == texts(5)
     command = [sys.executable, "-m", "magnetosuture_thread.cli", "bag", "check", str(odd)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env={**os.environ, "LC_ALL": "C.UTF-8"})
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env={**os.environ, "LC_ALL": "C.UTF-8"})
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -243,7 +243,7 @@ for index in range(100):
     bag.write("/noise", 10**9 + index * 10**7, os.urandom(10_000))
 os._exit(9)
 """
-    subprocess.run([sys.executable, "-c", kill, str(tmp_path / "bag")], check=False, timeout=60)
+    subprocess.run([sys.executable, "-c", kill, str(tmp_path / "bag")], check=False, timeout=300)
     assert (tmp_path / "bag" / ".reserve").exists()
     assert cli.main(["bag", "check", str(tmp_path / "bag")]) == 1
     new = repaired(tmp_path / "bag", tmp_path / "new")

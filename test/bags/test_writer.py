@@ -56,7 +56,7 @@ def test_a_disk_that_takes_no_more(tmp_path: Path, limit: int):
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=300,
     )
     first, second = done.stdout.splitlines()
     bag = Bag(folder)

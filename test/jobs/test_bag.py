@@ -162,7 +162,7 @@ except BagError as error:
 def test_a_recording_stays_when_the_disk_is_full_and_nothing_else_does(tmp_path: Path, kind: str):
     output = tmp_path / "run"
     command = [sys.executable, "-c", FULL, str(output), kind]
-    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
     assert "the disk takes no larger file after" in said
     if kind == "result":
         assert list(tmp_path.iterdir()) == []

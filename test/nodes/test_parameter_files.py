@@ -235,7 +235,7 @@ def test_a_node_of_whose_file_nothing_applies_does_not_start(
     if text is not None:
         file.write_text(text)
     process = started(node, "-r", "__ns:=/lab1", "--params-file", str(file))
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=300)
     assert process.returncode == 1
     errors = [line for line in said.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1, said

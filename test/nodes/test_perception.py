@@ -214,7 +214,7 @@ def test_a_node_that_cannot_start_ends_the_program_with_one_line(
             env=graph_environment(domain),
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=300,
             check=False,
         )
     assert ended.returncode == 1

@@ -199,12 +199,12 @@ sys.exit(run(Late, []))
 @pytest.mark.parametrize(("why", "clean"), [("asked", True), ("broken", False)])
 def test_a_callback_that_is_still_at_work_at_the_end_is_no_failure(environment, why: str, clean: bool):
     command = [sys.executable, "-c", END_AT_WORK, why]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert (ended.returncode == 0) is clean, ended.stderr
     assert ("Traceback" not in ended.stderr) is clean
 
 
 def test_an_interruption_waits_until_a_callback_is_done(environment):
     command = [sys.executable, "-c", END_AT_WORK, "interrupted"]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "went on\n", "")

@@ -186,7 +186,7 @@ def test_a_scene_that_cannot_be_read_does_not_start_the_node(graph):
         graph.add(SceneServerNode, scene="nowhere")
     command = [sys.executable, "-m", "magnetosuture_thread.nodes.scene_server", "--ros-args", "-p", "scene:=nowhere"]
     environment = graph_environment(graph.domain)
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
     assert ended.returncode == 1
     assert "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dish_150mm" in ended.stderr
     assert ended.stderr.count("\n") == 1

@@ -145,8 +145,8 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"power_stage": "roboclaw", "power_stage_ports": ("/tmp/a",)}, "a path for two of the 4 coils"),
     ],
 )
-def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], status: str):
-    with pytest.raises(ConfigurationError, match=status):
+def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], words: str):
+    with pytest.raises(ConfigurationError, match=words):
         RigSettings(**changes)
 
 
@@ -162,9 +162,9 @@ def test_settings_that_make_no_rig_are_refused(changes: dict[str, Any], status: 
     ],
 )
 def test_a_start_or_looks_that_do_not_fit_the_scene_are_refused(
-    shapes: tuple[Disc | Polygon, ...], changes: dict[str, Any], status: str
+    shapes: tuple[Disc | Polygon, ...], changes: dict[str, Any], words: str
 ):
-    with pytest.raises(ConfigurationError, match=status):
+    with pytest.raises(ConfigurationError, match=words):
         rig(*shapes, **changes)
 
 
@@ -209,13 +209,13 @@ def test_new_scene_changes_contact_camera_image_and_dish():
 def test_a_scene_in_which_needle_or_thread_would_be_in_something_is_refused_and_nothing_changes():
     made = rig()
     before, camera = made.scene, made.camera
-    for other, status in (
+    for other, words in (
         (scene(Disc((0.005, 0.0), 0.001)), "got shape_0 where the needle is"),
         (scene(Disc((-0.01, 0.0005), 0.001)), "got shape_0 where the thread is"),
         (scene(diameter=0.03), "got wall where the thread is"),
         (scene(diameter=0.019), "got wall where the needle is"),
     ):
-        with pytest.raises(InvalidInputError, match=status):
+        with pytest.raises(InvalidInputError, match=words):
             made.set_scene(other)
         assert made.scene is before
         assert made.camera is camera
