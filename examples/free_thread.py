@@ -16,5 +16,5 @@ while angle < 0.5 * np.pi:
     prediction = predictor.step(NeedlePose(step / RATE, RADIUS * np.array([heading[1], -heading[0]]), heading))
 
 print(f"after {step / RATE:.2f} s the loose end is at {1e3 * prediction.positions[-1].round(5)} mm")
-print(f"greatest strain of a segment: {np.abs(prediction.strain).max():.1e}")
+print(f"maximum strain of a segment: {np.abs(prediction.strain).max():.1e}")
 print(f"nearest node to the wall: {1e3 * prediction.margins['wall'].minimum:.2f} mm")

@@ -61,6 +61,11 @@ JSON_KEYS = {
 ALLOWED = JSON_KEYS
 ENTRY_POINTS = {"main", "run", "add"}  # of programs, and of each command
 
+# In what is printed, drawn or logged.
+OLD_PHRASES = re.compile(
+    r"seen centreline|simulated truth|\bgreatest\b|\bleast margin|own word|root of the mean|thread seen|judging"
+)
+
 _OLD = re.compile(rf"(?:^|_)({'|'.join(' '.join(OLD_WORDS).split())})(?:_|$)")
 
 
@@ -108,6 +113,29 @@ def test_other_words_are_not_taken_for_old_ones(name: str):
 def test_public_names_have_no_old_word(path: Path):
     found = {name: old_word(name) for name in public_names(path) if not name.startswith("_") and old_word(name)}
     assert not found
+
+
+def texts(path: Path) -> Iterator[str]:
+    """Yield the texts of a module that are no docstrings and no names."""
+    if path.suffix == ".html":
+        yield path.read_text(encoding="utf-8")
+        return
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    statements = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in statements:
+            yield node.value
+
+
+@pytest.mark.parametrize("path", [*MODULES, *PACKAGE.rglob("*.html")], ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_text_that_is_shown_has_an_old_phrase(path: Path):
+    assert not [text for text in texts(path) if OLD_PHRASES.search(text)]
+
+
+def test_an_old_phrase_is_recognised_in_a_text_and_not_in_a_docstring(tmp_path: Path):
+    module = tmp_path / "module.py"
+    module.write_text('"""The greatest of all."""\nx = f"greatest stretch {1}"\n')
+    assert [bool(OLD_PHRASES.search(text)) for text in texts(module)] == [True]
 
 
 def test_what_is_on_the_wire_has_no_old_word():

@@ -43,7 +43,7 @@ class ZeroDelays:
     def words(self) -> str:
         """The figures in a line for a person."""
         median, p99, greatest = (f"{1e3 * value:.1f}" for value in (self.median, self.p99, self.greatest))
-        return f"  {self.event}: median {median}, 99th percentile {p99}, greatest {greatest} ms ({self.count} times)"
+        return f"  {self.event}: median {median}, 99th percentile {p99}, maximum {greatest} ms ({self.count} times)"
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def bridge_table(report: BridgeReport) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold", caption_justify="left")
     table.caption = f"zero: of the duties of all boards; loop at {report.rate:g} Hz, {report.scheduling}"
     table.add_column("", no_wrap=True)
-    for name in ("median", "p99", "greatest", "bound", "beyond"):
+    for name in ("median", "p99", "maximum", "bound", "beyond"):
         table.add_column(name, justify="right", no_wrap=True)
     for each in report.delays:
         values = (each.median, each.p99, each.greatest, each.bound)

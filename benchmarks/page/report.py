@@ -81,7 +81,7 @@ def page_table(report: PageReport) -> Table:
     title = f"operator's page, simulated rig, n = {report.segments}; ms from a key press"
     table = Table(title=title, title_justify="left", title_style="bold")
     table.add_column("", no_wrap=True)
-    for name in ("median", "p99", "most", "keys", "lost"):
+    for name in ("median", "p99", "maximum", "keys", "lost"):
         table.add_column(name, justify="right", no_wrap=True)
     for each in report.delays:
         values = (f"{1e3 * value:.1f}" for value in (each.median, each.p99, each.greatest))

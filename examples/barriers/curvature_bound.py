@@ -12,8 +12,8 @@ class CurvatureBound(Barrier):
 
     name = "curvature_bound"
 
-    def __init__(self, greatest=150.0, segment_length=0.019 / 25):  # 1/m and m
-        self.bound = greatest * segment_length**2
+    def __init__(self, max_curvature=150.0, segment_length=0.019 / 25):  # 1/m and m
+        self.bound = max_curvature * segment_length**2
 
     def value(self, positions):
         second = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]

@@ -61,9 +61,9 @@ def _header(calibration: CalibrationResult) -> list[str]:
         if not math.isnan(score.truth_after):
             held = "" if math.isnan(score.truth_held_out) else f", by the other bags {score.truth_held_out:.3g}"
             words.append(
-                f"  Against the truth: {score.truth_before:.3g} before, {score.truth_after:.3g} after{held} %."
+                f"  Against the ground truth: {score.truth_before:.3g} before, {score.truth_after:.3g} after{held} %."
             )
-    compared = "the seen centreline" if calibration.against == "seen" else "the truth"
+    compared = "the measured centreline" if calibration.against == "seen" else "the ground truth"
     if calibration.finished:
         words.append(f"Fitted to {compared}. Intervals are of 95 %.")
     if calibration.settings.formulation == "rod" and any(

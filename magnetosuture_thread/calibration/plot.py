@@ -65,7 +65,7 @@ def _draw_scene(axes: Axes, calibration: CalibrationResult, fit: BagFit) -> None
     whole = np.flatnonzero(run.known.mean(axis=1) >= np.quantile(run.known.mean(axis=1), 0.5))
     chosen = whole[np.linspace(0, len(whole) - 1, min(INSTANTS, len(whole))).astype(int)]
     styles = [
-        ("seen by the camera" if run.against == "seen" else "the truth", {**WIDE, "linewidth": 6.0}),
+        ("measured by the camera" if run.against == "seen" else "the ground truth", {**WIDE, "linewidth": 6.0}),
         ("as the setup has it", {"color": INK, "linewidth": 0.9, "linestyle": (0, (4, 2))}),
         ("calibrated", {"color": PREDICTED, "linewidth": 1.4}),
     ]
@@ -81,7 +81,7 @@ def _draw_scene(axes: Axes, calibration: CalibrationResult, fit: BagFit) -> None
     name = Path(run.name).name
     if len(calibration.scores) > 1:
         score = next(score for score in calibration.scores if score.name == run.name)
-        name += f", the bag with the greatest error: {score.after:.2f} %"
+        name += f", the bag with the maximum error: {score.after:.2f} %"
     axes.set_title(name, fontsize=10, color=INK, loc="left")
 
 

@@ -162,7 +162,7 @@ def read_run(
         expected = f"expected at least {MIN_DURATION:g} s"
         raise BagError(name, f"is too short: {duration:.1f} s with needle and thread, {expected}")
     if len(compared) < MIN_FRAMES:
-        known = "seen" if against == "seen" else "known by the truth"
+        known = "measured" if against == "seen" else "known from ground truth"
         words = f"in {len(compared)} frames, the first second left out, is half of the thread or more {known}"
         raise BagError(name, f"is of no use: {words}, expected at least {MIN_FRAMES}")
     chosen = np.unique(np.linspace(0, len(compared) - 1, min(MAX_FRAMES, len(compared))).round().astype(int))

@@ -175,7 +175,7 @@ def _draw_colours(figure: Figure, line: LineCollection) -> None:
     seen = figure.add_axes((0.015, 0.055, 0.03, 0.02))
     seen.axhline(0.5, color=SEEN, linewidth=5.0, alpha=0.45)
     seen.set_axis_off()
-    figure.text(0.05, 0.059, "seen by the camera", fontsize=9, color=INK)
+    figure.text(0.05, 0.059, "measured by the camera", fontsize=9, color=INK)
     bar = figure.colorbar(line, cax=figure.add_axes((0.185, 0.062, 0.25, 0.014)), orientation="horizontal")
     bar.set_label("predicted, by its nodes' distance from the obstacles [mm]", fontsize=8.5, color=INK)
     bar.ax.tick_params(labelsize=8, colors=INK, length=2)
@@ -213,10 +213,10 @@ def draw_scale_bar(axes: Axes, view: DishView, share: float) -> None:
 
 def _draw_error(axes: Axes, series: TimeSeries) -> None:
     seen = series.column("error_seen")
-    axes.plot(series.times, seen, color=SEEN, linewidth=1.4, label="against the seen centreline")
+    axes.plot(series.times, seen, color=SEEN, linewidth=1.4, label="against the measured centreline")
     if series.has("error_truth"):
         truth = series.column("error_truth")
-        axes.plot(series.times, truth, color=TRUTH, linewidth=1.4, label="against the simulated truth")
+        axes.plot(series.times, truth, color=TRUTH, linewidth=1.4, label="against the ground truth")
     axes.set_ylim(0.0, 1.3 * axes.get_ylim()[1])  # room for the legend
     axes.set_title("prediction error [% of the thread's length]", fontsize=9.5, color=INK, loc="left")
     axes.legend(loc="upper right", fontsize=8.5, frameon=False, ncols=2)
@@ -239,7 +239,7 @@ def _draw_strain(axes: Axes, series: TimeSeries) -> None:
     axes.set_yscale("log")
     axes.set_ylim(values.min() / 3.0, values.max() * 3.0)
     axes.plot(series.times, values, color=INK, linewidth=1.2)
-    axes.set_title("greatest stretch or compression of a segment [%]", fontsize=9.5, color=INK, loc="left")
+    axes.set_title("maximum stretch or compression of a segment [%]", fontsize=9.5, color=INK, loc="left")
 
 
 def draw_case(path: Path, case: CaseResult, formulation: str) -> None:
@@ -251,7 +251,7 @@ def draw_case(path: Path, case: CaseResult, formulation: str) -> None:
     reference, score, worst = case.reference, case.score, int(case.error_percent.argmax())
     figure.text(0.02, 0.945, f"{reference.name}, formulation {formulation}", fontsize=13, color=INK, weight="bold")
     words = (
-        f"mean error {score.mean_error_percent:.3f} % of the length, greatest {score.max_error_percent:.3f} %; "
+        f"mean error {score.mean_error_percent:.3f} % of the length, maximum {score.max_error_percent:.3f} %; "
         f"n = {case.vertices.shape[1] - 1}; the reference is simulated, by another method"
     )
     figure.text(0.02, 0.9, words, fontsize=9.5, color=INK)

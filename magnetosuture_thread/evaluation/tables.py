@@ -131,13 +131,13 @@ def bags_table(rows: Sequence[Row]) -> Table:
         caption_justify="left",
     )
     table.caption = (
-        "errors in % of the length, mean and greatest over time;\n"
-        "margin: the least of an obstacle; step: median of the model's"
+        "errors in % of the length, mean and maximum over time;\n"
+        "margin: the minimum of an obstacle; step: median of the model's"
     )
     if any(row["simulated"] for row in rows):
         table.caption += f";\n{SIMULATED} simulated, as the bag itself says"
     table.add_column("bag", overflow="fold", min_width=12)
-    for name in ("frames", "truth", "max", "seen", "max", "margin", "step"):
+    for name in ("frames", "ground truth", "max", "measured", "max", "margin", "step"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
         if row["problem"]:
@@ -178,7 +178,7 @@ def summary_table(summary: ReplaySummary) -> Table:
     if live:
         table.add_row("velocity commands", str(summary.commands), simulated)
         table.add_row("  reached the coils", str(summary.driven), _share(summary.driven, summary.commands))
-        table.add_row("messages dropped", str(sum(summary.dropped.values())), "played, and lost on the way")
+        table.add_row("messages dropped", str(sum(summary.dropped.values())), "of those played")
         for way, count in summary.dropped.items():
             if count:
                 table.add_row("  dropped", str(count), way)
@@ -187,22 +187,22 @@ def summary_table(summary: ReplaySummary) -> Table:
     if summary.remark:
         table.add_row("setup in doubt", "", summary.remark)
     table.add_section()
-    table.add_row("latency, median" if live else "times, median", "", "99th percentile, greatest")
+    table.add_row("latency, median" if live else "times, median", "", "99th percentile, maximum")
     for stage, found in summary.latency.items():
         table.add_row(f"  {stage}", _milliseconds(found), _tail(found))
     table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
     if summary.speed is not None:
         table.add_row("speed", f"{summary.speed:.3g}", "times as fast as recorded")
     table.add_section()
-    table.add_row("least margin", "", "0 or more is safe; lengths are met to 0.1 %")
+    table.add_row("minimum margin", "", "0 or more is safe; lengths are met to 0.1 %")
     for margin in summary.least_margins:
         where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
         table.add_row(f"  {margin.kind}", f"{_micrometres(margin.clearance)} µm", f"{where}, at {margin.time:.2f} s")
     table.add_row("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted))
-    table.add_row("greatest stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment")
-    table.add_row("greatest residual", f"{summary.residual:.1e}", "scaled; not the solver's own word")
+    table.add_row("maximum stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment")
+    table.add_row("maximum residual", f"{summary.residual:.1e}", "scaled; checked apart from the solver")
     table.add_section()
-    _add_errors(table, summary, truth="simulated truth", missing="no frame could be scored")
+    _add_errors(table, summary, truth="ground truth", missing="no frame could be scored")
     if (apart := summary.currents) is not None:
         table.add_section()
         tail = f"{apart.p99:.2f}, {apart.greatest:.2f} A; recorded: {apart.recorded:.2f} A rms"
@@ -217,16 +217,16 @@ def loop_table(summary: LoopSummary) -> Table:
     table.add_row("camera frames", str(summary.frames), f"over {summary.duration:.1f} s of steering")
     table.add_row("  skipped", str(summary.skipped), "the rig had no time for them")
     table.add_row("  tracked", str(summary.tracked), f"{summary.lost} looked at and lost")
-    table.add_row("  wrong poses", str(summary.wrong), "more than 0.3 mm or 5 degrees from the truth")
+    table.add_row("  wrong poses", str(summary.wrong), "more than 0.3 mm or 5 degrees from the ground truth")
     table.add_row("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames))
     table.add_section()
     table.add_row("needle from its path", f"{1e3 * summary.path_error:.3f} mm", _greatest(summary.path_error_greatest))
-    table.add_row("tracked tail from the truth", f"{1e3 * summary.tail_error:.3f} mm", "root of the mean square")
+    table.add_row("tracked tail from the ground truth", f"{1e3 * summary.tail_error:.3f} mm", "RMS")
     heading = math.degrees(summary.heading_error)
-    table.add_row("tracked heading", f"{heading:.2f} deg", "root of the mean square")
+    table.add_row("tracked heading", f"{heading:.2f} deg", "RMS")
     table.add_row("currents at a limit", f"{100.0 * summary.saturated:.1f} %", "of the commands")
     table.add_section()
-    table.add_row("latency from the frame's stamp", "", "99th percentile, greatest")
+    table.add_row("latency from the frame's stamp", "", "99th percentile, maximum")
     for name, found in summary.latency.items():
         table.add_row(f"  to {name}", _milliseconds(found), _tail(found))
     table.add_row("  tracker alone", _milliseconds(summary.processing), _tail(summary.processing))
@@ -243,12 +243,12 @@ def evaluation_table(evaluation: Evaluation) -> Table:
     residual = max(case.max_residual for case in evaluation.cases)
     marked = sum(case.fallbacks for case in evaluation.cases)
     table.caption = (
-        "errors in % of the length, mean and greatest over time; stretch in %;\n"
+        "errors in % of the length, mean and maximum over time; stretch in %;\n"
         "deepest node in an obstacle in m; step in µs of wall clock, median and p99;\n"
         f"largest residual {residual:.0e}, {marked} steps fell back or did not converge"
     )
     table.add_column("case", no_wrap=True)
-    for name in ("error", "greatest", "stretch", "depth", "step", "p99"):
+    for name in ("error", "maximum", "stretch", "depth", "step", "p99"):
         table.add_column(name, justify="right", no_wrap=True)
     for case in evaluation.cases:
         table.add_row(
@@ -275,11 +275,11 @@ def _figures_table(title: str) -> Table:
 
 
 def _add_errors(table: Table, summary: ReplaySummary | LoopSummary, truth: str, missing: str = "") -> None:
-    table.add_row("thread seen, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")
-    table.add_row("prediction error, mean", "", "greatest; % of the length")
+    table.add_row("thread measured, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")
+    table.add_row("prediction error, mean", "", "maximum; % of the length")
     if summary.error_seen is None and missing:
-        table.add_row("  against the seen centreline", "none", missing)
-    for name, figures in (("seen centreline", summary.error_seen), (truth, summary.error_truth)):
+        table.add_row("  against the measured centreline", "none", missing)
+    for name, figures in (("measured centreline", summary.error_seen), (truth, summary.error_truth)):
         if figures is not None:
             scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
             table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
@@ -291,7 +291,7 @@ def _micrometres(metres: float) -> str:
 
 
 def _greatest(metres: float) -> str:
-    return f"root of the mean square; greatest {1e3 * metres:.3f} mm"
+    return f"RMS; maximum {1e3 * metres:.3f} mm"
 
 
 def _share(part: int, whole: int) -> str:

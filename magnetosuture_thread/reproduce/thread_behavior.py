@@ -126,9 +126,9 @@ def _evaluated(path: Path, setup: Setup) -> BehaviorRun:
 def behavior_table(runs: Sequence[BehaviorRun]) -> Table:
     """Return the figures of the thread-behavior tests as a table."""
     table = Table(title="thread behaviour, closed loop, simulated", title_justify="left", title_style="bold")
-    table.caption = "errors: mean (greatest) over time, % of the thread's length; needle: root of the mean square"
+    table.caption = "errors: mean (maximum) over time, % of the thread's length; needle: RMS"
     table.add_column("", no_wrap=True)
-    for name in ("against the truth", "against the seen", "frames", "needle off its path"):
+    for name in ("against the ground truth", "against the measured", "frames", "needle off its path"):
         table.add_column(name, justify="right")
     for run in runs:
         summary = run.summary
@@ -180,8 +180,8 @@ def _draw_row(figure: Figure, run: BehaviorRun, bottom: float, height: float) ->
     plot = figure.add_axes((0.725, bottom + 0.055, 0.262, height - 0.06))
     times = np.array([(instant.stamp - began) * 1e-9 for instant in run.instants])
     for label, colour, errors in (
-        ("against the seen centreline", SEEN, [instant.errors["seen"] for instant in run.instants]),
-        ("against the truth", TRUTH, [instant.errors["truth"] for instant in run.instants]),
+        ("against the measured centreline", SEEN, [instant.errors["seen"] for instant in run.instants]),
+        ("against the ground truth", TRUTH, [instant.errors["truth"] for instant in run.instants]),
     ):
         mean = float(np.nanmean(errors))
         plot.plot(times, errors, color=colour, linewidth=1.2, label=f"{label}, mean {mean:.2f}")

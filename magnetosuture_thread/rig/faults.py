@@ -65,10 +65,10 @@ class Fault:
         return cls(words[0], start, duration)
 
     @classmethod
-    def requested_faults(cls, text: str, time: float) -> Fault:
+    def requested(cls, text: str, time: float) -> Fault:
         """Read `KIND DURATION` as a fault that begins at a time [s].
 
-        >>> Fault.requested_faults("glare 0.5", 7.0)
+        >>> Fault.requested("glare 0.5", 7.0)
         Fault(kind='glare', start=7.0, duration=0.5)
 
         Raises:

@@ -44,10 +44,10 @@ class VisionTrackerSettings(Configuration):
         maximum=math.pi,
     )
     max_needle_speed: float = quantity(
-        0.05, "greatest speed of the needle; what is faster is not it", unit="m/s", minimum=1e-4, maximum=1.0
+        0.05, "maximum speed of the needle; what is faster is not it", unit="m/s", minimum=1e-4, maximum=1.0
     )
     max_turn_rate: float = quantity(
-        6.0, "greatest turn rate of the needle; what is faster is not it", unit="rad/s", minimum=0.1, maximum=100.0
+        6.0, "maximum turn rate of the needle; what is faster is not it", unit="rad/s", minimum=0.1, maximum=100.0
     )
     confirm_frames: int = quantity(
         3, "frames in a row that must agree before a needle found anew is tracked", minimum=1, maximum=30

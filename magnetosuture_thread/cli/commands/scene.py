@@ -100,7 +100,7 @@ def _table(report: dict[str, Any]) -> Table:
         padding=(0, 1, 0, 0),
         title=f"dish of {1e3 * dish['diameter']:g} mm, {1e3 * dish['depth']:g} mm deep",
     )
-    table.caption = f"version {report['version']}; least and greatest x, y in mm, area in mm^2"
+    table.caption = f"version {report['version']}; minimum and maximum x, y in mm, area in mm^2"
     table.add_column("", justify="right")
     table.add_column("name", overflow="fold", min_width=12)
     for name in ("kind", "shape"):

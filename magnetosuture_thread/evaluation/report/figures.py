@@ -17,7 +17,7 @@ CLOSE, FAIR = 1.0, 5.0  # % of the length
 EXACT = 1e-3  # of a segment's length: what the solvers' tolerance leaves
 TOUCH = 1e-6  # m; a node this deep in an obstacle still counts as touching it
 
-AGAINST = {"truth": "the truth", "seen": "the seen centreline"}
+AGAINST = {"truth": "the ground truth", "seen": "the measured centreline"}
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def _error(about: BagDetails, figures: BagFigures, target: str) -> Headline:
         return Headline(name, "none", missing, NONE, "not scored")
     grades = ((CLOSE, GOOD, "close"), (FAIR, MIDDLING, "off, but usable"), (math.inf, BAD, "far off"))
     millimetres = format_number(10.0 * found["mean"] * about.length)
-    detail = f"mean over {_frames_of(found['count'])}; {millimetres} mm. Greatest {format_number(found['maximum'])} %"
+    detail = f"mean over {_frames_of(found['count'])}; {millimetres} mm. Maximum {format_number(found['maximum'])} %"
     return Headline(name, f"{format_number(found['mean'])} %", detail, *_grade(found["mean"], *grades))
 
 
@@ -212,13 +212,13 @@ def _margin(about: BagDetails, figures: BagFigures) -> Headline:
     """Return the least margin: of something solid where all barriers hold, else the one that is broken most."""
     minima = figures.minimum.values()
     if not minima:
-        return Headline("least margin", "none", "no prediction converged", NONE, "not known")
+        return Headline("minimum margin", "none", "no prediction converged", NONE, "not known")
     broken = [least.kind.replace("_", " ") for least in minima if not _holds(about, least)]
     worst = min(minima, key=lambda least: least.clearance - _min_clearance(about, least))
     if not broken:
         worst = min((least for least in minima if least.kind in SOLID), key=lambda m: m.clearance, default=worst)
     touching = f"; touches in {_frames_of(figures.contact_frames)}" if figures.contact_frames else ""
-    name = f"least margin, {worst.kind.replace('_', ' ')}"
+    name = f"minimum margin, {worst.kind.replace('_', ' ')}"
     detail = f"at {worst.time:.2f} s, node {worst.node}{touching}"
     grade, words = (BAD, f"broken: {', '.join(broken)}") if broken else (GOOD, "every barrier holds")
     return Headline(name, micrometres(worst.clearance), detail, grade, words)
@@ -241,7 +241,7 @@ def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
 
 
 def _strain(figures: BagFigures) -> Headline:
-    name, detail = "greatest stretch", "of a segment, either way"
+    name, detail = "maximum stretch", "of a segment, either way"
     if not math.isfinite(figures.strain):
         return Headline(name, "none", detail, NONE, "not known")
     grades = (

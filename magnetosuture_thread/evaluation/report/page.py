@@ -142,7 +142,7 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
             _lines(predicted, errors),
             {"moments": f"error_{metrics.target}", "floor": 0.0},
         ),
-        ("stretch", "stretch [%]", _lines(predicted, [("strain", "greatest", "ink", "")]), {"log": True}),
+        ("stretch", "stretch [%]", _lines(predicted, [("strain", "maximum", "ink", "")]), {"log": True}),
         ("obstacle", "distance [mm]", _lines(predicted, distances), {"zero": True}),
         ("lengths", "margin [µm]", _lines(predicted, margins), {"zero": True}),
         ("pace", "time [ms]", durations, {"log": True}),

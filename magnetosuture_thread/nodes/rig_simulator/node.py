@@ -75,7 +75,7 @@ class RigSimulatorNode(Node):
     def on_fault(self, message: String) -> None:
         """Apply a fault that begins now."""
         try:
-            self.rig.faults.add(Fault.requested_faults(message.data, max(0.0, self.rig.running)))
+            self.rig.faults.add(Fault.requested(message.data, max(0.0, self.rig.running)))
         except InvalidInputError as error:
             self._health.refuse(error)
 

@@ -126,7 +126,7 @@ def hernia_lines(summary: HerniaSummary) -> list[str]:
     return [
         f"{summary.duration:.1f} s at {summary.rate:g} Hz, {summary.nodes} segments, formulation {summary.formulation}",
         f"deepest node in an obstacle {summary.deepest:.1e} m, middle of a chord {1e6 * summary.chord_deepest:.0f} um, "
-        f"greatest stretch {100.0 * summary.stretch:.4f} %",
+        f"maximum stretch {100.0 * summary.stretch:.4f} %",
         f"a step takes {1e3 * summary.median_step:.2f} ms (99th percentile {1e3 * summary.high_step:.2f}): "
         f"{summary.real_time_factor:.0f} times faster than its period",
     ]

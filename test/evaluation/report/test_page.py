@@ -290,10 +290,10 @@ def test_the_head_shows_the_margin_that_is_broken():
     broken = MinimumMargin("connectivity", -1e-4, 3, -1, 0.2)
     figures = replace(BagFigures.of(metrics), minimum={"connectivity": broken, "obstacle": holds})
     tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
-    assert (tile.name, tile.assessment) == ("least margin, connectivity", "broken: connectivity")
+    assert (tile.name, tile.assessment) == ("minimum margin, connectivity", "broken: connectivity")
     figures = replace(figures, minimum={"connectivity": replace(broken, clearance=0.0), "obstacle": holds})
     tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
-    assert (tile.name, tile.assessment) == ("least margin, obstacle", "every barrier holds")
+    assert (tile.name, tile.assessment) == ("minimum margin, obstacle", "every barrier holds")
 
 
 def test_one_frame_is_not_frames():
