@@ -227,7 +227,7 @@ class _Replay:
                 try:
                     with outputs, interruption:
                         self._play(live, source, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE_REPLAY}")
-                    self.log("judging what came out")
+                    self.log("evaluating the outputs")
                     summary = self._evaluate(live)
                     if loop:
                         self.log("the first pass is recorded and judged; playing on until Ctrl-C")

@@ -88,7 +88,7 @@ def replay_offline(
                 elif step.result.problem is not None:
                     refused[_kind(step.result.problem)] += 1
             speed = given.duration / (time.perf_counter() - began)
-        log(f"{speed:.3g} times as fast as it was recorded; judging what came out")
+        log(f"{speed:.3g} times as fast as it was recorded; evaluating the outputs")
         summary = _summary(given, seen, metrics, refused, speed)
         if summary.remark:
             log(summary.remark)

@@ -101,7 +101,7 @@ def simulate(
         raise KeyboardInterrupt
     if problem:
         raise GraphError(f"{problem}; what was recorded is in {output}")
-    log("judging the run")
+    log("evaluating the run")
     return measure_loop(Bag(output), setup).summary(setup.name)
 
 

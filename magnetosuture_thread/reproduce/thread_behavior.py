@@ -128,7 +128,7 @@ def behavior_table(runs: Sequence[BehaviorRun]) -> Table:
     table = Table(title="thread behaviour, closed loop, simulated", title_justify="left", title_style="bold")
     table.caption = "errors: mean (maximum) over time, % of the thread's length; needle: RMS"
     table.add_column("", no_wrap=True)
-    for name in ("against the ground truth", "against the measured", "frames", "needle off its path"):
+    for name in ("error to ground truth", "to measured", "frames", "needle off path"):
         table.add_column(name, justify="right")
     for run in runs:
         summary = run.summary

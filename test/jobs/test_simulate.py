@@ -164,7 +164,7 @@ def test_with_a_simulated_clock_it_runs_faster_than_real_time(scenario: Path, tm
     assert summary.tracked >= 0.5 * summary.frames
     bag = Bag(tmp_path / "bag")
     assert bag.start < 1000e9  # on the simulation's own clock
-    assert bag.duration > 1.4 * (at["judging the run"] - at["running at 2 times the speed"])
+    assert bag.duration > 1.4 * (at["evaluating the run"] - at["running at 2 times the speed"])
 
 
 def test_a_run_can_be_ended_before_its_path(scenario: Path, tmp_path: Path):
