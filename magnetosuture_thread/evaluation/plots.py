@@ -62,7 +62,7 @@ def draw_summary(
     line = _draw_frame(scene, frame, view, chosen, obstacles)
     _draw_close_up(scene, frame, view, chosen, obstacles)
     _draw_colours(figure, line)
-    words = f"frame at {at:.2f} s, where the prediction is farthest from what is seen"
+    words = f"frame at {at:.2f} s, where the prediction is farthest from the measured thread"
     figure.text(0.015, 0.905, words, fontsize=9.5, color=INK)
     plots = figure.subplots(
         3, 1, sharex=True, gridspec_kw={"left": 0.51, "right": 0.985, "top": 0.87, "bottom": 0.085, "hspace": 0.33}
@@ -224,7 +224,7 @@ def _draw_error(axes: Axes, series: TimeSeries) -> None:
 
 def _draw_clearance(axes: Axes, series: TimeSeries) -> None:
     clearance = 1e3 * np.fmin.reduce([series.column(f"margin_{kind}") for kind in SOLID])
-    axes.set_title("least distance of a node from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
+    axes.set_title("minimum distance of a node from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
     if not np.isfinite(clearance).any():
         axes.text(0.5, 0.5, "no obstacle near the thread", transform=axes.transAxes, ha="center", color=FAINT)
         return

@@ -126,6 +126,7 @@ def bags_table(rows: Sequence[Row]) -> Table:
     """Return the table for a terminal: the figures that matter most, and mean and worst."""
     table = Table(
         title="1 bag" if len(rows) == 1 else f"{len(rows)} bags",
+        show_edge=False,  # which keeps it within 80 columns
         title_justify="left",
         title_style="bold",
         caption_justify="left",
@@ -137,7 +138,7 @@ def bags_table(rows: Sequence[Row]) -> Table:
     if any(row["simulated"] for row in rows):
         table.caption += f";\n{SIMULATED} simulated, as the bag itself says"
     table.add_column("bag", overflow="fold", min_width=12)
-    for name in ("frames", "ground truth", "max", "measured", "max", "margin", "step"):
+    for name in ("frames", "ground\ntruth", "max", "measured", "max", "margin", "step"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
         if row["problem"]:

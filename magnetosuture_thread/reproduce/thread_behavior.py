@@ -126,9 +126,12 @@ def _evaluated(path: Path, setup: Setup) -> BehaviorRun:
 def behavior_table(runs: Sequence[BehaviorRun]) -> Table:
     """Return the figures of the thread-behavior tests as a table."""
     table = Table(title="thread behaviour, closed loop, simulated", title_justify="left", title_style="bold")
-    table.caption = "errors: mean (maximum) over time, % of the thread's length; needle: RMS"
+    table.caption = (
+        "errors against ground truth and against the measured thread:\n"
+        "mean (maximum) over time, % of the thread's length; needle: RMS"
+    )
     table.add_column("", no_wrap=True)
-    for name in ("error to ground truth", "to measured", "frames", "needle off path"):
+    for name in ("ground truth", "measured", "frames", "needle off path"):
         table.add_column(name, justify="right")
     for run in runs:
         summary = run.summary
