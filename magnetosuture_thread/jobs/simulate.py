@@ -16,7 +16,16 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.interface import CAMERA, NODES, PROCESSES, SCENE, SCENE_MARKERS, SCENE_SERVER, TIP_SETPOINT
+from magnetosuture_thread.interface import (
+    CAMERA,
+    NODES,
+    PREDICTED_THREAD,
+    PROCESSES,
+    SCENE,
+    SCENE_MARKERS,
+    SCENE_SERVER,
+    TIP_SETPOINT,
+)
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
 from magnetosuture_thread.nodes import topics
@@ -38,6 +47,7 @@ OPTIONAL = (
 INTERRUPTED = "interrupted"
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 SETTLING_TIME = 1.0  # s for all nodes to have found each other
+PREDICTION_TIMEOUT = 10.0  # s for the first prediction: where the needle cannot be tracked, there is none
 FINAL_TIME = 0.5  # s that go on once the path is done
 TIMEOUT_FACTOR = 3.0  # times the path's own duration, and ...
 EXTRA_TIME = 20.0  # s of simulated time besides: then a run that never ends is ended
@@ -214,13 +224,20 @@ def _wired(folder: str, coils: int) -> list[str]:
 
 
 def _wait(recorder: Recorder, check: Callable[[], None]) -> None:
-    """Wait until every topic has a publisher, except those in `OPTIONAL`."""
+    """Wait until every topic has a publisher, except those in `OPTIONAL`, and for the first prediction.
+
+    On a busy machine the first frames take tracker and model a second or more; a run that had begun would lack them.
+    """
     optional = {topic.name for topic in OPTIONAL}
     deadline = time.monotonic() + START_TIMEOUT
     while missing := [name for name in recorder.silent() if name not in optional]:
         check()
         if time.monotonic() > deadline:
             raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
+        recorder.spin(POLL_PERIOD)
+    deadline = time.monotonic() + PREDICTION_TIMEOUT
+    while not recorder.taken[PREDICTED_THREAD.recorded] and time.monotonic() < deadline:
+        check()
         recorder.spin(POLL_PERIOD)
     recorder.spin(SETTLING_TIME)
 
