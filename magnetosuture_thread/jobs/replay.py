@@ -230,7 +230,7 @@ class _Replay:
                     self.log("evaluating the outputs")
                     summary = self._evaluate(live)
                     if loop:
-                        self.log("the first pass is recorded and judged; playing on until Ctrl-C")
+                        self.log("the first pass is recorded and evaluated; playing on until Ctrl-C")
                         try:
                             with interruption:
                                 live.play_on(source.records)
