@@ -64,7 +64,7 @@ ENTRY_POINTS = {"main", "run", "add"}  # of programs, and of each command
 # In what is printed, drawn or logged.
 OLD_PHRASES = re.compile(
     r"seen centreline|simulated truth|\bgreatest\b|\bleast margin|own word|root of the mean|thread seen|"
-    r"\bjudg(?:ed|ing)\b"
+    r"\bjudg(?:ed|ing)\b|no truth|what is seen"
 )
 
 _OLD = re.compile(rf"(?:^|_)({'|'.join(' '.join(OLD_WORDS).split())})(?:_|$)")

@@ -146,14 +146,13 @@ def parameter_table(found: Mapping[str, Any]) -> Table:
 def bag_table(found: Mapping[str, Any]) -> Table:
     """Return a row for each bag: prediction errors before and after, and by the other bags."""
     several, truth = len(found["bags"]) > 1, any(row["truth_after"] is not None for row in found["bags"])
-    table = Table(
-        title=f"prediction error, fitted to what is {found['against'] if found['against'] == 'seen' else 'true'}"
-    )
+    fitted = "the measured thread" if found["against"] == "seen" else "ground truth"
+    table = Table(title=f"prediction error, fitted to {fitted}")
     table.caption = "mean over time of the mean distance of the nodes, % of the length"
     table.add_column("bag", overflow="fold", min_width=12)
     table.add_column("frames", justify="right")
     # On a line of its own, as eight columns must fit into a terminal's 80.
-    kinds = ["", *(["truth\n"] if truth and found["against"] == "seen" else [])]
+    kinds = ["", *(["ground\ntruth\n"] if truth and found["against"] == "seen" else [])]
     for kind in kinds:
         for name in ("before", "after", *(["held out"] if several else [])):
             table.add_column(f"{kind}{name}" if kind else name.replace(" ", "\n"), justify="right", no_wrap=True)

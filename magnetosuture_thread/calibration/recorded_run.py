@@ -150,7 +150,7 @@ def read_run(
         "shows no needle in any frame; is it another setup's?": not counts["needle"],
         "shows no thread in any frame: nothing to start from or to compare with": not counts["seen"],
         "never shows half of the thread or more: nothing to start from": not poses,
-        "holds no truth (ground_truth/thread), as bags of a robot do; compare against seen": against == "truth"
+        "holds no ground truth (ground_truth/thread), as bags of a robot do; compare against seen": against == "truth"
         and not counts["truth"],
     }
     for problem, is_there in problems.items():

@@ -107,7 +107,7 @@ class BagErrors:
         if not self.after > WORSE * self.before:
             return ""
         better = self.across_after <= self.across_before
-        end = "what is left lies along it, where noise moves what is seen" if better else "do not use"
+        end = "what is left lies along it, where noise moves the measured thread" if better else "do not use"
         nodes = f"the nodes are {self.after:.3g} % of the length off after the fit, {self.before:.3g} % before"
         across = f"{self.across_after:.3g} % after, {self.across_before:.3g} % before"
         return f"{self.name}: {nodes}; across the thread, which is what was fitted, {across}: {end}"

@@ -203,7 +203,7 @@ def summary_table(summary: ReplaySummary) -> Table:
     table.add_row("maximum stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment")
     table.add_row("maximum residual", f"{summary.residual:.1e}", "scaled; checked apart from the solver")
     table.add_section()
-    _add_errors(table, summary, truth="ground truth", missing="no frame could be scored")
+    _add_errors(table, summary, missing="no frame could be scored")
     if (apart := summary.currents) is not None:
         table.add_section()
         tail = f"{apart.p99:.2f}, {apart.greatest:.2f} A; recorded: {apart.recorded:.2f} A rms"
@@ -233,7 +233,7 @@ def loop_table(summary: LoopSummary) -> Table:
     table.add_row("  tracker alone", _milliseconds(summary.processing), _tail(summary.processing))
     table.add_row("  model step alone", _milliseconds(summary.step_time), _tail(summary.step_time))
     table.add_section()
-    _add_errors(table, summary, truth="truth")
+    _add_errors(table, summary)
     return table
 
 
@@ -275,12 +275,12 @@ def _figures_table(title: str) -> Table:
     return table
 
 
-def _add_errors(table: Table, summary: ReplaySummary | LoopSummary, truth: str, missing: str = "") -> None:
+def _add_errors(table: Table, summary: ReplaySummary | LoopSummary, missing: str = "") -> None:
     table.add_row("thread measured, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")
     table.add_row("prediction error, mean", "", "maximum; % of the length")
     if summary.error_seen is None and missing:
         table.add_row("  against the measured centreline", "none", missing)
-    for name, figures in (("measured centreline", summary.error_seen), (truth, summary.error_truth)):
+    for name, figures in (("measured centreline", summary.error_seen), ("ground truth", summary.error_truth)):
         if figures is not None:
             scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
             table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)

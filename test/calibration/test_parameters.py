@@ -160,7 +160,7 @@ def test_tables_and_lines_say_what_is_there():
     table = bag_table(values)
     assert [" ".join(str(column.header).split()) for column in table.columns] == [
         *("bag", "frames", "before", "after", "held out"),
-        *("truth before", "truth after", "truth held out"),
+        *("ground truth before", "ground truth after", "ground truth held out"),
     ]
     lines = calibration_lines(values)
     assert lines[0] == "warning: drag anisotropy cannot be identified in this data: too wide to be of use"

@@ -94,7 +94,7 @@ def test_a_thread_that_cannot_start_is_as_wrong_as_can_be():
     [
         ([Observation(sight.stamp, reason="dark") for sight in SIGHTS], "seen", "no needle"),
         ([replace(sight, measured=np.empty((0, 2))) for sight in SIGHTS], "seen", "no thread"),
-        ([replace(sight, ground_truth=np.empty((0, 2))) for sight in SIGHTS], "truth", "no truth"),
+        ([replace(sight, ground_truth=np.empty((0, 2))) for sight in SIGHTS], "truth", "no ground truth"),
         (SIGHTS[:40], "seen", "too short"),
         (
             [replace(s, measured=s.measured[:20]) if k else s for k, s in enumerate(SIGHTS)],

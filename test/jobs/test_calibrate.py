@@ -135,7 +135,7 @@ def test_ctrl_c_before_anything_is_known_leaves_nothing(folder: Path, tmp_path: 
         (["nowhere"], 1, "nowhere: does not exist"),
         (["one", "--parameters", "elastic_module"], 2, "did you mean elastic_modulus"),
         (["one", "--material", "steel"], 2, "material: got 'steel', expected one of polyamide_7_0, silk_6_0"),
-        (["one", "--against", "truth", "--remap", "/ground_truth/thread:=/elsewhere"], 1, "holds no truth"),
+        (["one", "--against", "truth", "--remap", "/ground_truth/thread:=/elsewhere"], 1, "holds no ground truth"),
         (["one", "--source", "camera"], 1, "camera/image_raw"),
     ],
 )
