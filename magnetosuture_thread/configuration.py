@@ -17,6 +17,8 @@ from typing import Any, ClassVar, TypeVar, cast, get_type_hints
 import yaml
 
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml
 
 C = TypeVar("C", bound="Configuration")
 
@@ -235,6 +237,11 @@ def use_ros_numbers(loader: type[Any], *, decimal_integers: bool = False) -> Non
 use_ros_numbers(_RosLoader)
 
 
+def _load(text: str) -> Any:
+    check_yaml(text)
+    return yaml.load(text, _RosLoader)
+
+
 def read_yaml(path: Path, what: str) -> Any:
     """Return the content of a YAML file, read as ROS does: 1e-5 is a number, nothing is a date, keys are unique.
 
@@ -243,10 +250,12 @@ def read_yaml(path: Path, what: str) -> Any:
         what: it is, for the error.
 
     Raises:
-        ConfigurationError: the file cannot be read, or is no YAML.
+        ConfigurationError: the file cannot be read, is not regular or too large, or is no plain YAML.
     """
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), _RosLoader)
+        return _load(read_regular(path, MAX_TEXT_BYTES).decode("utf-8"))
+    except BudgetError as error:
+        raise ConfigurationError(what, str(error), f"plain YAML, at most {MAX_YAML_DEPTH} deep", str(path)) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise ConfigurationError(what, reason, "a readable YAML file", str(path)) from None
@@ -260,8 +269,8 @@ def read_yaml(path: Path, what: str) -> Any:
 def parse_parameter_value(text: str) -> Any:
     """Return the value of a text as in a parameter file; the text itself where it is no YAML."""
     try:
-        return yaml.load(text, _RosLoader)
-    except yaml.YAMLError:
+        return _load(text)
+    except (yaml.YAMLError, BudgetError):
         return text
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from magnetosuture_thread.texts import shortened
+
+MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
+
 
 class MagnetosutureError(Exception):
     """Base of every error that this package raises on purpose; its text is one line for a person."""
@@ -23,7 +27,9 @@ class ConfigurationError(MagnetosutureError):
         self.expectation = expectation
         self.source = source
         where = f"{source}: " if source else ""
-        super().__init__(f"{where}{name}: got {value!r}, expected {expectation}")
+        super().__init__(
+            f"{where}{shortened(name, MAX_NAME_CHARS)}: got {shortened(repr(value))}, expected {expectation}"
+        )
 
 
 class BagError(MagnetosutureError):
@@ -53,7 +59,7 @@ class InvalidInputError(MagnetosutureError):
         self.field = field
         self.value = value
         self.expectation = expectation
-        super().__init__(f"{field}: got {value}, expected {expectation}")
+        super().__init__(f"{shortened(field, MAX_NAME_CHARS)}: got {shortened(str(value))}, expected {expectation}")
 
 
 class SolverError(MagnetosutureError):

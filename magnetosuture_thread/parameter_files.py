@@ -42,7 +42,9 @@ def read_sections(path: Path, what: str = "parameter file") -> list[tuple[str, d
     """
     content = read_yaml(path, what)
     if not isinstance(content, Mapping):
-        raise ConfigurationError(what, content, f"sections by node, each with {PARAMETERS}", str(path))
+        # What the file holds is not shown: it may be none of ours.
+        found = None if content is None else f"content of type {type(content).__name__}"
+        raise ConfigurationError(what, found, f"sections by node, each with {PARAMETERS}", str(path))
     return list(_sections("", content, str(path)))
 
 
@@ -115,13 +117,13 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
                         given[owner][name] = value
             continue
         if group not in known:
-            raise ConfigurationError(format_key(key), "…", suggest_names(group, [EVERY_NODE, *known]), str(path))
+            raise ConfigurationError(format_key(key), group, suggest_names(group, [EVERY_NODE, *known]), str(path))
         space = key.rpartition("/")[0]
         if space and "*" not in space:
             spaces.append(space)
         if len(set(spaces)) > 1:
             raise ConfigurationError(
-                format_key(key), "…", f"one namespace in a setup, as {spaces[0]} before", str(path)
+                format_key(key), space, f"one namespace in a setup, as {spaces[0]} before", str(path)
             )
         given[group].update(values)
     return {group: from_mapping(cls, given[group], str(path)) for group, cls in known.items()}

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import FrozenInstanceError, dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
-from magnetosuture_thread.configuration import Configuration, configuration_fields, from_mapping, quantity, to_mapping
+from magnetosuture_thread.configuration import (
+    Configuration,
+    configuration_fields,
+    from_mapping,
+    quantity,
+    read_yaml,
+    to_mapping,
+)
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.parameter_files import key_matches, load_setup
 from magnetosuture_thread.shared_parameters import shared_parameter
@@ -177,7 +185,7 @@ def test_sections_are_for_whom_ros_has_them(tmp_path: Path, text: str, kettle: f
         ("/lab1/*: {ros__parameters: {viscosity: 2.0}}", "/lab1/*: got"),
         (
             "/lab1/kettle: {ros__parameters: {volume: 0.002}}\n/lab2/kettle: {ros__parameters: {volume: 0.001}}",
-            "/lab2/kettle: got '…', expected one namespace in a setup, as /lab1 before",
+            "/lab2/kettle: got '/lab2', expected one namespace in a setup, as /lab1 before",
         ),
         ("/**/kettle: {ros__parameters: {volume: 0.002}, other: {}}", "one key, ros__parameters"),
         ("/**/kettle:", "one key, ros__parameters"),
@@ -219,3 +227,24 @@ def test_what_is_of_ros_may_stand_under_every_key(tmp_path: Path):
 )
 def test_keys_match_as_in_ros(key: str, node: str, is_for: bool):
     assert key_matches(key, node) == is_for
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 20_000, "lists and mappings 21 deep in line 1"),
+        ("a: &a [1, 2]\nb: *a\n", "an anchor or alias"),
+        ("# " + "x" * 1_000_000, "a larger file"),
+    ],
+)
+def test_a_setup_past_its_budget_is_refused(tmp_path: Path, text: str, words: str):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ConfigurationError, match=words):
+        read_yaml(tmp_path / "a.yaml", "setup file")
+
+
+def test_a_pipe_or_device_is_no_setup(tmp_path: Path):
+    os.mkfifo(tmp_path / "a.yaml")
+    for path in (tmp_path / "a.yaml", Path("/dev/zero"), tmp_path):
+        with pytest.raises(ConfigurationError, match="a folder, pipe or device"):
+            read_yaml(path, "setup file")

@@ -13,13 +13,18 @@ PACKAGE = Path(magnetosuture_thread.__file__).parent
 
 # What each subpackage or top-level module may import of the package, itself aside.
 BASE = {"errors", "configuration", "resources", "shared_parameters", "parameter_files", "scene"}
+BASE |= {"files", "texts", "outputs", "untrusted"}
 ALLOWED = {
-    "errors": set(),
-    "configuration": {"errors"},
+    "errors": {"texts"},
+    "configuration": {"errors", "files", "untrusted"},
     "resources": {"errors"},
     "shared_parameters": {"configuration"},
     "parameter_files": {"errors", "configuration", "shared_parameters"},
     "interface": set(),
+    "files": set(),
+    "texts": set(),
+    "outputs": set(),
+    "untrusted": set(),
     "compiled": set(),
     "workers": set(),
     "barrier": {"errors", "geometry"},
@@ -34,8 +39,19 @@ ALLOWED = {
     "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
     "bags": {*BASE, "interface", "messages"},
     "messages": {"barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils"},
-    "evaluation": {"barrier", "messages", "errors", "geometry", "interface", "model", "scene"},
-    "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation"},
+    "evaluation": {
+        "barrier",
+        "messages",
+        "errors",
+        "files",
+        "texts",
+        "untrusted",
+        "geometry",
+        "interface",
+        "model",
+        "scene",
+    },
+    "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation", "texts"},
     "nodes": {
         *BASE,
         *("interface", "messages", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
@@ -74,7 +90,20 @@ ALLOWED = {
         *("interface", "geometry", "model", "vision", "safety", "bags", "evaluation", "setups", "jobs", "messages"),
     },
     "cli": {
-        *("errors", "geometry", "scene", "setups", "bags", "coils", "vision", "nodes", "jobs", "reproduce"),
+        *(
+            "errors",
+            "texts",
+            "outputs",
+            "geometry",
+            "scene",
+            "setups",
+            "bags",
+            "coils",
+            "vision",
+            "nodes",
+            "jobs",
+            "reproduce",
+        ),
         *("evaluation", "calibration"),
     },
 }

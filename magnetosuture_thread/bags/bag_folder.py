@@ -6,7 +6,7 @@ import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from magnetosuture_thread.bags.mcap.writer import WriterState
 from magnetosuture_thread.bags.storage import Connection
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.untrusted import MAX_METADATA_BYTES, MAX_TEXT_BYTES, BudgetError, check_yaml
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 COMPRESSED_SUFFIXES = tuple(f"{suffix}.zstd" for suffix in STORAGE_SUFFIXES)
@@ -29,11 +31,34 @@ class BagFiles:
         files: in the order in which they were recorded.
         missing: names of those that are listed in metadata.yaml and do not exist.
         notes: notes of our writer in metadata.yaml.
+        unlisted: names of those that are there and not listed in metadata.yaml, so that they are not read.
+        packed: whether each message was packed by the recorder; None where no metadata.yaml says so.
+        doubt: why metadata.yaml is not used, in one line; empty where it is, or there is none.
     """
 
     files: list[Path]
     missing: list[str]
     notes: dict[str, str]
+    unlisted: list[str] = field(default_factory=list)
+    packed: bool | None = None
+    doubt: str = ""
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What metadata.yaml says.
+
+    Attributes:
+        names: of the files, in the order in which they were recorded.
+        notes: of our writer.
+        packed: whether each message is packed; None where it does not say.
+        doubt: why it is not used; empty where it is, or there is none.
+    """
+
+    names: list[str] = field(default_factory=list)
+    notes: dict[str, str] = field(default_factory=dict)
+    packed: bool | None = None
+    doubt: str = ""
 
 
 def find_bag_files(path: Path) -> BagFiles:
@@ -57,11 +82,20 @@ def find_bag_files(path: Path) -> BagFiles:
     if path.is_file():
         if path.name.endswith(COMPRESSED_SUFFIXES):
             raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {path.name}")
-        return BagFiles([path], [], {})
-    names, notes = read_metadata(path)
+        beside = read_metadata(path.parent)
+        return BagFiles([path], [], {}, packed=beside.packed if path.name in beside.names else None)
+    metadata = read_metadata(path)
+    names, notes = metadata.names, metadata.notes
     present = {file.name: file for file in files}
     if listed := [present[name] for name in names if name in present]:
-        return BagFiles(listed, [name for name in names if name not in present], notes)
+        missing = [name for name in names if name not in present]
+        packs = {f"{name}.zstd" for name in names}  # left beside the unpacked files by a player
+        unlisted = [
+            file.name
+            for file in inside
+            if file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) and file.name not in {*names, *packs}
+        ]
+        return BagFiles(listed, missing, notes, unlisted, metadata.packed)
     compressed = [file for file in inside if file.name.endswith(COMPRESSED_SUFFIXES)]
     if compressed and not files:
         raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {compressed[0].name}")
@@ -70,7 +104,7 @@ def find_bag_files(path: Path) -> BagFiles:
     if len(files) > 1 and not _is_split(files):
         kind = files[0].suffix if len({file.suffix for file in files}) == 1 else ".mcap and .db3"
         raise BagError(path, f"holds {len(files)} {kind} files; name one of them")
-    return BagFiles(files, [], notes)
+    return BagFiles(files, [], notes, packed=metadata.packed, doubt=metadata.doubt)
 
 
 def _by_number(path: Path) -> tuple[str, int, str]:
@@ -86,6 +120,7 @@ def _is_split(files: list[Path]) -> bool:
 
 
 METADATA_FILE = "metadata.yaml"
+MAX_ALIASES = 16  # in it; some recorders write none, others a few
 NOTES = "magnetosuture"  # name of the mcap record that holds our notes
 QOS = "offered_qos_profiles"  # metadata key of a connection, in mcap and in sqlite3
 TYPE_HASH = "topic_type_hash"
@@ -125,6 +160,9 @@ def parse_qos_profiles(text: str) -> list[dict[str, Any]]:
         text: YAML, as a recorder keeps it with a topic.
     """
     try:
+        if len(text) > MAX_TEXT_BYTES:
+            return []
+        check_yaml(text)
         return [{**profile} for profile in dump_qos_v9(parse_qos(text))]
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return []
@@ -135,20 +173,31 @@ def dump_qos_profiles(profiles: Sequence[dict[str, Any]]) -> str:
     return yaml.safe_dump(list(profiles), sort_keys=False) if profiles else ""
 
 
-def read_metadata(folder: Path) -> tuple[list[str], dict[str, str]]:
-    """Return the file names and notes in the metadata.yaml of a bag; none where it cannot be read."""
+def read_metadata(folder: Path) -> Metadata:
+    """Read the metadata.yaml of a bag; what cannot be read of it is left out, and the doubt says why."""
     try:
-        content: Any = yaml.safe_load((folder / METADATA_FILE).read_text(encoding="utf-8"))
+        text = read_regular(folder / METADATA_FILE, MAX_METADATA_BYTES).decode("utf-8")
+        check_yaml(text, max_aliases=MAX_ALIASES)
+        content: Any = yaml.load(text, yaml.CSafeLoader)
         information = content["rosbag2_bagfile_information"]
         names = list(dict.fromkeys(Path(name).name for name in information["relative_file_paths"]))
+        mode = information.get("compression_mode")
+        packed = None if mode is None else str(mode).lower() == "message"
         custom = information.get("custom_data")
         if not isinstance(custom, Mapping):
-            return names, {}
+            return Metadata(names, {}, packed)
         entries = {str(key): str(value) for key, value in custom.items()}
         ours = {key.removeprefix(_PREFIX): value for key, value in entries.items() if key.startswith(_PREFIX)}
-        return names, verified_notes(ours) or {}
-    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError, AttributeError, RecursionError):
-        return [], {}
+        return Metadata(names, verified_notes(ours) or {}, packed)
+    except FileNotFoundError:
+        return Metadata()
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        problem = getattr(error, "strerror", None) or "is not what rosbag2 writes"
+    except BudgetError as error:
+        problem = f"has {error}"
+    except yaml.YAMLError:
+        problem = "is no YAML"
+    return Metadata(doubt=f"{METADATA_FILE} is not used: {problem}")
 
 
 def bag_information(

@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from magnetosuture_thread.bags.definitions import Extent, parse_definition
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.messages.building import MessageBuilder
 from magnetosuture_thread.resources import share_directory
+from magnetosuture_thread.untrusted import MAX_DECODED, BudgetError
 
 HEADER = "std_msgs/msg/Header"
 
@@ -77,15 +79,29 @@ class MessageDecoder:
     Attributes:
         type_name: for example `nav_msgs/msg/Path`.
         is_ours: whether our definition of the type is used.
-        is_known: whether there is any definition.
+        is_known: whether there is any definition that can be used.
+        problem: why the bag's definition is not used; empty where it is, or none is needed.
     """
 
     def __init__(self, definition: MessageDefinition) -> None:
         self.type_name = definition.type_name
-        own = _parsed(definition)
+        self.problem = ""
+        own, extent = dict[str, Any](), Extent({})
+        try:
+            own = _parsed(definition)
+            types = {**typestore().fielddefs, **own}
+            extent = Extent(types)
+            if self.type_name in types:
+                extent.check(self.type_name)
+        except BudgetError as error:
+            # Not ours in its place either: its messages are of that definition.
+            own, self.problem = {}, str(error)
+        self._density = extent.density
         ours = typestore()
-        self.is_ours = self.type_name in ours.fielddefs and (
-            self.type_name not in own or not _differ(self.type_name, own, ours.fielddefs)
+        self.is_ours = (
+            not self.problem
+            and self.type_name in ours.fielddefs
+            and (self.type_name not in own or not _differ(self.type_name, own, ours.fielddefs))
         )
         self._store: Typestore = ours if self.is_ours else _store(own)
         self.is_known = self.type_name in self._store.fielddefs
@@ -96,6 +112,11 @@ class MessageDecoder:
         Raises:
             BagError: the bytes are not of the type, or the type has no definition.
         """
+        if self.problem:
+            raise BagError(topic, f"the type {self.type_name} of its messages has {self.problem}")
+        if len(data) * self._density > MAX_DECODED:
+            text = f"a message of {len(data)} bytes may have more than {MAX_DECODED} parts; so many are not decoded"
+            raise BagError(topic, text)
         if not self.is_known:
             raise BagError(topic, f"the type {self.type_name or '(no name)'} of its messages has no definition")
         try:
@@ -105,7 +126,7 @@ class MessageDecoder:
 
     def has_header(self) -> bool:
         """Return whether a message is a header or begins with one."""
-        if self.type_name == HEADER:
+        if self.type_name == HEADER and not self.problem:
             return True
         fields = self._store.fielddefs[self.type_name][1] if self.is_known else []
         return bool(fields) and fields[0][1][1] == HEADER
@@ -115,15 +136,17 @@ def _parsed(definition: MessageDefinition) -> dict[str, Any]:
     """Return the types of a definition, by name; none where it cannot be parsed, or uses types without definition.
 
     An empty definition is ignored for a type that we know: some recorders leave it out.
+
+    Raises:
+        BudgetError: it asks for more than a message may be.
     """
     own: dict[str, Any] = {}
     if not definition.text.strip() and definition.type_name in typestore().fielddefs:
         return own
     try:
-        if definition.encoding == "ros2msg":
-            own = dict(get_types_from_msg(definition.text, definition.type_name))
-        elif definition.encoding == "ros2idl":
-            own = dict(get_types_from_idl(definition.text))
+        own = parse_definition(definition)
+    except BudgetError:
+        raise
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return {}
     used = {inner for _, fields in own.values() for _, kind in fields for inner in _nested_types(kind)}

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import zstandard
+from mcap.records import Attachment, Metadata
 
-from magnetosuture_thread.bags.bag_folder import find_bag_files
+from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
 from magnetosuture_thread.bags.mcap.file import McapFile
 from magnetosuture_thread.bags.message_types import MessageDecoder
 from magnetosuture_thread.bags.remap import apply_remap
@@ -28,8 +29,11 @@ from magnetosuture_thread.bags.storage import (
     merge_reports,
 )
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
 Progress = Callable[[float], None]
+UNVERIFIED_NOTE = "unverified"  # note of a bag that was salvaged from one without checksums: why it may be wrong
+UNCHECKED_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
 _decoder = cache(MessageDecoder)
 
 
@@ -87,6 +91,9 @@ class Bag:
         notes: notes of our writer.
         damage: what is corrupt and lost; None if the bag is intact. Its text is one line.
         unchecked: why damage may not have been noticed, in one line; empty if it would have been.
+        unverified: why even what is read may be wrong, in one line; empty if checksums vouch for it, or nothing speaks
+            against it. A bag keeps this for good: what `bag repair` makes of it says so in its notes.
+        remarks: on files of the bag that are not read, a line each.
         facts: properties of each file, for a person.
 
     Raises:
@@ -102,9 +109,15 @@ class Bag:
         missing = [CorruptRegion(name, 0, 0, "it is missing") for name in found.missing]
         lost = [DamageReport((region,), 0, region.end, None) for region in (*missing, *problems)]
         self.damage = merge_reports([*(storage.damage for storage in self._storages), *lost])
+        self._packed = found.packed
         self.unchecked = next((storage.unchecked for storage in self._storages if storage.unchecked), "")
+        own = next((storage.unverified for storage in self._storages if storage.unverified), "")
+        unlisted = [f"{name} is not read: {METADATA_FILE} does not list it" for name in found.unlisted]
+        self.remarks = [*unlisted, *([found.doubt] if found.doubt else [])]
         self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
         self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
+        self.unverified = own or self.notes.get(UNVERIFIED_NOTE, "")
+        self.unchecked = self.unchecked or self.notes.get(UNCHECKED_NOTE, "")
         if not any(storage.counts for storage in self._storages):
             raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
         filled = [storage for storage in self._storages if storage.counts]
@@ -148,6 +161,25 @@ class Bag:
         loaded = (self._load(item, refused, only=CDR) for item in self._stored(wanted, start, duration))
         return (record for record in loaded if record is not None)
 
+    def stored(self) -> Iterator[StoredMessage]:
+        """Yield all messages by time as they are stored, whatever their type or serialization."""
+        return self._stored(set(self.counts), 0.0, None)
+
+    def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
+        """Yield attachments, and metadata records of others; what cannot be vouched for is counted by reason."""
+        for storage in self._storages:
+            yield from storage.extras(dropped)
+
+    def load(self, item: StoredMessage) -> bytes:
+        """Return a stored message as it was before the recorder packed it, if it did.
+
+        Raises:
+            BagError: it cannot be unpacked.
+        """
+        is_packed = self._packed if self._packed is not None else item.connection.serialization == CDR
+        topic = self._names[item.connection.topic]
+        return unpacked(topic, item.data) if is_packed else item.data
+
     def every_record(self, refused: Counter[str]) -> Iterator[tuple[Connection, RecordedMessage]]:
         """Yield all messages by time, each with its connection.
 
@@ -156,7 +188,7 @@ class Bag:
         Args:
             refused: counts the messages that cannot be decompressed, by reason.
         """
-        for item in self._stored(set(self.counts), 0.0, None):
+        for item in self.stored():
             record = self._load(item, refused)
             if record is not None:
                 yield item.connection, record
@@ -190,7 +222,7 @@ class Bag:
         try:
             if only and connection.serialization != only:
                 raise BagError(topic, f"its messages are written as {connection.serialization!r}, expected {only!r}")
-            data = unpacked(topic, item.data)
+            data = self.load(item)
         except BagError as error:
             if refused is None:
                 raise
@@ -240,7 +272,6 @@ def _file_size(file: Path) -> int:
 
 
 _ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins like this: its first byte is 0
-_MAX_MESSAGE_BYTES = 1 << 30  # bytes of a message
 
 
 def unpacked(topic: str, data: bytes) -> bytes:
@@ -252,9 +283,10 @@ def unpacked(topic: str, data: bytes) -> bytes:
     if not data.startswith(_ZSTD):
         return data
     try:
-        if zstandard.frame_content_size(data) > _MAX_MESSAGE_BYTES:
-            raise BagError(topic, f"a packed message is larger than {_MAX_MESSAGE_BYTES} bytes")
+        if zstandard.frame_content_size(data) > MAX_BLOCK_BYTES:
+            raise BagError(topic, f"a packed message is larger than {MAX_BLOCK_BYTES} bytes")
         # Without a size in it, a frame is unpacked to this many bytes at most.
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=1 << 27)
+        unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES)
+        return unpacker.decompress(data, max_output_size=MAX_BLOCK_BYTES)
     except (zstandard.ZstdError, MemoryError) as error:
         raise BagError(topic, f"a packed message cannot be unpacked: {error}") from None

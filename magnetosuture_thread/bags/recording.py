@@ -49,12 +49,15 @@ class Recording:
         duration: as the bag's [s].
         damage: as the bag's.
         unchecked: as the bag's.
+        unverified: as the bag's.
+        remarks: as the bag's.
     """
 
     def __init__(self, bag: Bag, *, dish_frame: str = DISH_FRAME) -> None:
         self.path = bag.path
         self.notes, self.start, self.duration = bag.notes, bag.start, bag.duration
         self.damage, self.unchecked = bag.damage, bag.unchecked
+        self.unverified, self.remarks = bag.unverified, bag.remarks
         self.refused: Counter[str] = Counter()
         self.unfit: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
@@ -111,10 +114,31 @@ class Recording:
         for channel, name in self._topics.items():
             if name == topic:
                 try:
-                    self._check_first(topic, channel)
+                    return self._conversion_problem(topic, channel)
                 except BagError as error:
                     return error.problem
         return self.unfit.get(topic, "")
+
+    def _conversion_problem(self, topic: str, channel: Channel) -> str:
+        """Return why not one message of a topic can be used; empty if one can, or there are none.
+
+        Raises:
+            BagError: their frame is not connected to the dish's.
+        """
+        first, refused = "", Counter[str]()
+        for record in self._bag.records({topic}, refused=refused):
+            try:
+                converted = self._convert(record, channel)
+                if not isinstance(converted, str):
+                    converted.decode()
+                    return ""
+            except BagError as error:
+                if error.path == str(self.path):
+                    raise
+                converted = error.problem
+            first = first or converted
+        first = first or next(iter(refused), "")
+        return f"none of the messages on {topic} can be used: {first}" if first else ""
 
     def _check_first(self, topic: str, channel: Channel) -> None:
         for record in self._bag.records({topic}, refused=Counter()):

@@ -28,7 +28,7 @@ class TopicReport:
         backward: number of messages whose stamp is before that of the one before them.
         unreadable: number of messages whose stamp cannot be read although their type has one.
         frames: frame ids of the messages.
-        known: whether our graph uses the topic.
+        known: whether our graph uses the topic, and at least one of its messages can be used.
         problem: why it does not, although it has the name of one of our topics.
     """
 
@@ -113,6 +113,8 @@ class BagReport:
             "notes": self.bag.notes,
             "files": self.bag.facts,
             "unchecked": self.bag.unchecked or None,
+            "unverified": self.bag.unverified or None,
+            "remarks": self.bag.remarks,
             "refused": dict(self.refused),
             "damage": None
             if damage is None
@@ -149,7 +151,8 @@ def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = l
     topics: dict[str, TopicReport] = {}
     for name in sorted(bag.counts):
         own = bag.conflicts.get(name) or (bag.topics[name],)
-        topics[name] = TopicReport(name, own, known=recording.uses(name), problem=recording.problem_of(name))
+        problem = recording.problem_of(name)
+        topics[name] = TopicReport(name, own, known=recording.uses(name) and not problem, problem=problem)
     refused: Counter[str] = Counter()
     for connection, record in bag.every_record(refused):
         time = (record.time - bag.start) * 1e-9

@@ -1,15 +1,22 @@
-"""Reads the files of a bag in sqlite3, the older format of rosbag2, which has no checksums."""
+"""Reads the files of a bag in sqlite3, the older format of rosbag2, which has no checksums.
+
+A database may be anything: tables that compute their rows, trees that lead back to themselves, rows of gigabytes. Only
+plain tables are read, each row once, within a number of steps that depends on the size of the file.
+"""
 
 from __future__ import annotations
 
 import os
 import sqlite3
+import stat
 from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
+
+from mcap.records import Attachment, Metadata
 
 from magnetosuture_thread.bags.storage import (
     Connection,
@@ -20,17 +27,30 @@ from magnetosuture_thread.bags.storage import (
     pluralize,
 )
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
 UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
+UNVERIFIED = "damaged, and without checksums (sqlite3): any message that is read may be wrong"
+_ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a damaged name
 _MAGIC = b"SQLite format 3\0"
+_SIDECARS = ("-wal", "-journal", "-shm")
 _METADATA_COLUMNS = {
     "offered_qos_profiles": "offered_qos_profiles",
     "topic_type_hash": "type_description_hash",
 }  # by metadata key
+_COLUMNS = {
+    "topics": ("id", "name", "type", "serialization_format"),
+    "messages": ("id", "topic_id", "timestamp", "data"),
+}
 _MAX_ROW_ID = (1 << 63) - 1
+_MAX_GAPS = 2000  # unreadable places after which the rest of a database is given up
+_LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
+_STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
+_MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
 # sqlite3 does not enforce column types, so that a row may hold anything.
 _IS_VALID = (
     "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
+    f" AND length(data) <= {MAX_BLOCK_BYTES}"
 )
 
 
@@ -55,26 +75,31 @@ class SqliteFile:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from None
         if magic != _MAGIC:
             raise BagError(path, "is no sqlite3 file" if magic else "is empty, expected a sqlite3 file")
+        self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size
         self.notes: dict[str, str] = {}
         self.unchecked = UNCHECKED
+        self.connections: dict[int, Connection] = {}
+        self.counts: dict[int, int] = {}
         self._rows: list[tuple[int, int]] | None = None  # time and id of each readable row, if not all are readable
         lost: int | None = None
         try:
             with closing(self._connect()) as database:
-                self.connections = _connections(database)
                 problem = _problem(database)
+                self._check_tables(database)
+                self.connections = _connections(database)
                 if problem:
                     self._salvage(database)
                 else:
                     lost = self._count_messages(database)
-        except sqlite3.Error as error:
-            raise BagError(path, f"cannot be read as a bag: {error}") from None
+        except _ERRORS as error:
+            raise BagError(path, f"cannot be read as a bag: {_words(error)}") from None
         progress(size)
         if lost:
             problem = f"{pluralize(lost, 'row')} without a valid time, topic or data"
         elif problem:
             problem = f"the database is malformed ({problem})"
         self.damage = DamageReport((CorruptRegion(path.name, 0, size, problem),), 0, 0, lost) if problem else None
+        self.unverified = UNVERIFIED if problem else ""
         self.facts = {"format": "sqlite3", "bytes": str(size), "checksums": "none"}
 
     def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
@@ -90,25 +115,57 @@ class SqliteFile:
                     marks = ",".join("?" * len(wanted))
                     query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
                     between = f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
-                    rows = database.execute(query + between, (*wanted, start, end))
+                    limits = (max(start, -_MAX_ROW_ID), min(end, _MAX_ROW_ID))
+                    rows = database.execute(query + between, (*wanted, *limits))
                     yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)
                     return
                 query = "SELECT timestamp, topic_id, data FROM messages WHERE id = ?"
                 for time, number in self._rows:
                     if start <= time <= end:
-                        for stored_time, topic, data in database.execute(query, (number,)):
-                            if topic in wanted:
-                                yield StoredMessage(stored_time, self.connections[topic], data)
-        except sqlite3.Error as error:
-            raise BagError(self.path, f"cannot be read any more: {error}") from None
+                        row = database.execute(query, (number,)).fetchone()
+                        if row is not None and row[0] == time and row[1] in wanted and isinstance(row[2], bytes):
+                            yield StoredMessage(time, self.connections[row[1]], row[2])
+        except _ERRORS as error:
+            raise BagError(self.path, f"cannot be read any more: {_words(error)}") from None
+
+    def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
+        """Yield nothing: the format has no attachments."""
+        return iter(())
 
     def _connect(self) -> sqlite3.Connection:
         """Open the file read-only; nothing is written beside it either, unless a recorder left a journal."""
-        journal = any(self.path.with_name(self.path.name + ending).exists() for ending in ("-wal", "-journal"))
+        sidecars = [path for end in _SIDECARS if (path := self.path.with_name(self.path.name + end)).exists()]
+        for sidecar in sidecars:
+            if not stat.S_ISREG(sidecar.stat().st_mode):
+                raise BagError(sidecar, "is a folder, pipe or device, expected the journal of a database")
+        journal = any(not path.name.endswith("-shm") for path in sidecars)
         mode = "mode=ro" if journal else "mode=ro&immutable=1"
         database = sqlite3.connect(f"file:{quote(os.fsencode(self.path.absolute()))}?{mode}", uri=True)
         database.text_factory = _decode_text
+        if set_limit := getattr(database, "setlimit", None):  # from Python 3.11 on
+            set_limit(_LIMIT_LENGTH, MAX_BLOCK_BYTES + 1024)
+        left = self._max_steps
+
+        def step() -> int:
+            nonlocal left
+            left -= _STEP_INTERVAL
+            return int(left < 0)
+
+        database.set_progress_handler(step, _STEP_INTERVAL)
+        for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
+            database.execute(f"PRAGMA {pragma}")
         return database
+
+    def _check_tables(self, database: sqlite3.Connection) -> None:
+        """Refuse a database whose tables are not those of rosbag2, but views or columns that compute what they hold."""
+        for table, columns in _COLUMNS.items():
+            kinds = database.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)).fetchall()
+            if [kind for kind, _ in kinds] != ["table"] or "virtual" in str(kinds[0][1]).lower().split("(")[0]:
+                raise BagError(self.path, f"has no table {table}, which the database of a bag has")
+            found = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
+            missing = next((name for name in columns if found.get(name) != 0), None)
+            if missing is not None:
+                raise BagError(self.path, f"has no column {missing} in its table {table}, or one that is computed")
 
     def _count_messages(self, database: sqlite3.Connection) -> int:
         """Count the valid messages, and return the number of invalid rows."""
@@ -141,12 +198,19 @@ def _decode_text(data: bytes) -> str | None:
         return None
 
 
+def _words(error: Exception) -> str:
+    """Return an error of sqlite3 in words."""
+    if "interrupted" in str(error):
+        return "reading it takes more steps than a recording of its size does"
+    return " ".join(str(error).split())
+
+
 def _problem(database: sqlite3.Connection) -> str:
     """Return what is malformed; empty if nothing is."""
     try:
         found = str(database.execute("PRAGMA quick_check(1)").fetchone()[0])
-    except sqlite3.DatabaseError as error:
-        return str(error)
+    except _ERRORS as error:
+        return _words(error)
     return "" if found == "ok" else " ".join(found.split())
 
 
@@ -156,7 +220,7 @@ def _connections(database: sqlite3.Connection) -> dict[int, Connection]:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         rows = database.execute(query)
         definitions = {row[0]: MessageDefinition(*row) for row in rows if all(isinstance(word, str) for word in row)}
-    except sqlite3.Error:
+    except _ERRORS:
         pass  # Older files have none.
     connections = {}
     cursor = database.execute("SELECT * FROM topics")
@@ -164,6 +228,8 @@ def _connections(database: sqlite3.Connection) -> dict[int, Connection]:
     for row in cursor:
         values = dict(zip(names, row, strict=True))
         number, topic, kind, form = (values[name] for name in ("id", "name", "type", "serialization_format"))
+        if number in connections:
+            raise sqlite3.DatabaseError("its table of topics leads back to itself")
         if isinstance(number, int) and all(isinstance(word, str) for word in (topic, kind, form)):
             entries = {key: values.get(column) for key, column in _METADATA_COLUMNS.items()}
             metadata = {key: text for key, text in entries.items() if isinstance(text, str)}
@@ -172,17 +238,26 @@ def _connections(database: sqlite3.Connection) -> dict[int, Connection]:
 
 
 def _readable_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int, int]]:
-    """Yield id, topic and time of each row that is fully readable."""
-    last, stride = 0, 0
-    query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id"
-    while last < _MAX_ROW_ID:
+    """Yield id, topic and time of each row that is fully readable, by rising id: each once.
+
+    In a broken tree, ids may fall, as where a page is its own child. What follows such an id is skipped like a page
+    that cannot be read.
+    """
+    last, stride, gaps = 0, 0, 0
+    query = f"SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? AND {_IS_VALID} ORDER BY id"
+    while last < _MAX_ROW_ID and gaps < _MAX_GAPS:
         try:
             for number, topic, time, data in database.execute(query, (last,)):
+                if not isinstance(number, int) or number <= last:
+                    raise sqlite3.DatabaseError("ids that do not rise")
                 last, stride = number, 0
                 if isinstance(data, bytes) and isinstance(topic, int) and isinstance(time, int) and time >= 0:
                     yield number, topic, time
             return
-        except sqlite3.DatabaseError:
-            # Skip row by row past the unreadable ones, then in growing steps.
-            stride = max(1, min(2 * stride, _MAX_ROW_ID // 4))
-            last += stride
+        except _ERRORS as error:
+            if "interrupted" in str(error):
+                return  # The budget of steps is spent.
+            gaps += 1
+        # Skip row by row past the unreadable ones, then in growing steps.
+        stride = max(1, min(2 * stride, _MAX_ROW_ID // 4))
+        last += stride

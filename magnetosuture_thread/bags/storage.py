@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
+
+from mcap.records import Attachment, Metadata
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,8 @@ class MessageDefinition:
     Attributes:
         type_name: for example `nav_msgs/msg/Path`.
         encoding: `ros2msg` or `ros2idl`; empty where the bag does not define it.
-        text: the definition, with those of all types in it.
+        text: the definition, with those of all types in it. Of another encoding it may be binary: bytes that are no
+            UTF-8 are kept as surrogates (`surrogateescape`), so that it can be written as it was.
     """
 
     type_name: str
@@ -125,11 +129,21 @@ class Connection:
 
 
 class StoredMessage(NamedTuple):
-    """A message as it is stored in a file: time [ns], connection, bytes."""
+    """A message as it is stored in a file.
+
+    Attributes:
+        time: when it was recorded [ns].
+        connection: that it was recorded from.
+        data: as stored, which may be packed.
+        publish_time: when it was published [ns]; None where the format has no such time.
+        sequence: number given by its publisher; None where the format has none.
+    """
 
     time: int
     connection: Connection
     data: bytes
+    publish_time: int | None = None
+    sequence: int | None = None
 
 
 class BagStorage(Protocol):
@@ -144,6 +158,8 @@ class BagStorage(Protocol):
         notes: notes of our writer.
         damage: what is corrupt and lost; None if nothing is.
         unchecked: why damage may not have been noticed, in one line; empty if it would have been.
+        unverified: why even the messages that are read may be wrong, in one line; empty if checksums vouch for them,
+            or nothing speaks against them.
         facts: properties of the file for a person, for example chunks and compression.
     """
 
@@ -155,7 +171,11 @@ class BagStorage(Protocol):
     notes: dict[str, str]
     damage: DamageReport | None
     unchecked: str
+    unverified: str
     facts: dict[str, str]
+
+    def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
+        """Yield attachments and foreign metadata records; what cannot be vouched for is counted by reason."""
 
     def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import yaml
+from mcap.records import Attachment, Metadata
 
 from magnetosuture_thread.bags.bag_folder import (
     METADATA_FILE,
@@ -25,7 +25,6 @@ from magnetosuture_thread.bags.bag_folder import (
 )
 from magnetosuture_thread.bags.mcap.writer import MAX_INDEX_BYTES, McapWriter
 from magnetosuture_thread.bags.message_types import own_definition, typestore
-from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import Connection, MessageDefinition, pluralize
 from magnetosuture_thread.errors import BagError
 
@@ -35,7 +34,17 @@ _RESERVE_BYTES = 256 * 1024  # for summary and metadata.yaml, besides the index 
 
 
 class RecordingEndedError(BagError):
-    """The disk is full, or fails; what was recorded before can be read."""
+    """The disk is full, or fails; what was recorded before can be read.
+
+    Args:
+        folder: of the bag.
+        cause: what ended it.
+        file: that holds what was recorded before.
+    """
+
+    def __init__(self, folder: Path, cause: str, file: Path) -> None:
+        self.cause, self.file = cause, file
+        super().__init__(folder, f"{cause}; what was recorded before can be read: {file}")
 
 
 class BagWriter:
@@ -109,7 +118,8 @@ class BagWriter:
     def add_connection(self, connection: Connection) -> int:
         """Add a connection, and return its number for `write_to`."""
         if QOS in connection.metadata:
-            profiles = dump_qos_profiles(parse_qos_profiles(connection.metadata[QOS]))
+            given = connection.metadata[QOS]
+            profiles = dump_qos_profiles(parse_qos_profiles(given)) or given  # as it was, where it cannot be read
             connection = replace(connection, metadata={**connection.metadata, QOS: profiles})
         number = self._writer.add_channel(connection)
         self._connections[number] = connection
@@ -128,8 +138,13 @@ class BagWriter:
         """
         self.write_to(self._topics[topic], time, data)
 
-    def write_to(self, number: int, time: int, data: bytes) -> None:
-        """Write one serialised message of a connection; otherwise as `write`."""
+    def write_to(
+        self, number: int, time: int, data: bytes, *, publish_time: int | None = None, sequence: int | None = None
+    ) -> None:
+        """Write one serialised message of a connection, with its own publish time and sequence number if it has any.
+
+        Otherwise as `write`.
+        """
         if not 0 <= time <= MAX_TIME:
             raise BagError(
                 self._connections[number].topic, f"a message of the time {time} ns; expected 0 to {MAX_TIME}"
@@ -137,8 +152,22 @@ class BagWriter:
         if self._closed:
             raise BagError(self.folder, "is closed; nothing more can be written to it")
         try:
-            if self._writer.add_message(number, time, data):
+            if self._writer.add_message(number, time, data, publish_time=publish_time, sequence=sequence):
                 self._reserve.grow(_RESERVE_BYTES + MAX_INDEX_BYTES * self._writer.state.chunks)
+        except OSError as error:
+            self._end(error)
+
+    def add_extra(self, extra: Attachment | Metadata) -> None:
+        """Write an attachment or a metadata record; before the first message.
+
+        Raises:
+            RecordingEndedError: as `write`.
+        """
+        try:
+            if isinstance(extra, Metadata):
+                self._writer.add_metadata(extra.name, extra.metadata)
+            else:
+                self._writer.add_attachment(extra)
         except OSError as error:
             self._end(error)
 
@@ -177,9 +206,7 @@ class BagWriter:
     def _refusal(self, problem: OSError) -> RecordingEndedError:
         kept = pluralize(self._writer.state.counts.total(), "message")
         what = DISK_FULL_TEXTS.get(problem.errno or 0, f"fails ({problem.strerror})")
-        file = self.folder / self._file_name
-        text = f"the disk {what} after {kept}; what was recorded before can be read: {file}"
-        return RecordingEndedError(self.folder, text)
+        return RecordingEndedError(self.folder, f"the disk {what} after {kept}", self.folder / self._file_name)
 
     def _finish(self) -> None:
         information = bag_information(self._file_name, self._writer.state, self._connections, self._notes)
@@ -225,49 +252,3 @@ class _DiskReserve:
     def release(self) -> None:
         """Free the reserved space."""
         self._path.unlink(missing_ok=True)
-
-
-def write_repaired_bag(
-    bag: Bag,
-    folder: Path,
-    name: str,
-    refused: Counter[str],
-    progress: Callable[[float], None] = lambda fraction: None,
-) -> int:
-    """Write every intact message of a bag into a new one, with its notes and definitions.
-
-    Types keep the definitions of the bag; ours is written where it has none and we know the type. Compressed messages
-    are decompressed, and topics have their remapped names.
-
-    Args:
-        bag: the bag to repair.
-        folder: of the new one; must be empty.
-        name: of the new one.
-        refused: counts the messages that cannot be decompressed, by reason.
-        progress: called with the completed fraction, 0 to 1.
-
-    Returns:
-        The number of messages.
-
-    Raises:
-        BagError: the new bag cannot be written.
-    """
-    numbers: dict[Connection, int] = {}
-    count = 0
-    with BagWriter(folder, bag.notes, name=name) as writer:
-        for connection in bag.connections():
-            if connection not in numbers:
-                numbers[connection] = writer.add_connection(_defined(bag, connection))
-        for connection, record in bag.every_record(refused):
-            writer.write_to(numbers[connection], record.time, record.data)
-            count += 1
-            progress((record.time - bag.start) / max(bag.end - bag.start, 1))
-    return count
-
-
-def _defined(bag: Bag, connection: Connection) -> Connection:
-    """Return a connection as it is written to the new bag."""
-    definition = connection.definition
-    if not definition.text:
-        definition = own_definition(definition.type_name)
-    return replace(connection, topic=bag.name_of(connection), definition=definition)

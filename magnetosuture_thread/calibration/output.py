@@ -58,6 +58,8 @@ def _header(calibration: CalibrationResult) -> list[str]:
         words.append(
             f"From {score.name} ({source}), {score.frames} frames: prediction error {figures} % of the length."
         )
+        if score.unverified:
+            words.append(f"  UNVERIFIED: {score.unverified}.")
         if not math.isnan(score.truth_after):
             held = "" if math.isnan(score.truth_held_out) else f", by the other bags {score.truth_held_out:.3g}"
             words.append(

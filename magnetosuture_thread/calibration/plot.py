@@ -16,6 +16,7 @@ from magnetosuture_thread.calibration.residuals import across_residuals
 from magnetosuture_thread.calibration.result import FIXED, BagFit, CalibrationResult, Estimate
 from magnetosuture_thread.evaluation.plots import FAINT, INK, INSTANTS, PREDICTED, WIDE, draw_instants, tidy
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.texts import printable
 
 BEFORE = "#b4bcc4"
 MIN_SHOWN = 1e-3  # % of length
@@ -78,11 +79,11 @@ def _draw_scene(axes: Axes, calibration: CalibrationResult, fit: BagFit) -> None
             label = f"{run.times[k]:.0f} s"
         instants.append((label, (np.vstack([tail, run.targets[k]]), fit.before[k], fit.after[k])))
     draw_instants(axes, run.tails, run.scene.obstacles if run.scene is not None else (), styles, instants)
-    name = Path(run.name).name
+    name = printable(Path(run.name).name)
     if len(calibration.scores) > 1:
         score = next(score for score in calibration.scores if score.name == run.name)
         name += f", the bag with the maximum error: {score.after:.2f} %"
-    axes.set_title(name, fontsize=10, color=INK, loc="left")
+    axes.set_title(name, fontsize=10, color=INK, loc="left", parse_math=False)
 
 
 def _draw_time(axes: Axes, calibration: CalibrationResult, fits: Sequence[BagFit]) -> None:
@@ -94,7 +95,7 @@ def _draw_time(axes: Axes, calibration: CalibrationResult, fits: Sequence[BagFit
         if index:
             axes.axvline(begin, color=FAINT, linewidth=0.8, linestyle=(0, (2, 2)))
         if len(fits) > 1:
-            axes.text(begin, 1.0, f" {Path(fit.run.name).name}", **style)
+            axes.text(begin, 1.0, f" {printable(Path(fit.run.name).name)}", parse_math=False, **style)
         for vertices, colour, label in ((fit.before, BEFORE, "before"), (fit.after, PREDICTED, "after")):
             error = np.maximum(fit.error(vertices, length), MIN_SHOWN)
             axes.plot(begin + fit.run.times, error, color=colour, linewidth=1.3, label=None if index else label)

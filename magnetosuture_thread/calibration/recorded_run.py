@@ -48,6 +48,7 @@ class RecordedRun:
         against: what the targets are, `seen` or `truth`.
         simulated: what of it is simulated; empty if nothing says so.
         scene: that the thread moves in; None if it is not known.
+        unverified: why any message of the bag may be wrong; empty if nothing speaks against them.
     """
 
     name: str
@@ -62,6 +63,7 @@ class RecordedRun:
     against: str = "seen"
     simulated: str = ""
     scene: Scene | None = None
+    unverified: str = ""
 
     @property
     def known(self) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,7 @@ class BagErrors:
         truth_held_out: calibrated by the other bags.
         across_before: mean distance across the thread, with what the setup says.
         across_after: calibrated; this is what was made least.
+        unverified: why any message of the bag may be wrong; empty if nothing speaks against them.
     """
 
     name: str
@@ -100,6 +101,7 @@ class BagErrors:
     truth_held_out: float = math.nan
     across_before: float = math.nan
     across_after: float = math.nan
+    unverified: str = field(default="", kw_only=True)
 
     @property
     def warning(self) -> str:
@@ -190,6 +192,7 @@ class CalibrationResult:
                 lines.append(f"{estimate.name} cannot be identified in this data: {estimate.reason}")
         if self.attachment is not None and self.attachment.reason:
             lines.append(f"the attachment cannot be told: {self.attachment.reason}")
+        lines += [f"{score.name} is unverified: {score.unverified}" for score in self.scores if score.unverified]
         return lines + [score.warning for score in self.scores if score.warning]
 
     @property
@@ -237,5 +240,5 @@ def bag_errors(
             for vertices in (fit.before, fit.after, held)
         ]
         off = [mean_across(vertices, run, length) for vertices in (fit.before, fit.after)]
-        scores.append(BagErrors(run.name, len(run.frames), *errors, *off))
+        scores.append(BagErrors(run.name, len(run.frames), *errors, *off, unverified=run.unverified))
     return tuple(scores)

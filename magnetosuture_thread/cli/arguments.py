@@ -10,10 +10,12 @@ from typing import Any, TypeAlias
 
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.remap import parse_remap
+from magnetosuture_thread.outputs import input_problem, output_problem
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 DONE, FAILED, WRONG_USE = 0, 1, 2
+STANDARD_OUTPUT = Path("-")  # as the file of --json, of benchmarks
 EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
 
 
@@ -82,6 +84,37 @@ def output_file(text: str) -> Path:
     if not path.parent.is_dir() or path.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r} is no file in a folder that exists")
     return path
+
+
+OUTPUTS = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written
+
+
+def check_outputs(options: argparse.Namespace) -> None:
+    """Refuse outputs that are or damage an input, twice the same one, or something else than a new or regular file.
+
+    Raises:
+        ConfigurationError: with the option.
+    """
+    given = vars(options)
+    inputs = []
+    for name, value in given.items():
+        if name not in OUTPUTS:
+            listed = value if isinstance(value, list) else [value]
+            inputs += [Path(each) for each in listed if isinstance(each, Path) or (isinstance(each, str) and each)]
+    taken = list[Path]()
+    for name in OUTPUTS:
+        path = given.get(name)
+        if not isinstance(path, Path) or path == STANDARD_OUTPUT:
+            continue
+        problem = input_problem(path, inputs)
+        if not path.is_dir():
+            problem = problem or output_problem(path)
+        if not problem and path.absolute() in taken:
+            problem = "is named by another option too; expected a file of its own"
+        if problem:
+            what, _, expectation = problem.partition("; expected ")
+            raise ConfigurationError(f"--{name}", str(path), f"{expectation}, as it {what}")
+        taken.append(path.absolute())
 
 
 def remap(text: str) -> tuple[str, str]:

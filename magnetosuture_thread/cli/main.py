@@ -8,11 +8,10 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from rich.console import Console
-
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.cli.arguments import EXIT_CODES, FAILED, WRONG_USE
+from magnetosuture_thread.cli.arguments import EXIT_CODES, FAILED, WRONG_USE, check_outputs
 from magnetosuture_thread.cli.commands import bag, calibrate, evaluate, run_graph, scene
+from magnetosuture_thread.cli.terminal import make_console
 
 MOVED = {  # commands of before, and what is written instead
     "record": "`magnetosuture render`",
@@ -49,7 +48,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given and given[0] in MOVED:
         return _fail(f"the command {given[0]!r} is now {MOVED[given[0]]}", WRONG_USE)
     options = make_parser().parse_args(given)
-    return exit_code(lambda: int(options.run(options)))
+
+    def run() -> int:
+        check_outputs(options)
+        return int(options.run(options))
+
+    return exit_code(run)
 
 
 def exit_code(run: Callable[[], int]) -> int:
@@ -69,7 +73,7 @@ def exit_code(run: Callable[[], int]) -> int:
 
 
 def _fail(problem: str, code: int) -> int:
-    errors = Console(stderr=True, soft_wrap=True, highlight=False)
+    errors = make_console(errors=True)
     errors.print("error:", style="bold red", end=" ")
     errors.print(" ".join(problem.split()), markup=False)
     return code

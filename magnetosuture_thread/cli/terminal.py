@@ -8,23 +8,35 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
+
+from magnetosuture_thread.texts import printable
 
 
-def make_console() -> Console:
-    """Return the console of a command: standard output, numbers and paths in no colours of their own."""
-    return Console(highlight=False)
+class _PlainConsole(Console):
+    """A console on which no name of a file, topic or frame moves the cursor, changes colours or turns text around."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Render; control characters in texts become escape sequences, those of the console itself stay."""
+        for segment in super().render(renderable, options):
+            text, style, control = segment
+            yield segment if control or text.isprintable() else Segment(printable(text), style)
+
+
+def make_console(*, errors: bool = False) -> Console:
+    """Return the console of a command: numbers and paths in no colours of their own, control characters escaped.
+
+    Args:
+        errors: whether it writes to standard error, in place of standard output.
+    """
+    return _PlainConsole(highlight=False, emoji=False, stderr=errors, soft_wrap=errors)
 
 
 def make_log(console: Console) -> Callable[[str], None]:
-    """Return what prints a line as it is, however long; what cannot be printed, as an escape sequence."""
-    return lambda text: console.print(printable(text), soft_wrap=True, markup=False)
-
-
-def printable(text: str) -> str:
-    """Return a text without control characters and what no encoding has, which names in a bag may hold."""
-    return "".join(sign if sign.isprintable() or sign == "\n" else ascii(sign)[1:-1] for sign in text)
+    """Return what prints a line as it is, however long."""
+    return lambda text: console.print(text, soft_wrap=True, markup=False)
 
 
 @contextmanager
@@ -39,4 +51,7 @@ def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
 def write_json(path: Path | None, figures: Any) -> None:
     """Write figures to the file given by --json, if any."""
     if path:
-        path.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")
+        from magnetosuture_thread.jobs.output import whole_file
+
+        with whole_file(path) as partial:
+            partial.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

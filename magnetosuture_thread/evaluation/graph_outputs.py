@@ -191,6 +191,7 @@ class ReplaySummary:
         refused: frames and poses that could not be used, by why.
         dropped: messages that got lost on a way, by which; empty offline, where there are none.
         damage: what of the bag could not be read, empty if nothing.
+        unverified: why any message of the bag may be wrong, empty if nothing speaks against them.
         remark: what else to know of the bag, empty if nothing.
     """
 
@@ -217,6 +218,7 @@ class ReplaySummary:
     refused: dict[str, int] = field(default_factory=dict)
     dropped: dict[str, int] = field(default_factory=dict)
     damage: str = ""
+    unverified: str = ""
     remark: str = ""
 
     def to_json(self) -> dict[str, Any]:

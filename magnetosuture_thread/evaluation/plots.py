@@ -23,6 +23,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.margins import SOLID
+from magnetosuture_thread.texts import printable
 
 INK, FAINT = "#22303c", "#7b8794"
 SEEN, TRUTH, PREDICTED = "#0f6fc6", "#8a6d00", "#d1495b"
@@ -75,7 +76,8 @@ def draw_summary(
         tidy(axes)
     plots[2].set_xlim(series.times[0], series.times[-1])
     plots[2].set_xlabel("time since the bag's start [s]", color=INK)
-    figure.text(0.015, 0.938, _title(summary), fontsize=12, color=INK, linespacing=1.4)
+    title = printable(_title(summary))  # with names from outside, and no mathematics in them
+    figure.text(0.015, 0.938, title, fontsize=12, color=INK, linespacing=1.4, parse_math=False)
     figure.savefig(path)
 
 
@@ -249,7 +251,8 @@ def draw_case(path: Path, case: CaseResult, formulation: str) -> None:
         1, 2, gridspec_kw={"width_ratios": [1.25, 1.0], "left": 0.06, "right": 0.985, "top": 0.83, "bottom": 0.1}
     )
     reference, score, worst = case.reference, case.score, int(case.error_percent.argmax())
-    figure.text(0.02, 0.945, f"{reference.name}, formulation {formulation}", fontsize=13, color=INK, weight="bold")
+    title = printable(f"{reference.name}, formulation {formulation}")
+    figure.text(0.02, 0.945, title, fontsize=13, color=INK, weight="bold", parse_math=False)
     words = (
         f"mean error {score.mean_error_percent:.3f} % of the length, maximum {score.max_error_percent:.3f} %; "
         f"n = {case.vertices.shape[1] - 1}; the reference is simulated, by another method"

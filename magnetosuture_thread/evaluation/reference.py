@@ -6,6 +6,7 @@ import json
 import zipfile
 import zlib
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 
 # What numpy and json raise on files that are something else.
-NOT_ONE = (OSError, ValueError, TypeError, AttributeError, LookupError, EOFError, zipfile.BadZipFile, zlib.error)
+NOT_ONE = (
+    *(OSError, ValueError, TypeError, AttributeError, LookupError, EOFError, MemoryError, RecursionError),
+    *(zipfile.BadZipFile, zlib.error),
+)
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,12 @@ class ReferenceTrajectory:
 
 
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], dict[str, Any]]:
-    with np.load(path, allow_pickle=False) as data:
+    packed = BytesIO(read_regular(path, MAX_FILE_BYTES))
+    with zipfile.ZipFile(packed) as archive:
+        if (size := sum(entry.file_size for entry in archive.infolist())) > MAX_FILE_BYTES:
+            raise ValueError(f"it unpacks to {size} bytes, more than {MAX_FILE_BYTES}")
+    packed.seek(0)
+    with np.load(packed, allow_pickle=False) as data:
         times, poses, threads = (np.asarray(data[key], dtype=np.float64) for key in ("t", "pose", "X"))
         return times, poses, threads, json.loads(str(data["meta"]))
 

@@ -26,11 +26,12 @@ from magnetosuture_thread.evaluation.report.figures import (
     micrometres,
     milliseconds,
 )
+from magnetosuture_thread.texts import printable
 
 Row: TypeAlias = "dict[str, str | int | float | None]"
 
 ERRORS = {"mean": "mean", "median": "median", "p99": "p99", "maximum": "max"}
-SIMULATED = "*"  # mark of a bag
+SIMULATED, UNVERIFIED, SILENT = "*", "?", "!"  # marks of a bag
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes the beginning of a formula for
 
 
@@ -47,6 +48,9 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
         "frames": figures.frames,
         "tracked": figures.tracked,
         "predicted": figures.predicted,
+        "silent_s": figures.silence.total,
+        "max_silence_s": figures.silence.max_gap,
+        "silences": figures.silence.gaps,
     }
     for prefix, errors in (("error", figures.error), ("recorded_error", figures.recorded_error)):
         for target in AGAINST:
@@ -66,14 +70,15 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
     row |= _percentiles("step", figures.step_time) | _percentiles("tracker", figures.processing)
     for stage in STAGES:
         row |= _percentiles(f"latency_{stage.replace(' ', '_')}", figures.live.latency.get(stage))
-    row |= {"damage": "; ".join(about.damage), "refused": sum(about.refused.values()), "problem": ""}
+    row |= {"damage": "; ".join(about.damage), "unverified": about.unverified}
+    row |= {"refused": sum(about.refused.values()), "problem": ""}
     return {column: finite_or_none(value) for column, value in row.items()}
 
 
 def failed_row(name: str, path: str, problem: str) -> Row:
     """Return the row of a bag that could not be evaluated."""
     row: Row = dict.fromkeys(COLUMNS)
-    words = ("setup", "simulated", "source", "formulation", "damage")
+    words = ("setup", "simulated", "source", "formulation", "damage", "unverified")
     return row | dict.fromkeys(words, "") | {"bag": name, "path": path, "problem": problem}
 
 
@@ -100,7 +105,9 @@ def table_csv(rows: Sequence[Row]) -> str:
 
 
 def _cell(value: str | int | float | None) -> str | int | float | None:
-    return f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
+    if not isinstance(value, str):
+        return value
+    return f"'{printable(value)}" if value.startswith(FORMULA) else printable(value)
 
 
 def table_json(rows: Sequence[Row]) -> str:
@@ -137,6 +144,12 @@ def bags_table(rows: Sequence[Row]) -> Table:
     )
     if any(row["simulated"] for row in rows):
         table.caption += f";\n{SIMULATED} simulated, as the bag itself says"
+    if any(row["unverified"] for row in rows):
+        table.caption += f";\n{UNVERIFIED} unverified: damaged, and nothing vouches for its messages"
+    silent = [(silent_s, longest) for silent_s, longest in map(_silence, rows) if silent_s]
+    if silent:
+        total, longest = sum(each for each, _ in silent), max(longest for _, longest in silent)
+        table.caption += f";\n{SILENT} without frames for {total:.1f} s in all, {longest:.1f} s at the longest"
     table.add_column("bag", overflow="fold", min_width=12)
     for name in ("frames", "ground\ntruth", "max", "measured", "max", "margin", "step"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -144,9 +157,11 @@ def bags_table(rows: Sequence[Row]) -> Table:
         if row["problem"]:
             table.add_row(Text(str(row["bag"])), Text("failed", style="bold red"))
             continue
+        marks_of = ((SIMULATED, "simulated"), (UNVERIFIED, "unverified"), (SILENT, "silences"))
+        marks = [mark for mark, why in marks_of if row[why]]
         errors = [row[f"error_{target}_{which}_percent"] for target in AGAINST for which in ("mean", "max")]
         table.add_row(
-            Text(f"{row['bag']} {SIMULATED}" if row["simulated"] else str(row["bag"])),
+            Text(" ".join([str(row["bag"]), *marks])),
             f"{row['predicted']}/{row['frames']}",
             *(_shown(error, format_number) for error in errors),
             _shown(row["least_obstacle_m"], micrometres),
@@ -158,6 +173,10 @@ def bags_table(rows: Sequence[Row]) -> Table:
         means = [_shown(summed[name][f"error_{target}_mean_percent"], format_number) for target in AGAINST]
         table.add_row(name, "", means[0], "", means[1])
     return table
+
+
+def _silence(row: Row) -> tuple[float, float]:
+    return float(row["silent_s"] or 0.0), float(row["max_silence_s"] or 0.0)
 
 
 def _shown(value: Any, how: Callable[[float], str]) -> str:
@@ -185,6 +204,8 @@ def summary_table(summary: ReplaySummary) -> Table:
                 table.add_row("  dropped", str(count), way)
     if summary.damage:
         table.add_row("the bag is damaged", "", summary.damage)
+    if summary.unverified:
+        table.add_row("the bag is unverified", "", summary.unverified)
     if summary.remark:
         table.add_row("setup in doubt", "", summary.remark)
     table.add_section()

@@ -99,7 +99,8 @@ def calibrate_bags(
             measured = read_observations(given.recording, given.setup, source=given.source, progress=advance)
             simulated = given.recording.notes.get("simulated", "")
             try:
-                passages.append(read_run(str(path), measured, its, against, simulated, given.setup.scene))
+                passage = read_run(str(path), measured, its, against, simulated, given.setup.scene)
+                passages.append(replace(passage, unverified=given.recording.unverified))
             except BagError:
                 if problem := measured.thread_problem():
                     raise BagError(path, problem) from None

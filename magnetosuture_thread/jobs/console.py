@@ -168,7 +168,7 @@ class ReplayHost(RecordingHost):
         self._nodes = NodeProcesses(self._source.processes, arguments, self._environment, self._logs).__enter__()
         self._thread.start()
 
-    async def set_recording(self, recording: bool) -> str:
+    async def set_recording(self, recording: bool, operator: str) -> str:
         """Refuse: another command records a replay."""
         return "what comes of a bag is recorded by `magnetosuture replay BAG --output DIR`"
 

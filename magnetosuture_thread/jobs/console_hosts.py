@@ -164,19 +164,22 @@ class RecordingHost(GraphHost):
             "busy": self.busy,
         }
 
-    @property
-    def notes(self) -> dict[str, str]:
-        """Return the notes of a recording."""
+    def notes(self, operator: str) -> dict[str, str]:
+        """Return the notes of a recording, begun by the page that has control.
+
+        Args:
+            operator: who commands that page.
+        """
         text = self.setup.path.read_text(encoding="utf-8")
         notes = {"setup": self.setup.name, SETUP_NOTE: text}
         if self.graph.is_active(RIG):
-            notes["simulated"] = f"the whole rig, jogged by an operator, setup {self.setup.name}"
+            notes["simulated"] = f"the whole rig, jogged by {operator}, setup {self.setup.name}"
         return notes
 
     def start(self) -> None:
         """Start what this runs; here nothing."""
 
-    async def set_recording(self, recording: bool) -> str:
+    async def set_recording(self, recording: bool, operator: str) -> str:
         """Start or end a recording; return an empty text, or the reason of a refusal."""
         if recording == (self._recording is not None):
             return ""
@@ -187,7 +190,7 @@ class RecordingHost(GraphHost):
         raw = self.graph.settings.image_transport == "raw"
         recorded = [topic for topic in RECORDED_TOPICS if topic is not topics.IMAGE or raw]
         output = new_name(self._recordings, self.setup.name)
-        bag = self._recording = BagRecording(output, self.notes, self.graph, recorded)
+        bag = self._recording = BagRecording(output, self.notes(operator), self.graph, recorded)
         try:
             await bag.begin()
         except MagnetosutureError as error:

@@ -12,11 +12,12 @@ from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.bag_folder import STORAGE_SUFFIXES, find_bag_files
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
-from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag, printable_path
+from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress
 from magnetosuture_thread.jobs.track import numbered
 from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.texts import one_line
 from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
 
 if TYPE_CHECKING:
@@ -116,12 +117,12 @@ def evaluate_one(task: Task, log: Log, progress: Progress) -> Row:
 
 
 def _failed(task: Task, problem: str) -> Row:
-    return failed_row(task.name, printable_path(str(task.path)), printable_path(" ".join(problem.split())))
+    return failed_row(task.name, one_line(str(task.path)), one_line(" ".join(problem.split())))
 
 
 def _name(bag: Path) -> str:
     path = Path(os.path.abspath(bag))
-    name = printable_path(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
+    name = one_line(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
     return name.encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
 
 

@@ -33,6 +33,7 @@ from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.observations import NOT_FOUND, ObservationReader, pixels
 from magnetosuture_thread.offline.predictions import predictions
+from magnetosuture_thread.texts import one_line
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 SOFTWARE = ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless")
@@ -78,7 +79,8 @@ def evaluate_bag(
         metrics = RunMetrics(model.thread_length, given.recording.start, targets, recorded=recorded)
         seen = _MeteredReader(given, metrics, lambda share: progress(0.95 * share))
         refused = _predict(given, model, metrics, seen)
-        figures = BagFigures.of(metrics, live_figures(given.recording, given.start, given.duration))
+        live = live_figures(given.recording, given.start, given.duration)
+        figures = BagFigures.of(metrics, live, (given.start, given.start + given.duration))
         about = _about(given, name, model, refused, seen.thread_problem())
         if not figures.predicted:
             counts = Counter(metrics.reasons) + refused
@@ -194,7 +196,7 @@ def _about(given: BagInput, name: str, model: ThreadModelSettings, refused: Coun
     recording, setup = given.recording, given.setup
     return BagDetails(
         name=name,
-        path=printable_path(str(recording.path)),
+        path=one_line(str(recording.path)),
         setup=setup.name,
         simulated=recording.notes.get("simulated", ""),
         source=given.source,
@@ -206,6 +208,7 @@ def _about(given: BagInput, name: str, model: ThreadModelSettings, refused: Coun
         begin=given.start,
         duration=given.duration,
         damage=tuple(str(place) for place in recording.damage.regions) if recording.damage else (),
+        unverified=recording.unverified,
         refused=dict(refused.most_common()),
         topics={
             channel.recorded: (channel.type_name, recording.counts[channel.recorded])
@@ -231,12 +234,6 @@ def _versions() -> Iterator[tuple[str, str]]:
             yield name, version(name)
         except PackageNotFoundError:  # as where Ubuntu's python3-opencv is in its place
             continue
-
-
-def printable_path(text: str) -> str:
-    """Return a text of one line that can be written as UTF-8 and shown, whatever bytes a file's name is made of."""
-    decoded = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
-    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in decoded)
 
 
 def live_figures(recording: Recording, start: float, duration: float | None) -> LiveFigures:

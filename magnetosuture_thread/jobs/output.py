@@ -11,6 +11,7 @@ from pathlib import Path
 
 from magnetosuture_thread.bags.writer import RecordingEndedError
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.outputs import output_problem
 
 
 @contextmanager
@@ -44,11 +45,13 @@ def whole_folder(output: Path, *, is_recording: bool = False) -> Iterator[Path]:
         partial.rename(output)
         made = []
     except RecordingEndedError as error:
-        if partial is None or not is_recording:
+        if partial is None:
             raise
+        if not is_recording:  # nothing of it stays: no file is named
+            raise BagError(output, f"cannot be written: {error.cause}") from None
         partial.rename(output)
         made = []
-        raise RecordingEndedError(output, error.problem.replace(str(partial), str(output))) from None
+        raise RecordingEndedError(output, error.cause, output / error.file.relative_to(partial)) from None
     except OSError as error:
         raise BagError(output, f"cannot be written: {error.strerror or error}") from None
     finally:
@@ -64,16 +67,18 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Yield a file to write; it is renamed to its final name only when the block ends without an error.
 
     Args:
-        path: the file to make; one that is there is replaced then.
+        path: the file to make; a regular one that is there is replaced then.
 
     Yields:
         A hidden file beside it.
 
     Raises:
-        BagError: it cannot be written.
+        BagError: it cannot be written, or is something else than a regular file.
     """
     partial: Path | None = None
     try:
+        if problem := output_problem(path):
+            raise BagError(path, problem)
         handle, made = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.absolute().parent)
         os.close(handle)
         partial = Path(made)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.reader import UNVERIFIED_NOTE, Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
@@ -87,7 +87,8 @@ class BagInput:
     @property
     def notes(self) -> dict[str, str]:
         """Return the notes of a bag made from this one."""
-        return {**self.recording.notes, "setup": self.setup.name, "replayed": str(self.recording.path)}
+        own = {UNVERIFIED_NOTE: self.recording.unverified} if self.recording.unverified else {}
+        return {**self.recording.notes, **own, "setup": self.setup.name, "replayed": str(self.recording.path)}
 
     def check_loop(self) -> None:
         """Raise `BagError` if the bag is too short to be played in a loop."""
@@ -114,8 +115,12 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     recording = Recording(Bag(path, remap=selection.get("remap")), dish_frame=selection.get("frame", DISH_FRAME))
     if recording.damage is not None:
         log(f"the bag is damaged, what is intact is played: {recording.damage}")
-    elif recording.unchecked:
+    if recording.unverified:
+        log(f"unverified: {recording.unverified}")
+    elif recording.unchecked and recording.damage is None:
         log(recording.unchecked)
+    for remark in recording.remarks:
+        log(remark)
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
     source = chosen_source(recording, selection.get("source", "auto"))
@@ -218,6 +223,7 @@ def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> Repla
         error_truth=errors["truth"],
         source=given.source,
         damage=str(given.recording.damage or ""),
+        unverified=given.recording.unverified,
         **others,
     )
 

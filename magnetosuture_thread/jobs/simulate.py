@@ -206,7 +206,8 @@ def _arm() -> None:
     while True:
         try:
             with CoilClient() as client:
-                return client.execute("arm")
+                client.execute("arm")
+                return
         except GraphError as error:
             if time.monotonic() > deadline:
                 raise GraphError(f"the bridge cannot be armed: {error}") from None

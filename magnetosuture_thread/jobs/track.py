@@ -21,7 +21,10 @@ from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.interface import CAMERA
+from magnetosuture_thread.untrusted import MAX_FILE_BYTES
+from magnetosuture_thread.vision.image_header import image_header
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
@@ -73,6 +76,7 @@ class FrameSource:
 
     def __init__(self, paths: Sequence[Path], *, remap: Mapping[str, str] | None = None) -> None:
         self._files: list[Path] = []
+        self._turned = 0  # frames that have an orientation
         self._recording: Recording | None = None
         self._channel = CAMERA["raw"]
         self.notes: dict[str, str] = {}
@@ -88,9 +92,12 @@ class FrameSource:
 
     @property
     def refused(self) -> list[str]:
-        """Return why frames of a bag could not be taken, a line each, once all have been gone through."""
+        """Return why frames of a bag could not be taken, and what else to know, once all have been gone through."""
         reasons = self._recording.refused if self._recording is not None else {}
-        return [f"{reason}: {pluralize(count, 'frame')} left out" for reason, count in reasons.items()]
+        lines = [f"{reason}: {pluralize(count, 'frame')} left out" for reason, count in reasons.items()]
+        if self._turned:
+            lines.append(f"{pluralize(self._turned, 'frame')} with an EXIF orientation, read as stored: it is ignored")
+        return lines
 
     def _add(self, path: Path, remap: Mapping[str, str] | None, alone: bool) -> None:
         try:
@@ -107,7 +114,8 @@ class FrameSource:
             bag = Bag(path, remap=remap)
             recording = self._recording = Recording(bag)
             self.notes = bag.notes
-            self.doubts = [doubt for doubt in (str(bag.damage or ""), bag.unchecked) if doubt]
+            doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
+            self.doubts = [line for line in (str(bag.damage or ""), doubt, *bag.remarks) if line]
             if recording.camera is None:
                 topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
                 raise BagError(path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
@@ -124,16 +132,23 @@ class FrameSource:
         """Go through the frames: files in the order given, a folder by name, a bag by time."""
         if self._recording is not None:
             self._recording.refused.clear()
+            self._turned = 0
             for record in self._recording.records([self._channel]):
                 yield self._recorded(record)
             return
         for name, file in zip(self.names, self._files, strict=True):
             try:
-                yield FrameFile(name, decode_image(file.read_bytes()))
+                data = read_regular(file, MAX_FILE_BYTES)
+                self._note_orientation(data)
+                yield FrameFile(name, decode_image(data))
             except OSError as error:
                 yield FrameFile(name, None, f"cannot be read: {error.strerror}")
             except InvalidInputError as error:
                 yield FrameFile(name, None, str(error))
+
+    def _note_orientation(self, data: bytes | memoryview) -> None:
+        header = image_header(data)
+        self._turned += header is not None and header.orientation != 1
 
     def rate(self) -> float:
         """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
@@ -153,6 +168,7 @@ class FrameSource:
             message = record.decode()
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             if record.type_name == CAMERA["compressed"].type_name:
+                self._note_orientation(message.data.data)
                 image = decode_image(message.data)
             else:
                 image = unpack_image(message.data, message.height, message.width, message.step, message.encoding)

@@ -258,7 +258,7 @@ class MessageBuilder:
             current, saturated, reasons = output.allocation.currents, output.allocation.saturated, output.reasons
             fields = {**self._velocities(output), "current": self.numbers("d", current), "saturated": saturated}
         else:
-            reasons, fields = (latch.latched_reason or "unconfigured",), {}
+            reasons, fields = system.closed_reasons, {}
         if driver.currents is not None:
             fields["measured_current"] = self.numbers("d", driver.currents)
         return self.make(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import DISH_FRAME, MARGINS, MEASURED_THREAD, NEEDLE_POSE
+from magnetosuture_thread.interface import CLOCK, DISH_FRAME, MARGINS, MEASURED_THREAD, NEEDLE_POSE
 from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
 from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
@@ -26,6 +26,7 @@ _MAX_NAME = 256  # bytes of the names of frames that are passed over in a path
 _POSE_AT, _COUNT_AT = aligned(DISH_END, 8), aligned(DISH_END, 4)
 _PATH_AT = _COUNT_AT + _COUNT.size
 _NAME_AT = _PATH_AT + 8  # the length of the frame's name in a path's first pose
+_STAMP = f"{NEEDLE_POSE.name}.header.stamp"
 _ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
 
 
@@ -37,8 +38,15 @@ def nanoseconds(stamp: Any) -> int:
 def checked_nanoseconds(stamp: Any, field: str) -> int:
     """Return a time message in nanoseconds, or refuse one with a second's or more beside its seconds."""
     if stamp.nanosec >= 1_000_000_000:
-        raise InvalidInputError(f"{field}.header.stamp.nanosec", stamp.nanosec, "less than a second's")
+        raise InvalidInputError(f"{field}.nanosec", stamp.nanosec, "less than a second's")
     return nanoseconds(stamp)
+
+
+def clock_nanoseconds(message: Any) -> int:
+    """Return the time of a Clock in nanoseconds, or refuse one that rclpy cannot represent."""
+    if message.clock.sec < 0:
+        raise InvalidInputError(f"/{CLOCK.name}.clock.sec", message.clock.sec, "a time since 1970")
+    return checked_nanoseconds(message.clock, f"/{CLOCK.name}.clock")
 
 
 def seconds(stamp: Any) -> float:
@@ -60,7 +68,7 @@ def needle_pose(message: Any) -> NeedlePose:
     """
     require_dish_frame(message.header.frame_id, NEEDLE_POSE.name)
     stamp = message.header.stamp
-    checked_nanoseconds(stamp, NEEDLE_POSE.name)  # the prediction could not be stamped by another
+    checked_nanoseconds(stamp, _STAMP)  # the prediction could not be stamped by another
     position, q = message.pose.pose.position, message.pose.pose.orientation
     heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
@@ -72,7 +80,7 @@ def tracked_pose(stamp: Any, tail: NDArray[np.float64], heading: NDArray[np.floa
     Raises:
         InvalidInputError: no stamp.
     """
-    checked_nanoseconds(stamp, NEEDLE_POSE.name)
+    checked_nanoseconds(stamp, _STAMP)
     along = round_trip_heading(heading, _ORIENTATION)
     return NeedlePose(seconds(stamp), np.array([float(tail[0]), float(tail[1])]), along)
 

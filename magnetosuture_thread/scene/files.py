@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import stat
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,17 @@ import yaml
 
 from magnetosuture_thread.configuration import use_ros_numbers
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.outputs import output_problem
 from magnetosuture_thread.resources import find_scene_file
 from magnetosuture_thread.scene.geojson import scene_from_geojson, scene_to_geojson
 from magnetosuture_thread.scene.mapping import scene_from_mapping, scene_to_mapping
 from magnetosuture_thread.scene.scene import Scene, scene_error
+from magnetosuture_thread.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml
 
 GEOJSON_ENDINGS = (".json", ".geojson")
-MAX_FILE_BYTES = 1_000_000
-MAX_DEPTH = 20
 MAX_SCALAR_CHARS = 1000
+_PLAIN_YAML = f"plain YAML, at most {MAX_YAML_DEPTH} deep"
 
 
 class _SceneLoader(yaml.CSafeLoader):  # the loader without libyaml takes ten times as long
@@ -50,35 +51,19 @@ use_ros_numbers(_SceneLoader, decimal_integers=True)
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a regular file of at most `MAX_FILE_BYTES`.
+    """Return the text of a regular file of at most `MAX_TEXT_BYTES`.
 
     Raises:
         ConfigurationError: it cannot be read, is a device or a pipe, is too large, or is no text.
     """
-    expectation = f"a regular file of at most {MAX_FILE_BYTES // 1000} kB of text"
+    expectation = f"a regular file of at most {MAX_TEXT_BYTES // 1000} kB of text"
     try:
-        # Opening a pipe without a writer would block forever.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except (OSError, ValueError) as error:
-        raise scene_error(
-            "scene file", getattr(error, "strerror", None) or str(error), expectation, str(path)
-        ) from None
-    try:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise scene_error("scene file", "a folder, pipe or device", expectation, str(path))
-        data = b""
-        while len(data) <= MAX_FILE_BYTES and (part := os.read(descriptor, MAX_FILE_BYTES + 1 - len(data))):
-            data += part
-    except OSError as error:
-        raise scene_error("scene file", error.strerror or str(error), expectation, str(path)) from None
-    finally:
-        os.close(descriptor)
-    if len(data) > MAX_FILE_BYTES:
-        raise scene_error("scene file", "a larger file", expectation, str(path))
-    try:
-        return data.decode("utf-8-sig")
+        return read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise scene_error("scene file", "bytes that are no UTF-8 text", expectation, str(path)) from None
+    except (OSError, ValueError) as error:
+        problem = getattr(error, "strerror", None) or str(error)
+        raise scene_error("scene file", problem, expectation, str(path)) from None
 
 
 def parse_yaml(text: str, source: str = "", what: str = "scene file") -> Any:
@@ -88,24 +73,19 @@ def parse_yaml(text: str, source: str = "", what: str = "scene file") -> Any:
         ConfigurationError: it is no YAML, or uses aliases or tags, or is too deep.
     """
     try:
-        depth = 0
+        check_yaml(text)
         for event in yaml.parse(text, Loader=yaml.CSafeLoader):
             problem = ""
-            if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
-                depth += 1
-                problem = f"lists and mappings {depth} deep" if depth > MAX_DEPTH else ""
-            elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
-                depth -= 1
-            elif isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_SCALAR_CHARS:
+            if isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_SCALAR_CHARS:
                 problem = f"a word of {len(event.value)} characters"
-            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-                problem = "an anchor or alias (& or *)"
             elif isinstance(event, yaml.NodeEvent) and getattr(event, "tag", None) not in (None, "!"):
                 problem = "a tag (!)"
             if problem:
                 where = f" in line {event.start_mark.line + 1}" if event.start_mark else ""
-                raise scene_error(what, problem + where, f"plain YAML, at most {MAX_DEPTH} deep", source)
+                raise scene_error(what, problem + where, _PLAIN_YAML, source)
         return yaml.load(text, _SceneLoader)
+    except BudgetError as error:
+        raise scene_error(what, str(error), _PLAIN_YAML, source) from None
     except yaml.YAMLError as error:
         problem = " ".join(str(getattr(error, "problem", None) or error).split())
         mark = getattr(error, "problem_mark", None)
@@ -142,7 +122,7 @@ def parse_json(text: str, source: str = "", what: str = "scene file") -> Any:
     except json.JSONDecodeError as error:
         raise scene_error(what, f"{error.msg} in line {error.lineno}", "valid JSON", source) from None
     except RecursionError:
-        raise scene_error(what, "lists too deep", f"JSON at most {MAX_DEPTH} deep", source) from None
+        raise scene_error(what, "lists too deep", f"JSON at most {MAX_YAML_DEPTH} deep", source) from None
     return found
 
 
@@ -182,6 +162,8 @@ def write_scene(scene: Scene, path: Path) -> None:
     else:
         content = scene_to_mapping(scene)
         text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
+    if problem := output_problem(path):
+        raise scene_error("scene file", problem, "a file that can be written", str(path))
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         partial.write_text(text, encoding="utf-8")

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.untrusted import MAX_PIXELS
+from magnetosuture_thread.vision.image_header import image_header
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
@@ -62,18 +64,25 @@ def glare_mask(picture: Picture) -> np.ndarray:
 
 
 def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
-    """Decode a JPEG or PNG image to BGR.
+    """Decode a JPEG, PNG, BMP, TIFF or WebP image to BGR, its pixels as they are stored.
+
+    An orientation in its EXIF data is ignored, as in frames of a camera: pixels stay where the sensor has them. See
+    `image_header` to know of it.
 
     Raises:
-        InvalidInputError: the bytes are no image that can be decoded.
+        InvalidInputError: the bytes are no image that can be decoded, or of more than `MAX_PIXELS`.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
+    header = image_header(buffer.data)
+    if header is not None and header.width * header.height > MAX_PIXELS:
+        size = f"{header.width} x {header.height} pixels"
+        raise InvalidInputError("image.data", size, f"at most {MAX_PIXELS} pixels")
     try:
-        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR) if buffer.size else None
+        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if header else None
     except cv2.error:  # some headers promise more than can be made
         image = None
     if image is None:
-        raise InvalidInputError("image.data", f"{buffer.size} bytes", "a JPEG or PNG image")
+        raise InvalidInputError("image.data", f"{buffer.size} bytes", "a JPEG or PNG image, or BMP, TIFF, WebP")
     return image
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
+from magnetosuture_thread.outputs import output_problem
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.look import State, Track
 from magnetosuture_thread.vision.scene_mask import mask_outlines
@@ -84,8 +85,9 @@ class OverlayWriter:
         self._video: cv2.VideoWriter | None = None
         self._size = (0, 0)
         if path.suffix.lower() in VIDEOS:
-            if not path.parent.is_dir():
-                raise BagError(path, "is in no folder that exists")
+            problem = output_problem(path) or ("" if path.parent.is_dir() else "is in no folder that exists")
+            if problem:
+                raise BagError(path, problem)
             return
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -101,6 +103,8 @@ class OverlayWriter:
         """
         if self._path.suffix.lower() not in VIDEOS:
             file = self._path / f"{name}.png"
+            if problem := output_problem(file):
+                raise BagError(file, problem)
             if not cv2.imwrite(str(file), image):
                 raise BagError(file, "cannot be written")
             return

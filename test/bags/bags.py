@@ -110,3 +110,12 @@ def chunks_of(path: Path) -> Iterator[tuple[int, int, list[Message]]]:
                 if isinstance(record, mcap.records.Message)
             ]
             yield index.chunk_start_offset, index.chunk_start_offset + index.chunk_length, messages
+
+
+def copy_with_notes(bag: Path, folder: Path, **notes: str) -> None:
+    """Copy a bag to a folder, with further notes."""
+    old = Bag(bag)
+    with BagWriter(folder, {**old.notes, **notes}) as new:
+        numbers = {connection: new.add_connection(connection) for connection in old.connections()}
+        for item in old.stored():
+            new.write_to(numbers[item.connection], item.time, item.data)

@@ -45,9 +45,9 @@ LATCHED = Qos(
 )
 
 
-def repaired(path: Path, output: Path) -> Bag:
+def repaired(path: Path, output: Path, *options: str) -> Bag:
     """Return what `bag repair` makes of a bag."""
-    assert cli.main(["bag", "repair", str(path), "--output", str(output)]) == 0
+    assert cli.main(["bag", "repair", str(path), "--output", str(output), *options]) == 0
     return Bag(output)
 
 
@@ -72,7 +72,8 @@ def test_a_row_with_anything_in_it_is_lost_and_said(tmp_path: Path, change: str)
     assert bag.damage is not None
     assert bag.damage.messages == 1
     assert read(bag) == texts(50)[:2] + texts(50)[3:]
-    assert read(repaired(folder, tmp_path / "new")) == read(bag)
+    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 1
+    assert read(repaired(folder, tmp_path / "new", "--unverified")) == read(bag)
 
 
 @pytest.mark.parametrize("name", ["X'ff00'", "CAST(X'2fff' AS TEXT)", "7.5"])
@@ -260,3 +261,13 @@ def test_a_length_in_a_header_that_lies(tmp_path: Path):
         {"/h": "std_msgs/msg/Header"},
     )
     assert cli.main(["bag", "check", str(path)]) == 0
+
+
+def test_a_damaged_name_in_the_words_of_an_error_is_no_traceback(tmp_path: Path):
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(5), {"/text": STRING})
+    file = folder / "bag.db3"
+    data = file.read_bytes().replace(b"timestamp_idx", b"\xc1imestamp_idx").replace(b"CREATE INDEX", b"CREATE INDEZ")
+    assert data != file.read_bytes()
+    file.write_bytes(data)
+    with pytest.raises(BagError, match="cannot be read as a bag"):
+        Bag(folder)

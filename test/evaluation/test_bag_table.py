@@ -6,12 +6,13 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
 
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles
-from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, SensorSilence
+from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures, headlines
 from magnetosuture_thread.evaluation.tables import (
     COLUMNS,
     TIMES,
@@ -110,3 +111,19 @@ def test_the_terminal_s_table_marks_what_is_simulated():
     assert "* simulated" in text
     console.print(bags_table([row("real")]))
     assert "simulated" not in console.export_text()
+
+
+def test_the_silence_of_a_sensor_is_in_table_row_and_headline():
+    """4 of 6 minutes without frames read as 1383 of 1387 frames."""
+    figures = replace(FIGURES, frames=1387, predicted=1383, silence=SensorSilence(1, 240.0, 240.0, 60.0), span=360.0)
+    about = BagDetails("loop", "/data/loop", "petri", duration=360.0)
+    (found,) = read([row_of(about, figures)])
+    assert (found["silent_s"], found["max_silence_s"], found["silences"]) == ("240.0", "240.0", "1")
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(bags_table([row_of(about, figures), row("other")]))
+    text = console.export_text()
+    assert "loop !" in text
+    assert "! without frames for 240.0 s in all" in text
+    frames = next(each for each in headlines(about, figures) if each.name == "frames predicted")
+    assert "none at all for 240 s, the longest 240 s at 60.0 s" in frames.detail
+    assert frames.grade == "bad"

@@ -9,6 +9,7 @@ from magnetosuture_thread.evaluation import metrics as module
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import (
     RunMetrics,
+    SensorSilence,
     node_errors,
     prediction_error_percent,
     prediction_errors,
@@ -194,3 +195,24 @@ def test_a_curve_that_is_a_little_short_tells_of_the_free_end_too():
 
 def test_nothing_is_known_without_a_curve():
     assert np.isnan(errors_of(np.empty((0, 2)))).all()
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        (np.arange(0.0, 360.0, 0.1), SensorSilence()),
+        (
+            np.concatenate([np.arange(0.0, 60.0, 0.1), np.arange(300.0, 360.0, 0.1)]),
+            SensorSilence(1, 240.1, 240.1, 59.9),
+        ),
+        (np.arange(100.0, 200.0, 0.1), SensorSilence(2, 260.1, 160.1, 199.9)),
+        (np.delete(np.arange(0.0, 360.0, 0.1), [50, 51, 52, 90]), SensorSilence()),  # 0.4 s
+        (np.arange(0.0, 100.0, 0.1) + 1e9, SensorSilence()),  # of another clock
+        (np.array([3.0]), SensorSilence(1, 360.0, 360.0, 0.0)),
+    ],
+)
+def test_the_silence_of_a_sensor_is_counted(times: np.ndarray, expected: SensorSilence):
+    found = SensorSilence.of(times, 0.0, 360.0)
+    assert found.gaps == expected.gaps
+    assert (found.total, found.max_gap) == pytest.approx((expected.total, expected.max_gap), abs=0.2)
+    assert found.at == pytest.approx(expected.at, abs=0.2, nan_ok=True)

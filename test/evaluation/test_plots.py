@@ -31,13 +31,13 @@ def run(clearance: float) -> RunMetrics:
     return metrics
 
 
-def draw(path: Path, view, clearance: float, discs: tuple[Disc, ...] = ()) -> np.ndarray:
+def draw(path: Path, view, clearance: float, discs: tuple[Disc, ...] = (), name: str = "bag") -> np.ndarray:
     """Draw a picture and return its pixels, red, green, blue."""
     found = run(clearance)
     chosen = found.worst_measured
     assert chosen is not None
     assert chosen.stamp == 2 * 10**9
-    summary = ReplaySummary("bag", "petri", "all", 2, 2, 2, 0, 0, {}, None, [], 0, 1e-6, 1e-9, 1.0, None, None)
+    summary = ReplaySummary(name, "petri", "all", 2, 2, 2, 0, 0, {}, None, [], 0, 1e-6, 1e-9, 1.0, None, None)
     frame = np.full((480, 640, 3), 225, np.uint8)
     draw_summary(path, frame, view, chosen, 2.0, found.series, discs, summary)
     image = cv2.imread(str(path))
@@ -49,6 +49,11 @@ def share(image: np.ndarray, colour: tuple[float, ...]) -> float:
     """Return the share of the dish's pixels that are near a colour, in 0 to 1."""
     dish = image[90:600, 60:660].astype(float) / 255.0
     return float((np.abs(dish - np.asarray(colour[:3])).max(axis=2) < 0.06).mean())
+
+
+@pytest.mark.parametrize("name", ["a$\\x$b", "a\x1b[31mb"])
+def test_a_bag_of_any_name_is_drawn(tmp_path: Path, view, name: str):
+    assert draw(tmp_path / "a.png", view, 5e-3, name=name).size
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.5e-3, 5e-3])

@@ -212,3 +212,11 @@ def test_the_table_is_readable_at_80_columns(
     assert re.search(r"/camera/image_raw/compressed +5000 +10\.00 +0\.00 +499\.90 +0\.10 +0", shown), shown
     assert re.search(r"topic +messages +Hz +first +last +gap +back", shown)
     assert "/needle/measured_cp: geometry_msgs/PoseWithCovarianceStamped" in shown
+
+
+def test_a_full_disk_names_no_file_that_is_gone(tmp_path: Path):
+    output = tmp_path / "run"
+    command = [sys.executable, "-c", FULL, str(output), "result"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
+    assert said.startswith(f"{output}: cannot be written: the disk takes no larger file after")
+    assert "can be read" not in said

@@ -20,6 +20,7 @@ from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.jobs.calibrate import calibrate_bags, material_named, settings_of
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.setups import read_setup
+from test.bags.bags import copy_with_notes
 from test.calibration.runs import LENGTH, rig_run
 
 TRUE = 1.6e-9  # m^4/s; the material's is 1.3e-9
@@ -98,6 +99,16 @@ def test_bags_give_a_file_a_picture_and_figures_whatever_the_workers(folder: Pat
     assert {path.name for path in tmp_path.iterdir()} == {
         f"{n}.{end}" for n in (1, 2) for end in ("yaml", "json", "png")
     }
+
+
+def test_an_unverified_bag_says_so_in_file_figures_and_text(folder: Path, tmp_path: Path, capsys):
+    copy_with_notes(folder / "one", tmp_path / "bag", unverified="salvaged without checksums")
+    output, figures = tmp_path / "found.yaml", tmp_path / "found.json"
+    assert run(folder, str(tmp_path / "bag"), *ONE, "--output", str(output), "--json", str(figures)) == 0
+    assert "UNVERIFIED: salvaged without checksums" in output.read_text()
+    found = json.loads(figures.read_text())
+    assert [row["unverified"] for row in found["bags"]] == ["salvaged without checksums"]
+    assert "is unverified: salvaged without checksums" in " ".join(capsys.readouterr().out.split())
 
 
 def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):

@@ -28,6 +28,7 @@ from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
 from magnetosuture_thread.jobs.evaluate_bag import RecordedPredictions
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from test.bags.bags import copy_with_notes
 
 
 def without_times(rows: list[Row]) -> list[Row]:
@@ -57,6 +58,17 @@ def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
     assert "28 of 30" in page
     assert page.count("data:image/jpeg;base64,") == 1
     assert "Simulated camera frame at" in page
+
+
+def test_the_silence_of_the_camera_is_in_row_and_page(tmp_path: Path, short_bag: Path):
+    (whole,) = evaluate_bags([short_bag], tmp_path / "whole")
+    assert (whole["silences"], whole["silent_s"]) == (0, 0.0)
+    begin = Bag(short_bag).start + 3 * 10**8
+    (row,) = evaluate_bags([copied(short_bag, tmp_path / "b", [], silent=(begin, begin + 5 * 10**8))], tmp_path / "out")
+    assert row["silences"] == 1
+    assert 0.45 < float(str(row["silent_s"])) < 0.65
+    assert row["max_silence_s"] == row["silent_s"]
+    assert "in 1 gap" in (tmp_path / "out" / "b.html").read_text()
 
 
 def test_what_is_wrong_with_one_bag_is_in_its_row(tmp_path: Path, short_bag: Path):
@@ -180,8 +192,14 @@ def test_the_command_ends_with_1_where_a_bag_failed(tmp_path: Path, capsys: pyte
     assert (tmp_path / "out" / "table.json").exists()
 
 
-def copied(source: Path, target: Path, more: Sequence[tuple[Channel, int, bytes]], leave: str = "") -> Path:
-    """Copy a bag, with messages at times [ns] added and a topic left out."""
+def copied(
+    source: Path,
+    target: Path,
+    more: Sequence[tuple[Channel, int, bytes]],
+    leave: str = "",
+    silent: tuple[int, int] = (0, 0),
+) -> Path:
+    """Copy a bag, with messages at times [ns] added, and a topic and some time [ns] left out."""
     bag = Bag(source)
     with BagWriter(target, bag.notes) as writer:
         for name, type_name in bag.topics.items():
@@ -191,7 +209,8 @@ def copied(source: Path, target: Path, more: Sequence[tuple[Channel, int, bytes]
         for channel, time, data in more:
             writer.write(channel.recorded, time, data)
         for record in bag.records(set(bag.topics) - {leave}):
-            writer.write(record.topic, record.time, record.data)
+            if not silent[0] <= record.time < silent[1]:
+                writer.write(record.topic, record.time, record.data)
     return target
 
 
@@ -249,3 +268,13 @@ def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short
     assert str(row["bag"]).isprintable()
     assert str(row["path"]).isprintable()
     assert (tmp_path / "out" / f"{row['bag']}.html").exists()
+
+
+def test_an_unverified_bag_says_so_in_table_page_and_log(tmp_path: Path, short_bag: Path):
+    copy_with_notes(short_bag, tmp_path / "bag", unverified="salvaged without checksums")
+    said: list[str] = []
+    (row,) = evaluate_bags([tmp_path / "bag"], tmp_path / "out", duration=0.3, log=said.append)
+    assert row["unverified"] == "salvaged without checksums"
+    assert "salvaged without checksums" in (tmp_path / "out" / "table.csv").read_text()
+    assert "Unverified bag:" in (tmp_path / "out" / "bag.html").read_text()
+    assert any("unverified: salvaged" in line for line in said)

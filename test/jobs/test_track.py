@@ -252,3 +252,17 @@ def test_a_damaged_bag_is_said(tmp_path: Path):
 def test_pictures_have_no_topic_to_remap():
     with pytest.raises(BagError, match="is no bag"):
         FrameSource([SAMPLES / "frame_00.png"], remap={"/a": "/b"})
+
+
+def test_an_orientation_is_ignored_and_said(tmp_path: Path):
+    """Its pixels are measured as the sensor has them."""
+    from test.vision.test_images import oriented_jpeg
+
+    image = cv2.imread(str(SAMPLES / "frame_00.png"))
+    assert image is not None
+    (tmp_path / "turned.jpg").write_bytes(oriented_jpeg(image, 6))
+    said: list[str] = []
+    (seen,) = track([tmp_path / "turned.jpg"], VisionTrackerSettings(), Scene(), log=said.append)
+    (plain,) = track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene())
+    np.testing.assert_allclose(seen.track.tail, plain.track.tail, atol=5e-5)
+    assert said == ["1 frame with an EXIF orientation, read as stored: it is ignored"]

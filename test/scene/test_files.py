@@ -10,7 +10,8 @@ import pytest
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, scene_to_mapping, write_scene
-from magnetosuture_thread.scene.files import MAX_FILE_BYTES, parse_yaml
+from magnetosuture_thread.scene.files import parse_yaml
+from magnetosuture_thread.untrusted import MAX_TEXT_BYTES
 from test.scene.scenes import SHAPES, every_shape
 
 DISH = "dish: {diameter: 0.035, depth: 0.003}\n"
@@ -150,9 +151,9 @@ def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
         ):
             read_scene(str(path))
     large = tmp_path / "large.yaml"
-    large.write_text(DISH + "#" * (MAX_FILE_BYTES - len(DISH)))
+    large.write_text(DISH + "#" * (MAX_TEXT_BYTES - len(DISH)))
     assert read_scene(str(large)).shapes == ()
-    large.write_text(DISH + "#" * (MAX_FILE_BYTES - len(DISH) + 1))
+    large.write_text(DISH + "#" * (MAX_TEXT_BYTES - len(DISH) + 1))
     with pytest.raises(
         ConfigurationError, match="scene file: got 'a larger file', expected a regular file of at most 1000 kB"
     ):

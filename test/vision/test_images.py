@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
+import cv2
 import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.vision.image_header import ImageHeader, image_header
 from magnetosuture_thread.vision.images import decode_image, glare_mask, prepare, unpack_image
 
 
@@ -47,3 +52,49 @@ def test_the_floor_is_what_is_behind_slender_things():
     assert not glare_mask(picture).any()
     gray[40:60, 100:120] = 250
     assert glare_mask(prepare(gray, 2))[22:28, 52:58].all()
+
+
+def png(width: int, height: int) -> bytes:
+    """Return a PNG of black pixels: some kilobytes, whatever its size."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    packer = zlib.compressobj(9)
+    rows = b"".join(packer.compress(bytes(1 + (width + 7) // 8)) for _ in range(height)) + packer.flush()
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda *given: pytest.fail("decoded"))
+    with pytest.raises(InvalidInputError, match="30000 x 30000 pixels, expected at most"):
+        decode_image(png(30_000, 30_000))
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp", ".webp", ".tif"])
+def test_size_and_orientation_are_read_from_the_header(ending: str):
+    image = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
+    done, data = cv2.imencode(ending, image)
+    assert done
+    assert image_header(data.tobytes()) == ImageHeader(64, 48)
+    assert decode_image(data).shape == (48, 64, 3)
+    for end in range(0, len(data), 7):
+        image_header(data[:end].tobytes())
+
+
+def oriented_jpeg(image: np.ndarray, orientation: int) -> bytes:
+    """Return a JPEG with an orientation in its EXIF data, as telephones write it."""
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    tags = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
+    exif = b"Exif\0\0" + tags
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+def test_pixels_are_read_as_they_are_stored_whatever_the_orientation(orientation: int):
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:10, :20] = 255
+    turned = oriented_jpeg(image, orientation)
+    assert image_header(turned) == ImageHeader(64, 48, orientation)
+    assert (decode_image(turned) == decode_image(cv2.imencode(".jpg", image)[1])).all()

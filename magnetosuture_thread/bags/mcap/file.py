@@ -10,19 +10,25 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
+from mcap.records import Attachment, Metadata
 
+from magnetosuture_thread.bags.bag_folder import NOTES
 from magnetosuture_thread.bags.mcap.records import (
     MAGIC,
     MESSAGE_HEADER,
     CorruptRecordError,
     decompress_chunk,
     iterate_records,
+    parse_attachment,
 )
 from magnetosuture_thread.bags.mcap.salvage import salvage
 from magnetosuture_thread.bags.mcap.scan import Block, Scanner
 from magnetosuture_thread.bags.mcap.summary import read_summary
 from magnetosuture_thread.bags.storage import StoredMessage, merge_by_time, pluralize
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, BudgetError
+
+ROSBAG2 = "rosbag2"  # the metadata record in which rosbag2 keeps a copy of metadata.yaml
 
 
 class McapFile:
@@ -51,11 +57,15 @@ class McapFile:
                 salvaged = salvage(path.name, size, scan, summary, partial(_count_messages, stream))
         except OSError as error:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from None
+        except BudgetError as error:
+            raise BagError(path, str(error)) from None
+        self._scan, self._verified = scan, scan.data_crc_matches or salvaged.damage is None
         self.connections = salvaged.connections
         self.counts = salvaged.counts
         self.notes = salvaged.notes
         self.damage = salvaged.damage
         self.unchecked = salvaged.unchecked
+        self.unverified = ""
         used = set(self.counts)
         self._blocks = [block for block in salvaged.blocks if block.channels & used]
         self.start = min((block.start for block in self._blocks), default=0)
@@ -99,12 +109,43 @@ class McapFile:
         found = []
         for opcode, first, last in iterate_records(data):
             if opcode == Opcode.MESSAGE:
-                channel, _, time, _ = MESSAGE_HEADER.unpack_from(data, first)
+                channel, sequence, time, publish_time = MESSAGE_HEADER.unpack_from(data, first)
                 if channel in wanted and start <= time <= end:
-                    found.append((time, first + MESSAGE_HEADER.size, last, channel))
+                    found.append((time, first + MESSAGE_HEADER.size, last, channel, sequence, publish_time))
         found.sort()
-        for time, first, last, channel in found:
-            yield StoredMessage(time, self.connections[channel], data[first:last])
+        for time, first, last, channel, sequence, publish_time in found:
+            yield StoredMessage(time, self.connections[channel], data[first:last], publish_time, sequence)
+
+    def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
+        """Yield metadata records that are neither our notes nor rosbag2's, then attachments.
+
+        Args:
+            dropped: counts what cannot be vouched for, or is of another kind, by reason.
+        """
+        for record in self._scan.metadata:
+            if record.name in (NOTES, ROSBAG2):
+                continue
+            if self._verified:
+                yield record
+            else:
+                dropped["metadata record without a checksum in a damaged file"] += 1
+        if self._scan.private_records:
+            dropped["record of a private kind"] += self._scan.private_records
+        try:
+            with self.path.open("rb") as stream:
+                for start, length in self._scan.attachments:
+                    stream.seek(start)
+                    attachment, checked = None, False
+                    if length <= MAX_BLOCK_BYTES:
+                        attachment, checked = parse_attachment(stream.read(length))
+                    if attachment is None:
+                        dropped["corrupt or oversized attachment"] += 1
+                    elif not checked and not self._verified:
+                        dropped["attachment without a checksum in a damaged file"] += 1
+                    else:
+                        yield attachment
+        except OSError as error:
+            raise BagError(self.path, f"cannot be read: {error.strerror or error}") from None
 
 
 def _load(stream: BinaryIO, block: Block) -> bytes:

@@ -22,11 +22,12 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, MAX_BLOCK_RECORDS, UnpackBudget
+
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
 RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of the content
 MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
 MIN_PRIVATE_OPCODE = 0x80
-MAX_CHUNK_BYTES = 1 << 30  # of a chunk in memory, compressed or not
 
 _READERS: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.HEADER: mcap_records.Header.read,
@@ -82,20 +83,36 @@ def parse_record(opcode: int, body: bytes) -> Any:
     return record
 
 
+def parse_attachment(body: bytes) -> tuple[mcap_records.Attachment | None, bool]:
+    """Return an attachment, and whether it has a checksum; None where it is corrupt."""
+    stream = ReadDataStream(BytesIO(body))
+    try:
+        record = mcap_records.Attachment.read(stream)
+    except (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError):
+        return None, False
+    crc = int.from_bytes(body[-4:], "little")
+    if stream.count != len(body) or (crc and zlib.crc32(body[:-4]) != crc):
+        return None, False
+    return record, bool(crc)
+
+
 def iterate_records(content: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of the body of each record of a chunk.
 
     Raises:
         CorruptRecordError: the records do not fill the chunk exactly.
     """
-    position, size = 0, len(content)
+    position, size, count = 0, len(content), 0
     while position < size:
+        count += 1
         if position + RECORD_HEADER.size > size:
             raise CorruptRecordError("a chunk with a corrupt record")
+        if count > MAX_BLOCK_RECORDS:
+            raise CorruptRecordError(f"a chunk of more than {MAX_BLOCK_RECORDS} records")
         opcode, length = RECORD_HEADER.unpack_from(content, position)
         start = position + RECORD_HEADER.size
         position = start + length
-        if position > size or (opcode == Opcode.MESSAGE and length < MESSAGE_HEADER.size):
+        if position > size or not opcode or (opcode == Opcode.MESSAGE and length < MESSAGE_HEADER.size):
             raise CorruptRecordError("a chunk with a corrupt record")
         yield opcode, start, position
 
@@ -125,14 +142,16 @@ class ChunkContent(NamedTuple):
     compression: str
 
 
-def decompress_chunk(body: bytes) -> ChunkContent:
+def decompress_chunk(body: bytes, budget: UnpackBudget | None = None) -> ChunkContent:
     """Return the content of a chunk and verify its checksum.
 
     Args:
         body: of the chunk's record.
+        budget: of the file, which the content is counted in; None where it has been.
 
     Raises:
         CorruptRecordError: it is no chunk, cannot be decompressed, or its checksum is wrong.
+        BudgetError: the file unpacks to more than it may.
     """
     if len(body) < _CHUNK_HEADER.size:
         raise CorruptRecordError("a corrupt chunk")
@@ -141,8 +160,10 @@ def decompress_chunk(body: bytes) -> ChunkContent:
     if start > len(body) or start + _LENGTH.unpack_from(body, start - _LENGTH.size)[0] != len(body):
         raise CorruptRecordError("a corrupt chunk")
     compression = body[_CHUNK_HEADER.size : _CHUNK_HEADER.size + name_length]
-    if size > MAX_CHUNK_BYTES:
-        raise CorruptRecordError(f"a chunk that claims {size} bytes")
+    if size > MAX_BLOCK_BYTES:
+        raise CorruptRecordError(f"a chunk that claims {size} bytes, more than {MAX_BLOCK_BYTES}")
+    if budget is not None:
+        budget.spend(size + len(body))
     data = _decompress(compression, body[start:], size)
     if len(data) != size:
         raise CorruptRecordError("a chunk of a wrong size")
@@ -162,9 +183,9 @@ def _decompress(compression: bytes, compressed: bytes, size: int) -> bytes:
             return data
         if compression == b"zstd":
             if zstandard.frame_content_size(compressed) == size:
-                return zstandard.ZstdDecompressor().decompress(compressed)
+                return zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES).decompress(compressed)
             parts, count = [], 0
-            with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
+            with zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES).stream_reader(compressed) as stream:
                 while count <= size and (part := stream.read(_READ_BYTES)):
                     parts.append(part)
                     count += len(part)
@@ -174,7 +195,7 @@ def _decompress(compression: bytes, compressed: bytes, size: int) -> bytes:
     raise CorruptRecordError("a chunk of an unknown compression")
 
 
-def find_chunk(stream: BinaryIO, position: int, limit: int, before: int) -> int | None:
+def find_chunk(stream: BinaryIO, position: int, limit: int, before: int, budget: UnpackBudget) -> int | None:
     """Return where the next chunk with a correct checksum begins; None if there is none.
 
     A chunk without a checksum does not count: it cannot be told from message data that looks like one.
@@ -184,13 +205,18 @@ def find_chunk(stream: BinaryIO, position: int, limit: int, before: int) -> int 
         position: where the search begins.
         limit: where the data ends.
         before: the chunk must begin before this position.
+        budget: of the file.
+
+    Raises:
+        BudgetError: there is too much to search.
     """
     while position < before:
         stream.seek(position)
         window = stream.read(min(_WINDOW_BYTES, limit - position))
+        budget.spend(len(window))
         at = 0
         while (match := _CHUNK_PATTERN.search(window, at)) is not None and position + match.start() < before:
-            if is_intact_chunk(stream, position + match.start(), limit):
+            if is_intact_chunk(stream, position + match.start(), limit, budget):
                 return position + match.start()
             at = match.start() + 1
         if match is not None or len(window) < _WINDOW_BYTES:
@@ -199,16 +225,20 @@ def find_chunk(stream: BinaryIO, position: int, limit: int, before: int) -> int 
     return None
 
 
-def is_intact_chunk(stream: BinaryIO, position: int, limit: int) -> bool:
-    """Return whether a chunk with a correct checksum begins at a position."""
+def is_intact_chunk(stream: BinaryIO, position: int, limit: int, budget: UnpackBudget) -> bool:
+    """Return whether a chunk with a correct checksum begins at a position.
+
+    Raises:
+        BudgetError: the file unpacks to more than it may.
+    """
     stream.seek(position)
     _, length = RECORD_HEADER.unpack(stream.read(RECORD_HEADER.size))
-    if length > MAX_CHUNK_BYTES or position + RECORD_HEADER.size + length > limit:
+    if length > MAX_BLOCK_BYTES or position + RECORD_HEADER.size + length > limit:
         return False
     try:
-        content = decompress_chunk(stream.read(length))
-        for _ in iterate_records(content.data):
-            pass
+        budget.spend(length)
+        content = decompress_chunk(stream.read(length), budget)
+        budget.spend(0, sum(1 for _ in iterate_records(content.data)))
     except CorruptRecordError:
         return False
     return content.has_checksum

@@ -72,7 +72,7 @@ def salvage(
     else:
         regions += trailing + _corrupt_end(name, scan, summary)
     regions += [CorruptRegion(name, b.offset, b.offset + b.length, match.unindexed_reason) for b in match.unindexed]
-    complete = not scan.corrupt and not scan.has_private_records and scan.ended
+    complete = not scan.corrupt and not scan.private_records and scan.ended
     if summary is not None and not regions and (problem := _contradiction(summary, blocks, counts)):
         regions.append(CorruptRegion(name, summary.start, summary.end, problem))
         complete = False

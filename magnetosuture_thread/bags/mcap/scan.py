@@ -19,7 +19,6 @@ from mcap.records import Metadata
 
 from magnetosuture_thread.bags.mcap.records import (
     MAGIC,
-    MAX_CHUNK_BYTES,
     MESSAGE_HEADER,
     MIN_PRIVATE_OPCODE,
     RECORD_HEADER,
@@ -33,6 +32,7 @@ from magnetosuture_thread.bags.mcap.records import (
 )
 from magnetosuture_thread.bags.mcap.summary import ChannelTable, McapSummary
 from magnetosuture_thread.bags.storage import CorruptRegion
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
 _SKIP_BYTES = 1 << 20  # read at a time where a record is skipped
 _RUN_BYTES = 1 << 20  # of messages outside of chunks in one block
@@ -77,13 +77,14 @@ class ScanResult:
         unchecked_channels: channels defined elsewhere.
         metadata: metadata records.
         compressions: of the chunks.
+        attachments: offset and length of the bodies of attachment records.
         corrupt: regions that could not be read.
         chunks_lost: number of chunks among them, as far as it can be seen.
         ended: whether the data end record was reached.
         stopped: where the scan ended.
         data_crc: checksum of the data section as stored; 0 if there is none.
         data_crc_matches: whether it is correct.
-        has_private_records: whether there are records of private opcodes.
+        private_records: number of records of private opcodes.
     """
 
     blocks: list[Block] = field(default_factory=list)
@@ -93,13 +94,14 @@ class ScanResult:
     unchecked_channels: ChannelTable = field(default_factory=ChannelTable)
     metadata: list[Metadata] = field(default_factory=list)
     compressions: set[str] = field(default_factory=set)
+    attachments: list[tuple[int, int]] = field(default_factory=list)
     corrupt: list[CorruptRegion] = field(default_factory=list)
     chunks_lost: int = 0
     ended: bool = False
     stopped: int = 0
     data_crc: int = 0
     data_crc_matches: bool = False
-    has_private_records: bool = False
+    private_records: int = 0
 
 
 class Scanner:
@@ -123,6 +125,7 @@ class Scanner:
         self._name = path.name
         self._stream = stream
         self._limit = summary.start if summary is not None else size
+        self._budget = UnpackBudget(size)
         self._progress = progress
         self._crc = 0
         self._channel_sets = {_NO_CHANNELS: _NO_CHANNELS}
@@ -134,7 +137,11 @@ class Scanner:
             self._offsets = sorted([*offsets, summary.start - RECORD_HEADER.size - 4])
 
     def scan(self) -> ScanResult:
-        """Scan the file and return what was found."""
+        """Scan the file and return what was found.
+
+        Raises:
+            BudgetError: it unpacks to more, or holds more records, than a file of its size may.
+        """
         magic = self._read(0, len(MAGIC))
         self._crc = zlib.crc32(magic)
         position = len(MAGIC)
@@ -142,6 +149,7 @@ class Scanner:
             position = self._skip_corrupt(0, "the magic bytes are missing")
         while position < self._limit and not self.result.ended:
             before = position
+            self._budget.spend(0, 1)
             try:
                 position = self._step(position)
             except CorruptRecordError as problem:
@@ -157,12 +165,10 @@ class Scanner:
         after = start + length
         if opcode == Opcode.MESSAGE:
             return self._scan_loose_messages(position)
-        if (
-            opcode in (Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX)
-            or opcode >= MIN_PRIVATE_OPCODE
-            or length > MAX_CHUNK_BYTES
-        ):
+        if opcode in (Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX) or opcode >= MIN_PRIVATE_OPCODE:
             return self._skip(position, opcode, length)
+        if length > MAX_BLOCK_BYTES:
+            raise CorruptRecordError(f"a record of {length} bytes, more than {MAX_BLOCK_BYTES}")
         before = self._crc
         head, body = self._read(position, RECORD_HEADER.size), self._read(start, length)
         self._crc = zlib.crc32(body, zlib.crc32(head, before))
@@ -202,15 +208,17 @@ class Scanner:
                 raise CorruptRecordError("a corrupt message index")
         if start + length < self._limit:
             self._read_header(start + length)
-        self.result.has_private_records |= opcode >= MIN_PRIVATE_OPCODE
+        self.result.private_records += opcode >= MIN_PRIVATE_OPCODE
         self._crc = zlib.crc32(self._read(position, RECORD_HEADER.size), self._crc)
         for at in range(start, start + length, _SKIP_BYTES):
             self._crc = zlib.crc32(self._read(at, min(_SKIP_BYTES, start + length - at)), self._crc)
+        if opcode == Opcode.ATTACHMENT:
+            self.result.attachments.append((start, length))
         return start + length
 
     def _scan_chunk(self, start: int, length: int, body: bytes) -> None:
         """Add a chunk that is intact."""
-        content = decompress_chunk(body)
+        content = decompress_chunk(body, self._budget)
         self._add_block(
             content.data, Block(start, length, True, content.has_checksum, content.crc, 0, 0, 0, _NO_CHANNELS)
         )
@@ -228,8 +236,10 @@ class Scanner:
                 break  # The run ends here; the next step handles what is corrupt.
             if opcode != Opcode.MESSAGE:
                 break
-            if not MESSAGE_HEADER.size <= length <= MAX_CHUNK_BYTES:
-                raise CorruptRecordError("a corrupt message")
+            if not MESSAGE_HEADER.size <= length <= MAX_BLOCK_BYTES:
+                if after == position:
+                    raise CorruptRecordError("a corrupt message")
+                break
             after += RECORD_HEADER.size + length
         data = self._read(position, after - position)
         self._crc = zlib.crc32(data, self._crc)
@@ -241,13 +251,16 @@ class Scanner:
         counts: Counter[int] = Counter()
         definitions = []
         first, last = 0, 0
+        records = 0
         for opcode, start, end in iterate_records(data):
+            records += 1
             if opcode == Opcode.MESSAGE:
                 channel, _, time, _ = MESSAGE_HEADER.unpack_from(data, start)
                 first, last = (min(first, time), max(last, time)) if counts else (time, time)
                 counts[channel] += 1
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 definitions.append((opcode, data[start:end]))
+        self._budget.spend(0, records)
         for opcode, body in definitions:
             self._add_definition(opcode, body, block.has_checksum)
         channels = self._channel_sets.setdefault(frozenset(counts), frozenset(counts))
@@ -288,7 +301,7 @@ class Scanner:
                 after = min(after, offset)
                 break
         # Even then: a corrupt record header may skip chunks that are intact.
-        found = find_chunk(self._stream, position + 1, self._limit, after)
+        found = find_chunk(self._stream, position + 1, self._limit, after, self._budget)
         return after if found is None else found
 
     def _is_intact_record(self, position: int) -> bool:
@@ -296,7 +309,7 @@ class Scanner:
         try:
             opcode, length = self._read_header(position)
             if opcode == Opcode.CHUNK:
-                return is_intact_chunk(self._stream, position, self._limit)
+                return is_intact_chunk(self._stream, position, self._limit, self._budget)
             parse_record(opcode, self._read(position + RECORD_HEADER.size, length))
         except CorruptRecordError:
             return False

@@ -23,6 +23,7 @@ from magnetosuture_thread.bags.mcap.records import (
     parse_record,
 )
 from magnetosuture_thread.bags.storage import Connection, MessageDefinition
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
 
 @dataclass
@@ -60,7 +61,7 @@ class ChannelTable:
                 continue
             definition = MessageDefinition("")
             if schemas:
-                text = schemas[0].data.decode("utf-8", "replace")
+                text = schemas[0].data.decode("utf-8", "surrogateescape")
                 definition = MessageDefinition(schemas[0].name, schemas[0].encoding, text)
             known[number] = Connection(channel.topic, definition, channel.message_encoding, channel.metadata)
         return known
@@ -133,7 +134,7 @@ def read_summary(stream: BinaryIO, size: int) -> McapSummary | None:
     end = stream.read()
     if _FOOTER_PATTERN.fullmatch(end):
         start = _FOOTER.unpack_from(end, RECORD_HEADER.size)[0] or size - _FOOTER_BYTES
-        if len(MAGIC) <= start <= size - _FOOTER_BYTES:
+        if max(len(MAGIC), size - MAX_BLOCK_BYTES) <= start <= size - _FOOTER_BYTES:
             stream.seek(start)
             found = _parse_summary(stream.read(size - len(MAGIC) - start), start, shifted=False)
             if found is not None:

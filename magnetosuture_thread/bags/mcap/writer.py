@@ -27,18 +27,19 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
 from magnetosuture_thread.bags.mcap.records import MAGIC, MESSAGE_HEADER, RECORD_HEADER, encode_records
-from magnetosuture_thread.bags.storage import Connection
+from magnetosuture_thread.bags.storage import Connection, MessageDefinition
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # the header of a message's record, and what is before the data
 _INDEX = struct.Struct("<BQHI")  # the header of a message index, its channel, and its size
 
 
 class PendingMessage(NamedTuple):
-    """A message that is not written yet: channel id, sequence number, time [ns], CDR bytes."""
+    """A message that is not written yet: channel id, sequence number, times of recording and publishing [ns], bytes."""
 
     channel: int
     sequence: int
     time: int
+    publish_time: int
     data: bytes
 
 
@@ -100,7 +101,7 @@ class ChunkBuilder:
         size = 0
         entries: dict[int, list[tuple[int, int]]] = {}
         defined: set[int] = set()
-        for number, sequence, time, data in self._messages:
+        for number, sequence, time, publish_time, data in self._messages:
             if number not in entries:
                 channel = channels[number]
                 if channel.schema_id and channel.schema_id not in defined:
@@ -112,7 +113,7 @@ class ChunkBuilder:
                 entries[number] = []
             entries[number].append((time, size))
             length = MESSAGE_HEADER.size + len(data)
-            content += (_MESSAGE.pack(Opcode.MESSAGE, length, number, sequence, time, time), data)
+            content += (_MESSAGE.pack(Opcode.MESSAGE, length, number, sequence, time, publish_time), data)
             size += _MESSAGE.size + len(data)
         times = [message.time for message in self._messages]
         return BuiltChunk(b"".join(content), entries, min(times), max(times))
@@ -127,6 +128,7 @@ def encode_message_index(channel: int, entries: list[tuple[int, int]]) -> bytes:
 
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
+MAX_SEQUENCE = (1 << 32) - 1
 MAX_INDEX_BYTES = 400  # of the summary, for one chunk
 
 
@@ -178,15 +180,16 @@ class McapWriter:
         self.state = WriterState(0, 0, 0, Counter(), None, 0, ChunkBuilder())
         self.state = self._append(MAGIC + encode_records(mcap_records.Header("ros2", "magnetosuture_thread")))
         self._metadata_index: list[mcap_records.MetadataIndex] = []
+        self._attachment_index: list[mcap_records.AttachmentIndex] = []
         self._write_metadata(metadata)
 
     def add_channel(self, connection: Connection) -> int:
         """Define a channel and return its id."""
         definition, schema = connection.definition, 0
-        if definition.type_name:
+        if definition != MessageDefinition(""):
             schema = self._numbers.setdefault(definition, len(self._numbers) + 1)
             self._schemas[schema] = mcap_records.Schema(
-                schema, definition.text.encode(), definition.encoding, definition.type_name
+                schema, definition.text.encode("utf-8", "surrogateescape"), definition.encoding, definition.type_name
             )
         number = len(self._channels) + 1
         self._channels[number] = mcap_records.Channel(
@@ -194,16 +197,25 @@ class McapWriter:
         )
         return number
 
-    def add_message(self, channel: int, time: int, data: bytes) -> bool:
+    def add_message(
+        self, channel: int, time: int, data: bytes, *, publish_time: int | None = None, sequence: int | None = None
+    ) -> bool:
         """Add a message, and return whether a chunk was written with it.
+
+        Args:
+            channel: of the message.
+            time: when it was recorded [ns].
+            data: its bytes.
+            publish_time: when it was published [ns]; the time of recording if None.
+            sequence: its number; one more than that of the last on the channel if None.
 
         Raises:
             OSError: as `flush`.
         """
         pending = self.state.pending
-        sequence = self._sequences[channel]
-        pending.add(PendingMessage(channel, sequence, time, data))
-        self._sequences[channel] = sequence + 1
+        sequence = self._sequences[channel] if sequence is None else sequence
+        pending.add(PendingMessage(channel, sequence, time, time if publish_time is None else publish_time, data))
+        self._sequences[channel] = (sequence + 1) & MAX_SEQUENCE
         is_full = pending.size > MAX_CHUNK_BYTES or pending.span > MAX_CHUNK_SPAN
         if is_full:
             self.flush()
@@ -274,6 +286,33 @@ class McapWriter:
         """Close the file without a summary: it ends with the last complete chunk."""
         self._stream.close()
 
+    def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        """Write a metadata record; before the first message, so that truncation leaves it.
+
+        Raises:
+            OSError: the disk is full, or fails; the record is not there.
+        """
+        self._write_metadata({name: entries})
+
+    def add_attachment(self, attachment: mcap_records.Attachment) -> None:
+        """Write an attachment; before the first message, so that truncation leaves it.
+
+        Raises:
+            OSError: the disk is full, or fails; the attachment is not there.
+        """
+        record = encode_records(attachment)
+        entry = mcap_records.AttachmentIndex(
+            offset=self.state.size,
+            length=len(record),
+            create_time=attachment.create_time,
+            log_time=attachment.log_time,
+            data_size=len(attachment.data),
+            name=attachment.name,
+            media_type=attachment.media_type,
+        )
+        self.state = self._append(record)
+        self._attachment_index.append(entry)
+
     def _write_metadata(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
         """Write metadata, a record for each name."""
         for name, entries in metadata.items():
@@ -303,7 +342,7 @@ class McapWriter:
         data, at = b"", self.state.size
         offsets = b""
         statistics = mcap_records.Statistics(
-            attachment_count=0,
+            attachment_count=len(self._attachment_index),
             channel_count=len(self._channels),
             channel_message_counts=dict(self.state.counts),
             chunk_count=self.state.chunks,
@@ -318,6 +357,7 @@ class McapWriter:
             (Opcode.CHANNEL, encode_records(*self._channels.values())),
             (Opcode.STATISTICS, encode_records(statistics)),
             (Opcode.CHUNK_INDEX, b"".join(self._index[: self.state.chunks])),
+            (Opcode.ATTACHMENT_INDEX, encode_records(*self._attachment_index)),
             (Opcode.METADATA_INDEX, encode_records(*self._metadata_index)),
         ):
             if group:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -13,7 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from magnetosuture_thread.cli.arguments import DONE, FAILED, Subparsers, add_remap, command, output_file
-from magnetosuture_thread.cli.terminal import make_console, make_log, printable, progress, write_json
+from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
+from magnetosuture_thread.texts import one_line
 
 MAX_NOTE_CHARS = 200  # of a note that are shown; one may hold a whole setup
 
@@ -36,6 +36,8 @@ def add(subparsers: Subparsers) -> None:
     check.add_argument("--frame", default="dish", metavar="NAME", help="the bag's name of the dish frame")
     check.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
     repair.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
+    unverified = "salvage from a damaged bag without checksums what passes checks of its values; marks the new bag"
+    repair.add_argument("--unverified", action="store_true", help=unverified)
 
 
 def run_bag_check(options: argparse.Namespace) -> int:
@@ -56,38 +58,53 @@ def run_bag_check(options: argparse.Namespace) -> int:
     for line in _lines(found):
         make_log(console)(line)
     write_json(options.json, found)
-    return FAILED if found["damage"] or found["refused"] else DONE
+    return FAILED if found["damage"] or found["refused"] or found["unverified"] else DONE
 
 
 def run_repair(options: argparse.Namespace) -> int:
     """Write every intact message of a bag into a new one.
 
-    The new bag has the old one's notes and definitions of types. The command reports how many messages there are and
-    what is lost, where and when.
+    The new bag has the old one's notes, definitions, attachments, times and numbers of messages, byte for byte. The
+    command reports how many messages there are and what is lost or changed, where and when.
+
+    A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others. With
+    --unverified, those are written that decode, are finite, are within reach of the dish, and have their stamps in
+    order. The new bag says in its notes that it is unverified, and so does every later check, report and table.
     """
     from magnetosuture_thread.bags.reader import Bag
+    from magnetosuture_thread.bags.repair import write_repaired_bag
     from magnetosuture_thread.bags.storage import pluralize
-    from magnetosuture_thread.bags.writer import write_repaired_bag
     from magnetosuture_thread.jobs.output import whole_folder
 
     console = make_console()
     log = make_log(console)
-    refused: Counter[str] = Counter()
     with progress(console, "bag repair") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
         with whole_folder(options.output) as folder:
-            count = write_repaired_bag(
-                bag, folder, options.output.name, refused, lambda share: advance(0.5 + 0.5 * share)
+            report = write_repaired_bag(
+                bag,
+                folder,
+                options.output.name,
+                unverified=options.unverified,
+                progress=lambda share: advance(0.5 + 0.5 * share),
             )
     if bag.damage is not None:
         log(str(bag.damage))
-    elif not refused:
-        log(bag.unchecked or "is not damaged: the new bag holds the same")
-    for reason, lost in refused.items():
+    for line in (f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks):
+        log(line) if line else None
+    if report.is_same and not (bag.damage or bag.unverified or bag.unchecked or bag.remarks):
+        log("is not damaged: the new bag holds the same messages, definitions, attachments and notes")
+    for reason, lost in report.refused.items():
         log(f"{reason}: {pluralize(lost, 'message')} lost")
+    for reason, lost in report.dropped.items():
+        log(f"not kept: {lost} of this: {reason}")
+    if report.unpacked:
+        log(f"{pluralize(report.unpacked, 'message')} packed by the recorder, and unpacked in the new bag")
+    if report.defined:
+        log(f"without a definition, now with ours: {', '.join(sorted(set(report.defined)))}")
     for place in bag.damage.regions if bag.damage is not None else ():
         log(f"  {place}{_times(place.first, place.last, bag.start)}")
-    log(f"{count} messages in {options.output}")
+    log(f"{report.messages} messages in {options.output}")
     return DONE
 
 
@@ -110,7 +127,7 @@ def _table(found: dict[str, Any]) -> Table:
     for topic in found["topics"]:
         times = (topic[key] for key in ("rate_hz", "first_s", "last_s", "greatest_gap_s"))
         table.add_row(
-            Text(_named(topic["topic"]) + (" *" if topic["known"] else "")),
+            Text(one_line(topic["topic"]) + (" *" if topic["known"] else "")),
             str(topic["messages"]),
             *("-" if value is None else f"{value:.2f}" for value in times),
             str(topic["stamps_going_back"]),
@@ -123,9 +140,9 @@ def _lines(found: dict[str, Any]) -> list[str]:
     lines = []
     for topic in found["topics"]:
         types = " and ".join(kind.replace("/msg/", "/") for kind in topic["types"])
-        lines.append(f"{_named(topic['topic'])}: {_named(types) or 'no type'}")
+        lines.append(f"{one_line(topic['topic'])}: {one_line(types) or 'no type'}")
     for topic in found["topics"]:
-        name = _named(topic["topic"])
+        name = one_line(topic["topic"])
         if len(topic["types"]) > 1:
             lines.append(f"{name} has two types")
         elif topic["problem"]:
@@ -136,21 +153,19 @@ def _lines(found: dict[str, Any]) -> list[str]:
             lines.append(f"{name}: {topic['unreadable_stamps']} stamps cannot be read")
     lines += ["; ".join(f"{key} {value}" for key, value in file.items()) for file in found["files"]]
     lines += [f"{key}: {shorten(value, MAX_NOTE_CHARS, placeholder=' ...')}" for key, value in found["notes"].items()]
-    if found["unchecked"]:
+    lines += found["remarks"]
+    if found["unverified"]:
+        lines.append(f"unverified: {found['unverified']}")
+    elif found["unchecked"]:
         lines.append(found["unchecked"])
     lines += [
         f"{reason}: {count} {'message' if count == 1 else 'messages'} lost"
         for reason, count in found["refused"].items()
     ]
     if found["damage"] is None:
-        is_sure = not found["refused"] and not found["unchecked"]
+        is_sure = not (found["refused"] or found["unchecked"] or found["unverified"])
         return [*lines, "nothing is damaged"] if is_sure else lines
     lines.append(found["damage"]["text"])
     for place in found["damage"]["places"]:
         lines.append(f"  {place['file']}, bytes {place['start_byte']} to {place['end_byte']}: {place['what']}")
     return lines
-
-
-def _named(name: str) -> str:
-    """Return a name in a bag in one line."""
-    return printable(name).replace("\n", "\\n")

@@ -170,6 +170,7 @@ def calibrate_camera(
     """
     import numpy as np
 
+    from magnetosuture_thread.jobs.output import whole_file
     from magnetosuture_thread.jobs.track import FrameSource
     from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers
 
@@ -186,10 +187,8 @@ def calibrate_camera(
         calibration = calibrate_by_dish(images, dish_diameter)
     else:
         calibration = calibrate_by_markers(images, dish_diameter, *markers)
-    try:
-        output.write_text(calibration.to_yaml(), encoding="utf-8")
-    except OSError as error:
-        raise BagError(output, f"cannot be written: {error.strerror}") from None
+    with whole_file(output) as partial:
+        partial.write_text(calibration.to_yaml(), encoding="utf-8")
     return calibration
 
 

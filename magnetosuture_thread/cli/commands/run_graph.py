@@ -245,7 +245,9 @@ def run_coils(options: argparse.Namespace) -> int:
     log = make_log(make_console())
     with CoilClient() as client:
         if options.action != "state":
-            client.execute(options.action)
+            problem = client.execute(options.action)
+            if problem:
+                log(f"warning: {problem}")
         state = client.state()
     width = max(len(name) for name in state)
     for name, value in state.items():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, SensorSilence
 from magnetosuture_thread.model.margins import SOLID
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
@@ -53,6 +53,8 @@ class BagFigures:
         processing: of a frame in the tracker [s].
         interval: between frames, median [s].
         live: of the recorded graph.
+        silence: time without frames, or poses.
+        span: that is evaluated [s].
     """
 
     frames: int
@@ -70,16 +72,28 @@ class BagFigures:
     processing: Percentiles | None
     interval: float
     live: LiveFigures = field(default_factory=LiveFigures)
+    silence: SensorSilence = field(default_factory=SensorSilence)
+    span: float = math.nan
+
+    @property
+    def silent_share(self) -> float:
+        """Share of the time without frames, or poses."""
+        return self.silence.total / self.span if self.span > 0.0 else 0.0
 
     @classmethod
-    def of(cls, metrics: RunMetrics, live: LiveFigures | None = None) -> BagFigures:
+    def of(
+        cls, metrics: RunMetrics, live: LiveFigures | None = None, within: tuple[float, float] | None = None
+    ) -> BagFigures:
         """Return the figures of a run.
 
         Args:
             metrics: of the run.
             live: what the recording itself says of the graph.
+            within: seconds of the bag from and to which it is evaluated; from the first frame to the last if None [s].
         """
-        steps = np.diff(metrics.observed.times)
+        times = metrics.observed.times
+        begin, end = within or (float(times.min(initial=math.inf)), float(times.max(initial=-math.inf)))
+        steps = np.diff(times)
         return cls(
             frames=len(metrics.observed),
             tracked=metrics.tracked,
@@ -96,6 +110,8 @@ class BagFigures:
             processing=Percentiles.of(metrics.observed.column("processing")),
             interval=float(np.median(steps)) if len(steps) else math.nan,
             live=live or LiveFigures(),
+            silence=SensorSilence.of(times, begin, end),
+            span=end - begin,
         )
 
 
@@ -117,6 +133,7 @@ class BagDetails:
         begin: second of the bag that the evaluation begins at [s].
         duration: that was evaluated [s].
         damage: what is broken in the bag, a line each.
+        unverified: why any message of the bag may be wrong; empty if nothing speaks against them.
         refused: messages that could not be used, by why.
         topics: type and number of messages of each topic in our graph's words.
         settings: in force at the start: name, value and unit.
@@ -137,6 +154,7 @@ class BagDetails:
     begin: float = 0.0
     duration: float = math.nan
     damage: tuple[str, ...] = ()
+    unverified: str = ""
     refused: Mapping[str, int] = field(default_factory=dict)
     topics: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     settings: tuple[tuple[str, str, str], ...] = ()
@@ -205,6 +223,11 @@ def _frames(figures: BagFigures) -> Headline:
     share = figures.predicted / figures.frames if figures.frames else 0.0
     grades = ((-0.95, GOOD, "nearly all"), (-0.5, MIDDLING, "with gaps"), (0.0, BAD, "few"))
     detail = f"{100.0 * share:.1f} %; needle found in {figures.tracked}"
+    silence = figures.silence
+    if silence.gaps:
+        detail += f"; none at all for {format_number(silence.total)} s, the longest {format_number(silence.max_gap)} s"
+        detail += f" at {silence.at:.1f} s"
+        share *= 1.0 - figures.silent_share
     return Headline("frames predicted", f"{figures.predicted} of {figures.frames}", detail, *_grade(-share, *grades))
 
 

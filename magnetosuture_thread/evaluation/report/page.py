@@ -23,6 +23,7 @@ from magnetosuture_thread.evaluation.report import figures as report
 from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, BagFigures
 from magnetosuture_thread.evaluation.report.pictures import ReportPicture
 from magnetosuture_thread.model.margins import SOLID
+from magnetosuture_thread.texts import printable
 
 SINCE_EPOCH = 1_000_000_000  # s; a bag's time before it is no date
 MAX_POINTS = 5000  # of a line
@@ -70,13 +71,20 @@ def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pict
 
 @cache
 def _template() -> Template:
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    environment = Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, finalize=_shown
+    )
     environment.filters.update(
         number=report.format_number, milliseconds=report.milliseconds, micrometres=report.micrometres
     )
     environment.globals["margin_state"] = report.margin_state
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return environment.from_string(_source("page.html"))
+
+
+def _shown(value: Any) -> Any:
+    """Return what the page gets for a value: of a text from outside, what can be shown."""
+    return printable(value) if type(value) is str else value  # not Markup, which is ours
 
 
 def _source(name: str) -> str:

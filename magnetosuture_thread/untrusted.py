@@ -1,0 +1,90 @@
+"""The one budget for input that nobody vouches for: bytes, nesting, elements and time of files, texts and messages.
+
+A file of a few bytes may ask for hours or gigabytes: compressed zeros, lists in lists, types in types, aliases. Every
+reader takes its bounds from here, and what is past them is refused in one line. With them the command reads or refuses
+each such file within 5 s and 300 MB.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+MAX_TEXT_BYTES = 1_000_000  # of a setup, scene, calibration or other text that is read whole
+MAX_METADATA_BYTES = 4_000_000  # of a bag's metadata.yaml, which lists every topic
+MAX_TABLE_BYTES = 20_000_000  # of measurements in a CSV file
+MAX_FILE_BYTES = 1 << 26  # of a picture or reference trajectory
+MAX_BLOCK_BYTES = 1 << 26  # of a message, or of a chunk of messages, packed or not
+MAX_BLOCK_RECORDS = 500_000  # of a chunk
+MAX_PIXELS = 10_000_000  # of a picture: one of 3840 x 2160 has 8.3 million
+MAX_YAML_DEPTH = 20
+MAX_YAML_EVENTS = 500_000  # values, keys, beginnings and ends of lists
+MAX_NESTING = 32  # of message types in each other
+MAX_ELEMENTS = 10_000  # fields that a message has whatever its data, all nested ones counted
+MAX_DECODED = 1_000_000  # objects that the data of one message may become
+MAX_DEFINITION_CHARS = 200_000
+MAX_PARSER_STEPS = 40_000  # of a message definition's parser: a second
+
+
+class BudgetError(Exception):
+    """Input that asks for more than it may; the text says of what, and how much it may."""
+
+
+class UnpackBudget:
+    """What a file may become when it is unpacked and searched, by its size.
+
+    A recorder's compression saves a factor of 2 to 50; a bomb's, many thousands.
+
+    Args:
+        size: of the file [bytes].
+    """
+
+    def __init__(self, size: int) -> None:
+        self._max_bytes = self._bytes = (1 << 29) + 200 * size
+        self._max_records = self._records = 200_000 + size
+
+    def spend(self, count: int, records: int = 0) -> None:
+        """Count unpacked bytes, and records in them.
+
+        Raises:
+            BudgetError: there are more than the file may hold.
+        """
+        self._bytes -= count
+        self._records -= records
+        if self._bytes < 0:
+            raise BudgetError(f"unpacks to more than {self._max_bytes} bytes, which no recording of its size does")
+        if self._records < 0:
+            raise BudgetError(f"holds more than {self._max_records} records, which no recording of its size does")
+
+
+def check_yaml(text: str, *, max_aliases: int = 0) -> None:
+    """Refuse a YAML text that becomes much larger when it is read, or that nests too deep.
+
+    Args:
+        text: whatever was given.
+        max_aliases: that are accepted; each may double what is read.
+
+    Raises:
+        BudgetError: with the line.
+        yaml.YAMLError: it is no YAML.
+    """
+    depth = aliases = 0
+    for count, event in enumerate(yaml.parse(text, Loader=yaml.CSafeLoader)):
+        problem = ""
+        if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
+            depth += 1
+            problem = f"lists and mappings {depth} deep" if depth > MAX_YAML_DEPTH else ""
+        elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
+            depth -= 1
+        if isinstance(event, yaml.AliasEvent) or (not max_aliases and getattr(event, "anchor", None) is not None):
+            aliases += 1
+            problem = "an anchor or alias (& or *)" if aliases > max_aliases else problem
+        if count > MAX_YAML_EVENTS:
+            problem = f"more than {MAX_YAML_EVENTS} values"
+        if problem:
+            raise BudgetError(problem + _line(event))
+
+
+def _line(event: Any) -> str:
+    return f" in line {event.start_mark.line + 1}" if event.start_mark else ""

@@ -1,0 +1,74 @@
+"""Small files that ask for hours or gigabytes are refused or read in one line, and in little memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread.bags.message_types import MessageDecoder
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.storage import MessageDefinition
+from magnetosuture_thread.errors import BagError
+from test.bags.bags import read, texts
+from test.bags.bombs import ALIASES, BOMBS, cyclic_database, metadata_bomb
+
+MAX_MEGABYTES = 300
+# VmHWM, as the greatest memory by getrusage begins with that of the process that started this one.
+CHECK = """
+import sys
+from pathlib import Path
+from magnetosuture_thread import cli
+for path in sys.argv[1:]:
+    code = cli.main(["bag", "check", path])
+    (peak,) = (line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)
+    print("RESULT", code, int(peak) // 1024, flush=True)
+"""
+
+
+def test_no_bomb_takes_more_than_it_may(tmp_path: Path):
+    """Hours without the budgets, so that the time limit needs no measure of its own."""
+    paths = []
+    for name, make in BOMBS.items():
+        (tmp_path / name).mkdir()
+        paths.append(str(make(tmp_path / name)))
+    done = subprocess.run([sys.executable, "-c", CHECK, *paths], capture_output=True, text=True, timeout=900)
+    assert "Traceback" not in done.stderr
+    results = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("RESULT")]
+    assert len(results) == len(BOMBS), done.stderr
+    assert {code for code, _ in results} <= {"0", "1"}
+    peaks = {name: int(peak) for name, (_, peak) in zip(BOMBS, results, strict=True)}
+    assert max(peaks.values()) < MAX_MEGABYTES, peaks
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding", "problem"),
+    [
+        ("geometry_msgs/Point[300000000] x\n", "ros2msg", "more than 10000 fields"),
+        ("int8 x\n" + "#" * 300_000, "ros2msg", "300007 characters"),
+        ("".join(f"int32 a{n}\n" for n in range(20_000)), "ros2msg", "steps to parse|characters"),
+    ],
+)
+def test_a_definition_past_its_budget_says_so_when_a_message_is_decoded(text: str, encoding: str, problem: str):
+    decoder = MessageDecoder(MessageDefinition("nav_msgs/msg/Path", encoding, text))
+    assert not decoder.is_ours
+    with pytest.raises(BagError, match=problem):
+        decoder.decode("/path", b"\0\1\0\0")
+
+
+def test_metadata_past_its_budget_is_not_used_and_said(tmp_path: Path):
+    bag = Bag(metadata_bomb(tmp_path / "bag", ALIASES))
+    assert read(bag) == texts(5)
+    assert bag.remarks == ["metadata.yaml is not used: has an anchor or alias (& or *) in line 3"]
+
+
+def test_each_row_of_a_broken_tree_is_read_once(tmp_path: Path):
+    bag = Bag(cyclic_database(tmp_path / "bag"))
+    found = read(bag)
+    assert bag.damage is not None
+    assert 0 < len(found) == len(set(found)) <= 4000
+    assert set(found) <= set(texts(4000))
+    assert "unverified" not in bag.notes
+    assert "any message that is read may be wrong" in bag.unverified

@@ -1,0 +1,194 @@
+"""`bag repair` neither vouches for what it cannot know nor changes what it copies."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import struct
+from array import array
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import StoragePlugin
+
+from magnetosuture_thread import cli
+from magnetosuture_thread.bags.message_types import MESSAGES, typestore
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.sanity import SanityCheck, rising
+from magnetosuture_thread.messages.building import MessageBuilder
+from test.bags.bags import STRING, cdr, read, texts, write_rosbag
+
+PATH = "nav_msgs/msg/Path"
+BINARY = bytes(range(256)) * 3
+OWN_RECORDS = ("rosbag2", "magnetosuture")
+
+
+def thread(index: int, points: list[tuple[float, float, float]]) -> tuple[str, int, bytes]:
+    """Return a message of a measured thread, stamped every 0.1 s."""
+    builder: MessageBuilder = MESSAGES
+    at = 10**9 + index * 10**8
+    message = builder.path(builder.header(at, "dish"), [builder.pose(point, (0.0, 0.0, 0.0, 1.0)) for point in points])
+    return "/thread/measured", at, bytes(typestore().serialize_cdr(message, PATH))
+
+
+def malformed(folder: Path, messages: list[tuple[str, int, bytes]], types: dict[str, str]) -> Path:
+    """Write a sqlite3 bag that is known to be malformed, with all rows in it."""
+    write_rosbag(folder, StoragePlugin.SQLITE3, messages, types)
+    with closing(sqlite3.connect(folder / f"{folder.name}.db3")) as database:
+        database.execute("UPDATE topics SET id = id")
+        database.execute("PRAGMA writable_schema=ON")
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, 'never', X'00')")
+        database.commit()
+    return folder
+
+
+def test_a_damaged_bag_without_checksums_is_refused_unless_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    line = [(0.001 * k, 0.0, 0.0) for k in range(5)]
+    good = [thread(index, line) for index in range(20)]
+    bad = list(good)
+    bad[4] = thread(4, [(1e305, 0.0, 0.0), *line])
+    bad[7] = thread(7, [(float("nan"), 0.0, 0.0), *line])
+    bad[9] = (*good[9][:2], good[9][2][:-9])
+    late = thread(3, line)[2]
+    bad[12] = (*good[12][:2], late)
+    folder = malformed(tmp_path / "bag", bad, {"/thread/measured": PATH})
+    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 1
+    error = capsys.readouterr().err
+    assert "--unverified" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "new").exists()
+
+    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new"), "--unverified"]) == 0
+    said = capsys.readouterr().out
+    for reason in ("more than 1 m away", "not finite", "does not decode", "stamp out of order"):
+        assert reason in said
+    assert "not damaged" not in said
+    new = Bag(tmp_path / "new")
+    assert read(new) == [message for index, message in enumerate(good) if index not in (4, 7, 9, 12)]
+    # The mark stays: in every check, and in a repair of the repaired bag.
+    assert new.notes["unverified"] == new.unverified != ""
+    found = tmp_path / "found.json"
+    assert cli.main(["bag", "check", str(tmp_path / "new"), "--json", str(found)]) == 1
+    shown = capsys.readouterr().out
+    assert "unverified: " in shown
+    assert "nothing is damaged" not in shown
+    assert json.loads(found.read_text())["unverified"]
+    assert cli.main(["bag", "repair", str(tmp_path / "new"), "--output", str(tmp_path / "newer")]) == 1
+    assert cli.main(["bag", "repair", str(tmp_path / "new"), "--output", str(tmp_path / "newer"), "--unverified"]) == 0
+    assert Bag(tmp_path / "newer").unverified
+
+
+def test_a_sound_bag_without_checksums_is_copied_and_stays_unchecked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(5), {"/text": STRING})
+    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 0
+    new = Bag(tmp_path / "new")
+    assert read(new) == texts(5)
+    assert "damage to it cannot be noticed" in new.unchecked
+    assert cli.main(["bag", "check", str(tmp_path / "new")]) == 0
+    assert "nothing is damaged" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("values", "kept"),
+    [
+        ([], []),
+        ([1, 2, 2, 3], [True] * 4),
+        ([1, 9, 2, 3], [True, False, True, True]),
+        ([5, 1, 2, 3], [False, True, True, True]),
+        ([1, 2, 0, 3], [True, True, False, True]),
+    ],
+)
+def test_what_is_out_of_order_is_left_out(values: list[int], kept: list[bool]):
+    assert rising(array("q", values)) == kept
+
+
+def test_every_message_of_the_examples_is_sane():
+    for name in ("post_wrap", "hernia_steering"):
+        bag = Bag(Path(__file__).parents[2] / "examples" / name)
+        check = SanityCheck(bag)
+        assert {problem for item in bag.stored() if (problem := check.problem(item))} == set()
+
+
+def foreign(path: Path, packed: bytes) -> Path:
+    """Write an mcap file with everything that our own recordings do not have."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start("ros2")
+        schema = writer.register_schema("pkg.Thing", "protobuf", BINARY)
+        channel = writer.register_channel("/thing", "protobuf", schema)
+        writer.add_attachment(7, 8, "photo.bin", "application/octet-stream", BINARY)
+        writer.add_metadata("lab", {"operator": "nobody"})
+        for index in range(5):
+            writer.add_message(channel, 100 + index, packed + bytes([index]), 50 + index, 1000 + 3 * index)
+        writer.finish()
+    return path
+
+
+def content(path: Path) -> dict[str, Any]:
+    """Return all of an mcap file but how it is stored, by the package `mcap`."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        found = [
+            (schema.name if schema else "", schema.encoding if schema else "", schema.data if schema else b"", message)
+            for schema, _, message in reader.iter_messages()
+        ]
+        return {
+            "schemas": {each[:3] for each in found},
+            "messages": [(m.log_time, m.publish_time, m.sequence, m.data) for *_, m in found],
+            "attachments": list(reader.iter_attachments()),
+            "metadata": [
+                record for record in reader.iter_metadata() if record.name not in ("rosbag2", "magnetosuture")
+            ],
+        }
+
+
+@pytest.mark.parametrize("packed", [b"", b"\x28\xb5\x2f\xfd"])
+def test_bytes_stay_bytes(tmp_path: Path, packed: bytes, capsys: pytest.CaptureFixture[str]):
+    path = foreign(tmp_path / "a.mcap", packed)
+    assert cli.main(["bag", "repair", str(path), "--output", str(tmp_path / "new")]) == 0
+    assert "is not damaged: the new bag holds the same" in capsys.readouterr().out
+    assert content(tmp_path / "new" / "new_0.mcap") == content(path)
+    assert Bag(tmp_path / "new").damage is None
+
+
+def test_what_nothing_vouches_for_is_not_kept_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = foreign(tmp_path / "a.mcap", b"")
+    data = bytearray(path.read_bytes())
+    place = data.index(b"photo.bin") + 200
+    data[place] ^= 1
+    path.write_bytes(data)
+    assert cli.main(["bag", "repair", str(path), "--output", str(tmp_path / "new")]) == 0
+    said = capsys.readouterr().out
+    assert "not kept: 1 of this: corrupt or oversized attachment" in said
+    assert "not damaged" not in said
+
+
+def test_files_that_metadata_does_not_list_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.MCAP, texts(5), {"/text": STRING})
+    (folder / "other.mcap").write_bytes(b"whatever")
+    assert Bag(folder).remarks == ["other.mcap is not read: metadata.yaml does not list it"]
+    assert cli.main(["bag", "check", str(folder)]) == 0
+    assert "other.mcap is not read" in capsys.readouterr().out
+
+
+def test_a_topic_of_which_no_message_can_be_used_is_not_marked_as_taken(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    garbage = b"\0\1\0\0" + struct.pack("<iII", 1, 0, 5) + b"dish\0"
+    messages = [("/thread/measured", 10**9 + n, garbage + bytes(3) + b"\xff\xff\xff\x7f") for n in range(3)]
+    messages += [("/text", 10**9, cdr(STRING, "a"))]
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.MCAP, messages, {"/thread/measured": PATH, "/text": STRING})
+    assert cli.main(["bag", "check", str(folder)]) == 0
+    shown = capsys.readouterr().out
+    assert "/thread/measured *" not in shown
+    assert "none of the messages on /thread/measured can be used" in " ".join(shown.split())
+    assert np.isfinite(Bag(folder).duration)
