@@ -18,6 +18,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.safety.filter import STUCK, rest_reason
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.texts import shortened
 
 Vector = NDArray[np.float64]
 
@@ -29,7 +30,8 @@ MAX_STEP_PERIODS = 2.0  # over which velocity and currents may change in one ste
 MAX_CORRECTIONS = 4  # of the drift that the coils add to a velocity towards the wall
 MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
 RETRY_DELAY = 0.1  # s until a blocked command is tried again
-NO_SCENE = "no scene"
+NO_CURRENT = 1e-4  # A; with less in each coil the needle is at rest, which needs a reason
+NO_SCENE, NO_POSE = "no scene", "no needle pose"
 NO_PREDICTION, CURRENT_LIMIT = "no prediction", "current"  # constraints of the bridge, besides those of the filter
 
 
@@ -132,7 +134,7 @@ class CoilBridge:
         self._losses = 0
         self._previous = self._coils.zero()
         self._velocity = np.zeros(2)
-        self._last_step = -math.inf
+        self._last_step, self._was_armed = -math.inf, False
         self._stopped: float | None = None
         self._blocked, self._blocked_reason = -math.inf, ""
         self.set_scene(scene)
@@ -159,6 +161,7 @@ class CoilBridge:
             ConfigurationError: the needle has no room in it; the previous scene stays.
         """
         self._filter = None if scene is None else self._settings.safety_filter(scene)
+        self._last_step = -math.inf  # it took its time, before which the coils were set to zero
         self.extrapolator.dish_radius = math.inf if scene is None else scene.dish.radius
 
     def command(self, source: str, velocity: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
@@ -207,15 +210,23 @@ class CoilBridge:
         try:
             return self._step(now, arrival, driver)
         except Exception as error:  # After any error in here, the coils go to zero and stay there.
-            self.latch.trip(f"internal error: {type(error).__name__}: {error}")
+            self.latch.trip(f"internal error: {type(error).__name__}: {shortened(str(error))}")
             return self._zero_output(now, arrival, _SelectedInput(), (self.latch.stop_reason,))
 
+    def final_output(self, reason: str) -> BridgeOutput:
+        """Return the zeros with which the bridge ends, for a reason."""
+        self._clear()
+        return self._output(_SelectedInput(), (reason,), True, (), 1.0)
+
     def _step(self, now: float, arrival: float, driver: DriverState) -> BridgeOutput:
-        if self.latch.armed and not (driver.ready and driver.losses == self._losses):
-            self.latch.trip(f"driver: {driver.problem or 'currents were lost for a moment'}")
         period = 1.0 / self._settings.rate
         interval = arrival - self._last_step
-        self._last_step = arrival
+        if self.latch.armed and not (driver.ready and driver.losses == self._losses):
+            self.latch.trip(f"driver: {driver.problem or 'currents were lost for a moment'}")
+        elif self._was_armed and driver.timeout < interval < math.inf:
+            # The needle has gone on and come to rest as nobody knows, which a person must look at.
+            self.latch.trip(f"the bridge stood still for {interval:.2f} s: the coils stopped by themselves")
+        self._last_step, self._was_armed = arrival, self.latch.armed
         if interval > self._hold:
             self._clear()  # the driver has gone to zero by itself
         elapsed = min(max(interval, 0.0), MAX_STEP_PERIODS * period)
@@ -227,6 +238,7 @@ class CoilBridge:
         reasons = self._stop_reasons(arrival, then, driver, selected, no_prediction)
         active: tuple[str, ...] = (NO_PREDICTION,) if no_prediction else ()
         if reasons or pose is None or self._filter is None:
+            reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
             return self._zero_output(now, arrival, selected, reasons, active)
         if not selected.velocity.any():
             output = replace(self._zero_output(now, arrival, selected, ()), publish=True)
@@ -251,7 +263,8 @@ class CoilBridge:
         active += tuple(
             name for name in (limiting, CURRENT_LIMIT if allocation.saturated else "") if name and name not in active
         )
-        if math.hypot(*allocation.velocity) <= STUCK * math.hypot(*filtered.filtered):
+        is_stuck = math.hypot(*allocation.velocity) <= STUCK * math.hypot(*filtered.filtered)
+        if is_stuck or np.abs(allocation.currents).max() < NO_CURRENT:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)

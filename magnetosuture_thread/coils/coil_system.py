@@ -11,11 +11,13 @@ from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import CoilDriver, DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.coils.stop_record import RecordedState, StopRecord
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.scene import Scene
 
 MAX_INTERVALS = 2000  # that the statistics of the loop are over
-UNCONFIGURED_DRIVER = DriverState(False, "unconfigured")
+UNCONFIGURED, FINALIZED = "unconfigured", "finalized"
+UNCLEAN_END = "the bridge ended while armed or in fault, and not in order"
 
 
 class LoopTiming:
@@ -56,9 +58,13 @@ class CoilSystem:
         driver: the last that was opened.
         output: of the last step; None while unconfigured.
         timing: of the watchdog's loop.
+        closed: why there is no bridge, while there is none.
+
+    Args:
+        record: of the latch, over a restart; none if None.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, record: StopRecord | None = None) -> None:
         self.latch = ArmingLatch()
         # Loads the compiled functions, so that no step and no transition waits for a compiler.
         CoilBridge(CoilBridgeSettings(), self.latch, Scene())
@@ -66,6 +72,8 @@ class CoilSystem:
         self.driver: CoilDriver | None = None
         self.output: BridgeOutput | None = None
         self.timing = LoopTiming(1.0)
+        self.closed = UNCONFIGURED
+        self._record = record
         self._driver_name = "none"
         self._auto_arm = False
 
@@ -77,7 +85,44 @@ class CoilSystem:
     @property
     def driver_state(self) -> DriverState:
         """State of the driver."""
-        return UNCONFIGURED_DRIVER if self.bridge is None or self.driver is None else self.driver.state()
+        return DriverState(False, self.closed) if self.bridge is None or self.driver is None else self.driver.state()
+
+    @property
+    def closed_reasons(self) -> tuple[str, ...]:
+        """Why the currents are zero while there is no bridge."""
+        latched = self.latch.latched_reason
+        return (latched,) if latched and self.closed == UNCONFIGURED else tuple(filter(None, (latched, self.closed)))
+
+    def recall(self, record: StopRecord) -> None:
+        """Latch what a record holds of the process before, and keep the latch in it from now on."""
+        self._record = record
+        found = record.read()
+        if found is RecordedState.STOPPED:
+            self.latch.stop()
+        elif found is RecordedState.ARMED and not self.latch.armed:
+            self.latch.trip(UNCLEAN_END)
+
+    def remember(self, *, ends: bool = False) -> None:
+        """Write what must outlive this process: an emergency stop, and that it has not ended in order.
+
+        Args:
+            ends: whether it ends now, in order.
+
+        Raises:
+            InvalidInputError: the file cannot be written.
+        """
+        if self._record is None:
+            return
+        if self.latch.emergency:
+            state = RecordedState.STOPPED
+        else:
+            state = RecordedState.ARMED if (self.latch.armed or self.latch.fault) and not ends else RecordedState.SAFE
+        try:
+            self._record.write(state)
+        except (OSError, ValueError) as error:
+            problem = f"{self._record.path} ({getattr(error, 'strerror', None) or error})"
+            field = f"{CoilBridgeSettings.GROUP}.stop_file"
+            raise InvalidInputError(field, problem, "a file that can be written") from None
 
     def open(self, settings: CoilBridgeSettings, bridge: CoilBridge, driver: CoilDriver) -> None:
         """Open a driver; from now on each step applies currents, zero at first."""
@@ -89,16 +134,26 @@ class CoilSystem:
         """Arm automatically, once, as soon as the driver is ready; any switch or fault before cancels that."""
         self._auto_arm = True
 
-    def close(self) -> None:
-        """Set the coils to zero and close the driver."""
+    def close(self, reason: str = UNCONFIGURED) -> BridgeOutput | None:
+        """Set the coils to zero and close the driver.
+
+        Args:
+            reason: why there is no bridge from now on.
+
+        Returns:
+            The zeros with which it ends; None if there was no bridge.
+        """
+        final = None if self.bridge is None else self.bridge.final_output(reason)
         self.bridge = self.output = None
+        self.closed = reason
         self._auto_arm = False
         self._driver_name = "none"
         if self.driver is not None:
             self.driver.close()
+        return final
 
     def arm(self, armed: bool) -> None:
-        """Arm, so that later commands are followed, or disarm.
+        """Arm, so that later commands are followed, which is recorded before; or disarm, which is left to `remember`.
 
         Raises:
             InvalidInputError: see `ArmingLatch.arm`; or the bridge is not configured.
@@ -106,27 +161,38 @@ class CoilSystem:
         self._auto_arm = False
         if not armed:
             self.latch.disarm()
-        elif self.bridge is None:
+            return
+        if self.bridge is None:
             raise InvalidInputError("arm", "an unconfigured bridge", "an active one")
-        else:
-            self.bridge.arm(self.driver_state)
+        self.bridge.arm(self.driver_state)
+        try:
+            self.remember()
+        except InvalidInputError:
+            self.latch.disarm()
+            raise
 
     def reset(self) -> None:
         """Clear the emergency stop and faults; the bridge stays disarmed.
 
         Raises:
-            InvalidInputError: the driver is not ready.
+            InvalidInputError: the driver is not ready, or the record of the stop cannot be cleared.
         """
         self._auto_arm = False
+        emergency, fault = self.latch.emergency, self.latch.fault
         if self.bridge is None:
             self.latch.reset("")
         else:
             self.bridge.reset(self.driver_state)
+        try:
+            self.remember()
+        except InvalidInputError:
+            self.latch.emergency, self.latch.fault = emergency, fault
+            raise
 
     def zero(self) -> None:
         """Apply zero currents, unconditionally."""
         if self.driver is not None and self.output is not None:
-            self.driver.apply(np.zeros_like(self.output.allocation.currents))
+            self.driver.apply(np.zeros_like(self.output.allocation.currents), math.inf)
 
     def step(self, now: float, arrival: float) -> BridgeOutput | None:
         """Compute the coil currents and apply them; None while unconfigured.
@@ -140,7 +206,10 @@ class CoilSystem:
         state = self.driver.state()
         self._auto_arm = self._auto_arm and self.latch.ready_to_arm
         if self._auto_arm and state.ready and self.bridge.scene is not None:
-            self.arm(True)
+            try:
+                self.arm(True)
+            except InvalidInputError as error:
+                self.latch.trip(str(error))
         self.output = self.bridge.step(now, arrival, state)
-        self.driver.apply(self.output.allocation.currents)
+        self.driver.apply(self.output.allocation.currents, arrival)
         return self.output

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.untrusted import MAX_TABLE_BYTES
 
 COLUMNS = ("coil", "current", "x", "y", "bx", "by")
 # Values out of these bounds are assumed to have another unit.
@@ -56,7 +58,7 @@ def read_measurements(path: Path) -> ProbeMeasurements:
         InvalidInputError: the file is unreadable, or a line is invalid; with its number.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise InvalidInputError(str(path), reason, "a readable CSV file") from None

@@ -37,6 +37,11 @@ class CoilBridgeSettings(Configuration):
         "state that the node enters by itself at start; armed only with a driver without hardware",
         choices=("unconfigured", "inactive", "active", "armed"),
     )
+    stop_file: str = quantity(
+        "",
+        "file that keeps the emergency stop over a restart, one for each bridge; empty: a name of its own in "
+        "$XDG_STATE_HOME/magnetosuture or ~/.local/state/magnetosuture",
+    )
     driver: str = quantity(
         "recording",
         "sink of the currents: recording keeps them, simulated sends them to rig_simulator, roboclaw is hardware",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.texts import shortened
 
 Vector = NDArray[np.float64]
 
@@ -186,7 +187,7 @@ class PredictionMonitor:
             raise InvalidInputError("thread/margins.slowdown", slowdown, "a factor from 0 to 1")
         if not math.isfinite(stamp):
             raise InvalidInputError("thread/margins.header.stamp", stamp, "a time [s]")
-        self._last_arrival, self._version = arrival, scene_version
+        self._last_arrival, self._version = arrival, shortened(scene_version)
         if valid:
             self._stamp, self._arrival, self._slowdown = stamp, arrival, slowdown
 

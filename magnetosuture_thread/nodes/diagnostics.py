@@ -7,8 +7,10 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from magnetosuture_thread.nodes.topics import DIAGNOSTICS
+from magnetosuture_thread.texts import shortened
 
 PERIOD = 1.0  # s
+MAX_TEXT_CHARS = 400  # of a status or a value, whatever is in it
 
 
 class Health:
@@ -56,11 +58,11 @@ class Health:
     def refuse(self, problem: Exception, **values: object) -> None:
         """Say that an input was refused; the node itself goes on. An error that it has said before stays said."""
         self._refused += 1
-        self._last_refusal = str(problem)
+        self._last_refusal = shortened(str(problem), MAX_TEXT_CHARS)
         if self._level == DiagnosticStatus.ERROR:
             self._values.update(values)
         else:
-            self._set(DiagnosticStatus.WARN, f"refused: {problem}", values)
+            self._set(DiagnosticStatus.WARN, f"refused: {self._last_refusal}", values)
 
     def publish(self) -> None:
         """Publish the state now."""
@@ -70,7 +72,7 @@ class Health:
             name=f"{self._node.get_fully_qualified_name().lstrip('/')}: state",
             message=self._text,
             hardware_id="magnetosuture",
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+            values=[KeyValue(key=key, value=shortened(str(value), MAX_TEXT_CHARS)) for key, value in values.items()],
         )
         stamp = self._node.get_clock().now().to_msg()
         message = DiagnosticArray(status=[status])
@@ -79,6 +81,7 @@ class Health:
         self._sent = self._clock.now().nanoseconds * 1e-9
 
     def _set(self, level: bytes, text: str, values: dict[str, object]) -> None:
+        text = shortened(text, MAX_TEXT_CHARS)
         changed = (level, text) != (self._level, self._text)
         self._level, self._text = level, text
         self._values.update(values)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.configuration import ROS_PARAMETERS, Configuration
 from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 
@@ -23,7 +24,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 ERROR = TransitionCallbackReturn.ERROR
 
 
-class ManagedNode(LifecycleNode, Generic[C]):
+class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     """A lifecycle node with the states of ROS 2: unconfigured, inactive, active, finalized.
 
     Args:
@@ -37,12 +38,14 @@ class ManagedNode(LifecycleNode, Generic[C]):
     """
 
     def __init__(self, name: str, settings: type[C], **options: Any) -> None:
+        self.settings: C | None = None
         super().__init__(name, **node_options(name, options))
         self._class = settings
-        self.settings: C | None = None
         self.problem: Exception | None = None
+        # All can be set before the node is configured, which then says which of them are invalid.
+        with suppress(ConfigurationError):
+            declare(self, settings, read_only=False)
         self.add_on_set_parameters_callback(self._keep)
-        self._guard_transitions()
 
     @abstractmethod
     def begin(self, settings: C) -> None:
@@ -65,6 +68,15 @@ class ManagedNode(LifecycleNode, Generic[C]):
         """The state's name in ROS."""
         return str(self._state_machine.current_state[1])
 
+    @property
+    def clock_is_fixed(self) -> bool:
+        """Whether the node keeps the clock that it has: while it is configured."""
+        return self.settings is not None
+
+    def may_start(self) -> bool:
+        """Return whether the node may become active by itself at its start."""
+        return True
+
     def require(self, go: Callable[[], TransitionCallbackReturn]) -> None:
         """Make a transition.
 
@@ -85,7 +97,7 @@ class ManagedNode(LifecycleNode, Generic[C]):
             return
         try:
             self.require(self.trigger_configure)
-            if self.get_parameter("autostart").value != "inactive":
+            if self.get_parameter("autostart").value != "inactive" and self.may_start():
                 self.require(self.trigger_activate)
         except Exception:
             self.destroy_node()
@@ -138,9 +150,17 @@ class ManagedNode(LifecycleNode, Generic[C]):
         """After an unexpected error, release everything; the node can be configured again."""
         return self.on_shutdown(state)
 
+    def finish(self) -> None:
+        """Shut down by the lifecycle, so that everything is given back while the graph is still there."""
+        if self.stage != "finalized":
+            self.trigger_shutdown()
+
     def destroy_node(self) -> None:
-        """Leave the graph at once."""
-        super().destroy_node()
+        """Give all back, and leave the graph at once."""
+        try:
+            self.end()
+        finally:
+            super().destroy_node()
         # rclpy forgets it, and it keeps the node in the graph until garbage is collected.
         self._state_machine.destroy_when_not_in_use()
 
@@ -156,18 +176,3 @@ class ManagedNode(LifecycleNode, Generic[C]):
             return SetParametersResult(successful=True)
         error = ConfigurationError(held[0], "a change while configured", "a cleaned-up node")
         return SetParametersResult(successful=False, reason=str(error))
-
-    def _guard_transitions(self) -> None:
-        """Answer a transition that is not possible now by "no": rclpy would end the node."""
-        service = self._service_change_state
-        change = service.callback
-
-        def guarded(request: Any, response: Any) -> Any:
-            try:
-                return change(request, response)
-            except rclpy_implementation.RCLError as error:
-                self.get_logger().warning(f"transition {request.transition.id} refused: {error}")
-                response.success = False
-                return response
-
-        service.callback = guarded

@@ -1,4 +1,4 @@
-"""Messages of rclpy: built as everywhere, and decoded."""
+"""Messages of rclpy, built as everywhere, and what is read of their bytes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped
-from magnetosuture_msgs.msg import CoilCurrents
 from rclpy.serialization import deserialize_message
 
-from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.messages.building import MessageBuilder
 from magnetosuture_thread.messages.reading import nanoseconds
-from magnetosuture_thread.nodes.topics import Topic
+from magnetosuture_thread.nodes import topics
 
 
 @cache
@@ -37,19 +35,6 @@ MESSAGES = MessageBuilder(_make, _numbers)
 """Builds messages of rclpy."""
 
 
-def decoded(topic: Topic, data: bytes) -> Any:
-    """Return a message that came as bytes.
-
-    Raises:
-        InvalidInputError: they are cut off, or those of another definition of the type.
-    """
-    try:
-        return deserialize_message(data, topic.message)
-    except RuntimeError:  # rclpy's own kind of it is private
-        wanted = f"a {topic.channel.type_name} of our definition"
-        raise InvalidInputError(topic.channel.name, f"{len(data)} bytes", wanted) from None
-
-
 def serialised_velocity(data: bytes) -> np.ndarray:
     """Return the velocity of a serialised stamped twist, shape (2,) [m/s]."""
     linear = deserialize_message(data, TwistStamped).twist.linear
@@ -58,4 +43,4 @@ def serialised_velocity(data: bytes) -> np.ndarray:
 
 def command_stamp(data: bytes) -> int | None:
     """Return the stamp of the command that serialised currents follow [ns]; None if they follow none."""
-    return nanoseconds(deserialize_message(data, CoilCurrents).command) or None
+    return nanoseconds(topics.CURRENTS.decode(data).command) or None

@@ -6,21 +6,20 @@ import sys
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.node import Node
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 
 
-class PathFollowerNode(Node):
+class PathFollowerNode(PackageNode):
     """Publishes a velocity command for every needle pose; without poses the coil bridge times out."""
 
     def __init__(self, **options: Any) -> None:
@@ -31,12 +30,11 @@ class PathFollowerNode(Node):
         if scene is not None:
             settings.check_path(scene)
         self._blocked = ""  # reason why the path cannot be followed
-        self._health = Health(self)
-        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
+        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
         self._commands = topics.NEEDLE_COMMAND.publisher(self)
         self._setpoints = topics.TIP_SETPOINT.publisher(self)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
-        self._health.warn("no needle pose yet", progress=0.0)
+        self.health.warn("no needle pose yet", progress=0.0)
 
     def on_scene(self, scene: Scene) -> None:
         """Check the path against a new scene; a blocked path is not followed further."""
@@ -50,24 +48,24 @@ class PathFollowerNode(Node):
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Publish the velocity command that moves the tip along its path."""
         if self._blocked:
-            self._health.error(self._blocked)
+            self.health.error(self._blocked)
             return
         subscribers = self._commands.get_subscription_count()
         if subscribers < self._settings.audience:
             some = f"{subscribers} of {self._settings.audience} subscribers to velocity commands"
-            self._health.warn(some if subscribers else "no subscriber to velocity commands")
+            self.health.warn(some if subscribers else "no subscriber to velocity commands")
             return
         try:
             pose = reading.needle_pose(message)
             command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
         except InvalidInputError as error:
-            self._health.refuse(error)
+            self.health.refuse(error)
             return
         self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), command.velocity))
         if 0.0 < command.progress < 1.0:
             self._setpoints.publish(MESSAGES.placed(message.header.stamp, command.tip, 0.0))
         text = "done" if command.progress >= 1.0 else "following" if command.progress else "settling"
-        self._health.ok(text, progress=round(command.progress, 4))
+        self.health.ok(text, progress=round(command.progress, 4))
 
 
 def main(arguments: list[str] | None = None) -> int:

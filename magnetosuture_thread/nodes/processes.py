@@ -113,7 +113,9 @@ class NodeProcesses:
     def __init__(self, names: Sequence[str], arguments: Sequence[str], environment: dict[str, str], logs: Path) -> None:
         self._names = names
         self._arguments = arguments
-        self._environment = environment
+        # What a node keeps over a restart is of this run: an emergency stop of another one does not hold here.
+        self._state = tempfile.TemporaryDirectory(prefix="magnetosuture_state_")
+        self._environment = {**environment, "XDG_STATE_HOME": self._state.name}
         self._logs = logs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -188,6 +190,7 @@ class NodeProcesses:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        self._state.cleanup()
 
 
 _LIBC = ctypes.CDLL(None)

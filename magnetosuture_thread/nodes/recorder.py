@@ -5,15 +5,16 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
-from rosgraph_msgs.msg import Clock
 
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.interface import DIAGNOSTICS
+from magnetosuture_thread.messages.reading import clock_nanoseconds
+from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.topics import CLOCK, Topic
 
 DEPTH = 1000  # messages that may wait before any is lost
@@ -52,7 +53,7 @@ class Recorder:
         self.status_texts: dict[str, tuple[str, dict[str, str]]] = {}
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain, args=[])
-        self._node = rclpy.create_node("recorder", context=self._context)
+        self._node = GuardedNode("recorder", context=self._context, start_parameter_services=False)
         followed = (CLOCK, *taken) if simulated_clock else taken
         self._subscriptions = [
             (topic, self._node.create_subscription(topic.message, topic.name, _never, self._quality(topic), raw=True))
@@ -81,15 +82,16 @@ class Recorder:
 
     def _take(self, topic: Topic, data: bytes, arrived: int) -> None:
         if topic is CLOCK:
-            clock = deserialize_message(data, Clock).clock
-            self._now = clock.sec * 1_000_000_000 + clock.nanosec
+            with suppress(InvalidInputError):  # no time at all
+                self._now = clock_nanoseconds(CLOCK.decode(data))
             return
         self.taken[topic.channel.recorded] += 1
         self._receive(topic.channel.recorded, arrived if self._now is None else self._now, data)
         if topic.channel is DIAGNOSTICS:
-            for status in deserialize_message(data, DiagnosticArray).status:
-                values = {value.key: value.value for value in status.values}
-                self.status_texts[status.name.split(":")[0]] = (status.message, values)
+            with suppress(InvalidInputError):
+                for status in topic.decode(data).status:
+                    values = {value.key: value.value for value in status.values}
+                    self.status_texts[status.name.split(":")[0]] = (status.message, values)
 
     def _quality(self, topic: Topic) -> QoSProfile:
         """Return the topic's own quality of service, with a longer queue."""

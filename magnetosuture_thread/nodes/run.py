@@ -7,21 +7,28 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 import rclpy
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
 from magnetosuture_thread import MagnetosutureError
+from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.parameter_files import init
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+DELIVERY_TIMEOUT = 0.2  # s for the last messages of all nodes to be acknowledged
 
 
 class Interruption:
@@ -103,10 +110,61 @@ def raise_priority(priority: int, process: int | None = None) -> str:
 N = TypeVar("N", bound="Node | tuple[Node, ...]")
 
 
+def end_signals() -> tuple[signal.Signals, ...]:
+    """Return the signals that end a node in order; not SIGHUP where nohup ignores it.
+
+    What a shell runs in the background ignores SIGINT, but a node's parent ends it by that.
+    """
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return tuple(which for which in STOPS if which is not signal.SIGHUP or not ignored)
+
+
+class _Ending(Future):
+    """Done when a signal has asked the process to end: amid its start by a KeyboardInterrupt, later between callbacks.
+
+    rclpy's own handlers would take the nodes out of the graph at once, before they can publish their last.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._asked = self._deferred = False
+        for which in end_signals():
+            signal.signal(which, self._on_signal)
+
+    def done(self) -> bool:
+        """Return whether the process is to end."""
+        return self._asked
+
+    def add_done_callback(self, callback: Callable[..., None]) -> None:
+        """Leave a callback out: an executor adds one in each turn, and `defer` wakes it."""
+
+    def defer(self, executor: SingleThreadedExecutor) -> None:
+        """From now on raise nothing, and wake an executor instead: Python runs no handler while it waits."""
+        woken, written = os.pipe2(os.O_CLOEXEC)
+        os.set_blocking(written, False)
+        signal.set_wakeup_fd(written, warn_on_full_buffer=False)
+
+        def wake() -> None:
+            while os.read(woken, 1):
+                with suppress(Exception):  # it is gone already
+                    executor.wake()
+
+        threading.Thread(target=wake, name="signals", daemon=True).start()
+        self._deferred = True
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        # Amid a message that rclpy's library makes in Python, a KeyboardInterrupt would come out as another error.
+        again, self._asked = self._asked, True
+        if not self._deferred and not again:
+            raise KeyboardInterrupt
+
+
 def run(
     make: Callable[[], N], arguments: Sequence[str] | None = None, made: Callable[[N], None] = lambda node: None
 ) -> int:
-    """Run a node, or several in one process, until it is interrupted.
+    """Run a node, or several in one process, until it is interrupted, terminated or hung up.
+
+    A node then says its last while the graph is still there: see `GuardedNode.finish`.
 
     Args:
         make: makes the node, or all of them.
@@ -116,24 +174,15 @@ def run(
     Returns:
         0 when it was asked to end, 1 when it could not start.
     """
-    spins = False
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        # rclpy hears the signal first, and ends the executor. A KeyboardInterrupt as well, amid a message that its
-        # library makes in Python, would come out as another error.
-        if not spins:
-            raise KeyboardInterrupt
-
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, interrupt)
-    try:
-        init(arguments)
-    except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        return 1
     nodes: tuple[Node, ...] = ()
     executor = None
     try:
+        ended = _Ending()
+        try:
+            init(arguments, signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
+            print(f"error: {_one_line(error)}", file=sys.stderr)
+            return 1
         result = make()
         nodes = result if isinstance(result, tuple) else (result,)
         made(result)
@@ -144,8 +193,9 @@ def run(
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
-        spins = True
-        executor.spin()
+        ended.defer(executor)
+        executor.spin_until_future_complete(ended)
+        _finish(nodes)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except rclpy_implementation.RCLError:
@@ -167,6 +217,19 @@ def run(
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _finish(nodes: tuple[Node, ...]) -> None:
+    """Let nodes say their last, and give the middleware the time to deliver it."""
+    if not rclpy.ok():
+        return
+    for node in nodes:
+        if isinstance(node, GuardedNode):
+            node.finish()
+    until = time.monotonic() + DELIVERY_TIMEOUT
+    for node in nodes:
+        for publisher in node.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=max(0.0, until - time.monotonic())))
 
 
 def _one_line(error: Exception) -> str:

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rclpy.node import Node
-
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene, read_scene
+from magnetosuture_thread import MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
-from magnetosuture_thread.nodes.messages import decoded
-
-MAX_MESSAGE_BYTES = 1 << 19  # of 10,000 vertices; what is larger is not even read
+from magnetosuture_thread.nodes.node import PackageNode
 
 
 def initial_scene(name: str) -> Scene | None:
@@ -42,7 +38,11 @@ class SceneFollower:
     """
 
     def __init__(
-        self, node: Node, health: Health, scene: Scene | None, changed: Callable[[Scene], None] = lambda scene: None
+        self,
+        node: PackageNode,
+        health: Health,
+        scene: Scene | None,
+        changed: Callable[[Scene], None] = lambda scene: None,
     ) -> None:
         self.scene = scene
         self._heard = False
@@ -84,6 +84,4 @@ def received_scene(data: bytes) -> Scene:
     Raises:
         InvalidInputError: they are too many, cut off, or say no scene as it was sent.
     """
-    if len(data) > MAX_MESSAGE_BYTES:
-        raise InvalidInputError(topics.SCENE.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}")
-    return parse_scene_message(decoded(topics.SCENE, data))
+    return parse_scene_message(topics.SCENE.decode(data))

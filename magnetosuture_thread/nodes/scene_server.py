@@ -7,26 +7,24 @@ from collections.abc import Callable
 from typing import Any
 
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
-from rclpy.node import Node
 
 from magnetosuture_thread import MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
 
 
-class SceneServerNode(Node):
+class SceneServerNode(PackageNode):
     """Publishes the scene whenever it changes; an invalid change is refused with its reason and changes nothing."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(SCENE_SERVER, automatically_declare_parameters_from_overrides=True, **options)
         settings = declare(self, SceneServerSettings)
         self._editor = SceneEditor(read_scene(settings.scene) if settings.scene else None)
-        self._health = Health(self)
         self._scenes = topics.SCENE.publisher(self)
         self._markers = topics.SCENE_MARKERS.publisher(self)
         self._offer(LoadScene, LOAD_SCENE, lambda asked: self._editor.load(asked.file))
@@ -34,7 +32,7 @@ class SceneServerNode(Node):
         self._offer(EditShape, REPLACE_SHAPE, lambda asked: self._editor.replace(asked.name, asked.shape))
         self._offer(RemoveShape, REMOVE_SHAPE, lambda asked: self._editor.remove(asked.name))
         if self._editor.scene is None:
-            self._health.warn(f"no scene yet: the parameter scene is empty, and nobody has called {LOAD_SCENE}")
+            self.health.warn(f"no scene yet: the parameter scene is empty, and nobody has called {LOAD_SCENE}")
         else:
             self._publish(self._editor.scene)
 
@@ -48,7 +46,7 @@ class SceneServerNode(Node):
             change()
         except MagnetosutureError as error:
             answer.success, answer.message = False, str(error)
-            self._health.refuse(error)
+            self.health.refuse(error)
         else:
             answer.success = True
         after = self._editor.scene
@@ -64,7 +62,7 @@ class SceneServerNode(Node):
         self._markers.publish(MESSAGES.scene_markers(stamp, scene))
         count = len(scene.shapes)
         text = f"scene {scene.version}: dish of {1e3 * scene.dish.diameter:g} mm, {count} shape{'s' * (count != 1)}"
-        self._health.ok(text, version=scene.version, shapes=", ".join(scene.names) or "none")
+        self.health.ok(text, version=scene.version, shapes=", ".join(scene.names) or "none")
         self.get_logger().info(text)
 
 

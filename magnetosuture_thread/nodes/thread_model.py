@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.node import Node
 
 from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Prediction, Scene
 from magnetosuture_thread.configuration import configuration_fields
@@ -23,13 +22,11 @@ from magnetosuture_thread.model.session import WAITING, PredictionResult, Thread
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
-from magnetosuture_thread.nodes.messages import decoded
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
-
-MAX_MESSAGE_BYTES = 1 << 18  # bytes of a message; what is larger is not even read
 
 
 class ThreadSettings:
@@ -43,7 +40,7 @@ class ThreadSettings:
         health: where a message is said to be refused; who calls a service is told.
     """
 
-    def __init__(self, node: Node, session: ThreadSession, health: Health) -> None:
+    def __init__(self, node: PackageNode, session: ThreadSession, health: Health) -> None:
         self._node, self._session, self._health = node, session, health
         self._names = [about.name for about in configuration_fields(ThreadModelSettings)]
         self._parameters = Changeable(node, session.settings, self._prepare)
@@ -52,11 +49,7 @@ class ThreadSettings:
     def on_material(self, data: bytes) -> None:
         """Apply a ThreadMaterial message, or report why it is refused."""
         try:
-            if len(data) > MAX_MESSAGE_BYTES:
-                raise InvalidInputError(
-                    topics.MATERIAL.channel.name, f"{len(data)} bytes", f"at most {MAX_MESSAGE_BYTES}"
-                )
-            self._parameters.set(parse_material(decoded(topics.MATERIAL, data)))
+            self._parameters.set(parse_material(topics.MATERIAL.decode(data)))
         except MagnetosutureError as error:
             self._health.refuse(error)
 
@@ -73,7 +66,7 @@ class ThreadSettings:
         return change
 
 
-class ThreadModelNode(Node):
+class ThreadModelNode(PackageNode):
     """Predicts the thread at every needle pose.
 
     Args:
@@ -85,17 +78,16 @@ class ThreadModelNode(Node):
         super().__init__("thread_model", **node_options("thread_model", options))
         settings = declare(self, ThreadModelSettings, read_only=False, fixed=FIXED)
         self.get_logger().info("loading the model's kernels; the first start on a machine compiles them")
-        self._health = Health(self)
         scene = initial_scene(settings.scene)
         self._session = ThreadSession(settings, scene)
-        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
-        self._settings = ThreadSettings(self, self._session, self._health)
+        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
+        self._settings = ThreadSettings(self, self._session, self.health)
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         if listens:
             self.listen()
-        self._health.warn("no needle pose yet")
+        self.health.warn("no needle pose yet")
         where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
         self.get_logger().info(
             f"ready: {settings.segments} segments of {settings.material}, {where}, "
@@ -127,7 +119,7 @@ class ThreadModelNode(Node):
         try:
             outcome = self._session.on_pose(reading.nanoseconds(stamp), pose())
         except InvalidInputError as error:
-            self._health.refuse(error)
+            self.health.refuse(error)
             return
         self._report(outcome, time.perf_counter() - began)
 
@@ -141,9 +133,9 @@ class ThreadModelNode(Node):
         if not self._session.needs_measured_thread(stamp):
             return
         try:
-            centreline = reading.path_points(decoded(topics.MEASURED_THREAD, data))
+            centreline = reading.path_points(topics.MEASURED_THREAD.decode(data))
         except InvalidInputError as error:
-            self._health.refuse(error)
+            self.health.refuse(error)
             return
         self._start(stamp, centreline)
 
@@ -162,10 +154,10 @@ class ThreadModelNode(Node):
         if outcome.prediction is not None:
             self._publish(outcome, outcome.prediction, step_time)
         elif isinstance(outcome.problem, InvalidInputError):
-            self._health.refuse(outcome.problem)
+            self.health.refuse(outcome.problem)
         else:
             problem = WAITING if outcome.problem is None else str(outcome.problem)
-            (self._health.warn if outcome.problem is None else self._health.error)(problem)
+            (self.health.warn if outcome.problem is None else self.health.error)(problem)
             packed = packed_margins(time_of(outcome.stamp), None, problem, outcome.scene_version)
             self._margins.publish(packed)
 
@@ -180,9 +172,9 @@ class ThreadModelNode(Node):
             self._markers.publish(packed_markers(when, prediction, margins, self._session.thread.diameter))
         figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
         if prediction.status in (SOLVED, STARTED):
-            self._health.ok("predicting", **figures)
+            self.health.ok("predicting", **figures)
         else:
-            self._health.warn(f"predicting, but {prediction.status}", **figures)
+            self.health.warn(f"predicting, but {prediction.status}", **figures)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -18,10 +18,15 @@ from rclpy.qos import (
     qos_profile_sensor_data,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from magnetosuture_thread import InvalidInputError, interface
 from magnetosuture_thread.interface import Channel
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.node import GuardedNode
 
 SENSOR = qos_profile_sensor_data
 # Of frames that wait only the newest two: a tracker that was held up would otherwise be late for many more, and coils
@@ -33,13 +38,17 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
 MAX_SEQUENCE_GAP = 10_000  # numbers so far apart are of different publishers
 
+# Bytes of a message; what is larger is not even read. A pose or a command has a few hundred.
+SMALL, STATUS, TEXTS, SHAPES, DRAWN = 1 << 12, 1 << 16, 1 << 18, 1 << 19, 1 << 22
+
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic: its name and type, and its quality of service."""
+    """A topic: its name and type, its quality of service, and how large a message of it may be [bytes]."""
 
     channel: Channel
     qos: QoSProfile
+    max_bytes: int = SMALL
     absolute: bool = False
 
     @property
@@ -58,9 +67,23 @@ class Topic:
         options = QoSOverridingOptions.with_default_policies()
         return node.create_publisher(self.message, self.name, self.qos, qos_overriding_options=options)
 
+    def decode(self, data: bytes) -> Any:
+        """Return a message that came as bytes.
+
+        Raises:
+            InvalidInputError: they are too many, cut off, or those of another definition of the type.
+        """
+        if len(data) > self.max_bytes:
+            raise InvalidInputError(self.channel.name, f"{len(data)} bytes", f"at most {self.max_bytes}")
+        try:
+            return deserialize_message(data, self.message)
+        except (RuntimeError, ValueError):  # rclpy's own kind of it is private
+            wanted = f"a {self.channel.type_name} of our definition"
+            raise InvalidInputError(self.channel.name, f"{len(data)} bytes", wanted) from None
+
     def subscribe(
         self,
-        node: Node,
+        node: GuardedNode,
         callback: Callable[[Any], None],
         *,
         raw: bool = False,
@@ -69,8 +92,8 @@ class Topic:
         """Subscribe; reliability and depth can be overridden by parameters.
 
         Args:
-            node: that subscribes.
-            callback: called with each message, or with its CDR bytes.
+            node: that subscribes; it reports messages that are refused.
+            callback: called with each message that can be decoded, or with the CDR bytes of each.
             raw: whether with its bytes.
             unheard: called when there is a publisher whose messages cannot come, as its quality of service is
                 less than ours; by default ROS says so in the log.
@@ -82,17 +105,18 @@ class Topic:
             expected = str(getattr(self.qos, policy).name).lower()
             unheard(InvalidInputError(f"publisher of {self.channel.name}", f"another {policy}", expected))
 
-        return node.create_subscription(
-            self.message,
-            self.name,
-            callback,
-            self.qos,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=mismatched) if unheard else None,
-            raw=raw,
-        )
+        def take(data: bytes) -> None:
+            try:
+                message = self.decode(data)
+            except InvalidInputError as error:
+                node.refuse(error)
+            else:
+                callback(message)
 
-    def subscribe_numbered(self, node: Node, callback: Callable[[Any, int], None]) -> Subscription:
+        events = SubscriptionEventCallbacks(incompatible_qos=mismatched) if unheard else None
+        return self._subscribe(node, callback if raw else take, event_callbacks=events)
+
+    def subscribe_numbered(self, node: GuardedNode, callback: Callable[[Any, int], None]) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
 
         Where the middleware does not number messages, all that tells is how many publishers there are: of
@@ -100,44 +124,55 @@ class Topic:
         """
         taken = 0
 
-        def take(message: Any, info: dict[str, Any]) -> None:
+        def take(data: bytes, info: dict[str, Any]) -> None:
             nonlocal taken
             taken += 1
             number = info["publication_sequence_number"]
             if number is None or number == UNNUMBERED:
                 number = taken if subscription.get_publisher_count() <= 1 else taken * MAX_SEQUENCE_GAP
-            callback(message, number)
+            try:
+                message = self.decode(data)
+            except InvalidInputError as error:
+                node.refuse(error)
+            else:
+                callback(message, number)
 
-        options = QoSOverridingOptions.with_default_policies()
-        subscription = node.create_subscription(self.message, self.name, take, self.qos, qos_overriding_options=options)
+        subscription = self._subscribe(node, take)
         return subscription
 
+    def _subscribe(self, node: GuardedNode, take: Callable[..., None], **options: Any) -> Subscription:
+        """Subscribe to the bytes of the messages: what is too large is not made into a message first."""
+        overriding = QoSOverridingOptions.with_default_policies()
+        return node.create_subscription(
+            self.message, self.name, take, self.qos, qos_overriding_options=overriding, raw=True, **options
+        )
 
-IMAGE = Topic(interface.IMAGE, FRAMES)
-COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, FRAMES)
-CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR)
+
+IMAGE = Topic(interface.IMAGE, FRAMES, MAX_BLOCK_BYTES)
+COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, FRAMES, MAX_BLOCK_BYTES)
+CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR, STATUS)
 NEEDLE_POSE = Topic(interface.NEEDLE_POSE, SENSOR)
-TRACKER_STATE = Topic(interface.TRACKER_STATE, RELIABLE)
+TRACKER_STATE = Topic(interface.TRACKER_STATE, RELIABLE, STATUS)
 TIP_SETPOINT = Topic(interface.TIP_SETPOINT, RELIABLE)
 GROUND_TRUTH_NEEDLE = Topic(interface.GROUND_TRUTH_NEEDLE, RELIABLE)
 GROUND_TRUTH_THREAD = Topic(interface.GROUND_TRUTH_THREAD, RELIABLE)
 OPERATOR_COMMAND = Topic(interface.OPERATOR_COMMAND, RELIABLE)
-FILTER_STATE = Topic(interface.FILTER_STATE, RELIABLE)
+FILTER_STATE = Topic(interface.FILTER_STATE, RELIABLE, STATUS)
 NEEDLE_COMMAND = Topic(interface.NEEDLE_COMMAND, RELIABLE)
 NEEDLE_SETPOINT = Topic(interface.NEEDLE_SETPOINT, RELIABLE)
-MEASURED_THREAD = Topic(interface.MEASURED_THREAD, RELIABLE)
-PREDICTED_THREAD = Topic(interface.PREDICTED_THREAD, RELIABLE)
-MARGINS = Topic(interface.MARGINS, RELIABLE)
-THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE)
-SCENE = Topic(interface.SCENE, LATCHED)
-SCENE_MARKERS = Topic(interface.SCENE_MARKERS, LATCHED)
-MATERIAL = Topic(interface.MATERIAL, LATCHED)
-CURRENTS = Topic(interface.CURRENTS, RELIABLE)
-BRIDGE_STATE = Topic(interface.BRIDGE_STATE, LATCHED)
-RIG_CURRENTS = Topic(interface.RIG_CURRENTS, RELIABLE)
+MEASURED_THREAD = Topic(interface.MEASURED_THREAD, RELIABLE, SHAPES)
+PREDICTED_THREAD = Topic(interface.PREDICTED_THREAD, RELIABLE, SHAPES)
+MARGINS = Topic(interface.MARGINS, RELIABLE, SHAPES)
+THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE, DRAWN)
+SCENE = Topic(interface.SCENE, LATCHED, SHAPES)
+SCENE_MARKERS = Topic(interface.SCENE_MARKERS, LATCHED, DRAWN)
+MATERIAL = Topic(interface.MATERIAL, LATCHED, TEXTS)
+CURRENTS = Topic(interface.CURRENTS, RELIABLE, STATUS)
+BRIDGE_STATE = Topic(interface.BRIDGE_STATE, LATCHED, STATUS)
+RIG_CURRENTS = Topic(interface.RIG_CURRENTS, RELIABLE, STATUS)
 FAULT_REQUEST = Topic(interface.FAULT_REQUEST, RELIABLE)
 CLOCK = Topic(interface.CLOCK, SENSOR, absolute=True)
-DIAGNOSTICS = Topic(interface.DIAGNOSTICS, RELIABLE, absolute=True)
+DIAGNOSTICS = Topic(interface.DIAGNOSTICS, RELIABLE, STATUS, absolute=True)
 
 INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND, OPERATOR_COMMAND)
 OUTPUTS = (

@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
 from magnetosuture_thread import InvalidInputError, Scene
@@ -18,8 +17,8 @@ from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_path, packed_pose
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
@@ -44,7 +43,7 @@ class Follower(Protocol):
         """Receive what is published as measured thread."""
 
 
-class VisionTrackerNode(Node):
+class VisionTrackerNode(PackageNode):
     """Tracks the needle in every camera frame; when it is lost, no pose is published."""
 
     def __init__(self, **options: Any) -> None:
@@ -55,8 +54,7 @@ class VisionTrackerNode(Node):
         scene = initial_scene(settings.scene)
         self._settings = settings
         self._session = TrackerSession(settings, scene) if scene is not None else None
-        self._health = Health(self)
-        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
+        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
         self._words = "nothing seen"
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -70,7 +68,7 @@ class VisionTrackerNode(Node):
         else:
             topics.IMAGE.subscribe(self, self.on_image)
         self.create_timer(0.5 * SILENCE, self.on_watch, clock=self._steady)
-        self._health.warn("no camera frame yet" if scene is not None else NO_SCENE)
+        self.health.warn("no camera frame yet" if scene is not None else NO_SCENE)
         self.get_logger().info(f"ready: frames from {self.resolve_topic_name(CAMERA[settings.image_transport].name)}")
 
     def on_scene(self, scene: Scene) -> None:
@@ -102,7 +100,7 @@ class VisionTrackerNode(Node):
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
             self._states.publish(MESSAGES.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
-            self._health.warn(f"{reason}; before that {self._words}")
+            self.health.warn(f"{reason}; before that {self._words}")
 
     def _arrival(self) -> float:
         return float(self._steady.now().nanoseconds * 1e-9)
@@ -112,7 +110,7 @@ class VisionTrackerNode(Node):
         stamp, taken = message.header.stamp, 0.0
         if self._session is None:
             self._states.publish(MESSAGES.tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
-            self._health.warn(NO_SCENE)
+            self.health.warn(NO_SCENE)
             return
         try:
             image = np.asarray(decode())
@@ -136,13 +134,13 @@ class VisionTrackerNode(Node):
         self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))
         values = {"frames": self._session.frames, "tracked": self._session.tracked}
         if seen.problem is not None:
-            self._health.refuse(seen.problem, **values)
+            self.health.refuse(seen.problem, **values)
         elif seen.tracked:
             self._words = "tracking"
-            self._health.ok(self._words, confidence=round(track.confidence, 3), **values)
+            self.health.ok(self._words, confidence=round(track.confidence, 3), **values)
         else:
             self._words = f"{track.state.value}: {track.reason}"
-            self._health.warn(self._words, **values)
+            self.health.warn(self._words, **values)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -590,3 +590,64 @@ def test_a_pose_outside_of_the_dish_stops_the_needle_until_poses_agree_again():
             refused += 1
     assert refused == 4
     assert not still(plant.run(0.1)[-1])
+
+
+HARDWARE = DriverState(True, timeout=0.2)
+
+
+def frozen(plant: Plant, seconds: float) -> BridgeOutput:
+    """Let a bridge drive, stand still, and go on; return what it does then, with new commands and poses."""
+    plant.run(0.5)
+    plant.time += seconds
+    return plant.run(0.2)[-1]
+
+
+def test_a_bridge_that_stood_still_until_the_boards_stopped_is_in_fault():
+    plant = Plant(driver=HARDWARE).ready()
+    output = frozen(plant, 0.3)
+    assert plant.bridge.latch.fault == "the bridge stood still for 0.30 s: the coils stopped by themselves"
+    assert still(output)
+    plant.bridge.reset(HARDWARE)
+    plant.bridge.arm(HARDWARE)
+    assert not still(plant.run(0.2)[-1])
+
+
+@pytest.mark.parametrize(("driver", "seconds"), [(HARDWARE, 0.08), (READY, 1.0)])
+def test_one_that_the_coils_did_not_miss_drives_on(driver: DriverState, seconds: float):
+    """Shorter than the boards' own timeout, or with a driver that has none."""
+    plant = Plant(driver=driver).ready()
+    assert not still(frozen(plant, seconds))
+
+
+def test_a_pause_of_the_loop_while_disarmed_is_no_fault():
+    plant = Plant(driver=HARDWARE)
+    plant.bridge.latch.activate()
+    frozen(plant, 3.0)
+    plant.bridge.arm(HARDWARE)
+    assert not still(plant.run(0.2)[-1])
+
+
+def test_a_new_scene_that_takes_long_is_no_fault():
+    plant = Plant(driver=HARDWARE).ready()
+    plant.run(0.5)
+    plant.time += 0.4
+    plant.bridge.set_scene(Scene(Dish(0.036)))
+    assert not still(plant.run(0.2)[-1])
+
+
+def test_a_needle_at_the_wall_without_currents_has_the_wall_as_its_reason():
+    """The share of the filtered velocity that is certified there leaves currents of some nanoamperes."""
+    heading = np.array([np.cos(6.499343824195083), np.sin(6.499343824195083)])
+    tail, velocity = np.array([-0.00676600239461346, 0.015584649870821128]), np.array([-3.3019e-10, 9.63129e-10])
+    settings = CoilBridgeSettings(command_timeout=1.0, pose_timeout=1.0)
+    bridge, now = CoilBridge(settings, ArmingLatch(), Scene(Dish(0.035))), 100.0
+    bridge.latch.activate()
+    bridge.arm(READY)
+    for number in range(1, 9):
+        bridge.on_margins(now, True, 1.0, bridge.scene_version, now)
+        bridge.extrapolator.update(tail, heading, now, number, now, now)
+        bridge.command("operator", velocity, now, number, now, now)
+        output = bridge.step(now, now, READY)
+        assert still(output)
+        assert output.reasons[0].startswith("stopped by wall"), output.reasons
+        now += PERIOD

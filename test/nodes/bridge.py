@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,16 @@ def drive(graph, x: float = 0.005, y: float = 0.0) -> TwistStamped:
     asked = command(graph, x, y)
     graph.publish(topics.NEEDLE_COMMAND, asked)
     return asked
+
+
+def drive_until(graph, condition: Callable[[], Any], what: str) -> None:
+    """Drive again and again until a condition holds: on a busy machine one pose or command may come too late."""
+
+    def holds() -> bool:
+        drive(graph)
+        return bool(condition())
+
+    graph.wait(holds, what)
 
 
 def call(graph, kind: Any, name: str, request: Any) -> Any:

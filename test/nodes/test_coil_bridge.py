@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from test.nodes.bridge import EAST, LONG, TAIL, applied, armed, command, drive, driven, reasons
+from test.nodes.bridge import EAST, LONG, TAIL, applied, armed, command, drive, drive_until, driven, reasons
 
 
 def test_a_command_reaches_the_driver_and_the_topics(graph):
@@ -51,13 +51,8 @@ def test_a_pose_that_cannot_be_does_not_end_the_bridge(graph, tail):
     graph.publish(topics.NEEDLE_COMMAND, command(graph))
     graph.wait(lambda: any("the dish's centre" in str(d.status[0].values) for d in diagnostics), "a refusal")
     assert not driven(node)
-
-    def drives_again() -> bool:
-        """Command again and again: only several poses in a row that agree are believed after one that was not."""
-        drive(graph)
-        return driven(node)
-
-    graph.wait(drives_again, "good poses to be believed")
+    # Only several poses in a row that agree are believed after one that was not.
+    drive_until(graph, lambda: driven(node), "good poses to be believed")
 
 
 def test_between_commands_the_currents_follow_the_needle(graph):
@@ -79,13 +74,7 @@ def test_without_a_pose_there_is_no_current(graph):
 def test_a_pose_that_grows_old_stops_the_coils_while_commands_go_on(graph):
     node = armed(graph, pose_timeout=0.05, command_timeout=1.0)
     currents = graph.listen(topics.CURRENTS)
-
-    def drives() -> bool:
-        """Say it again and again: on a busy machine a pose is too old by the time that its command is there."""
-        drive(graph)
-        return driven(node)
-
-    graph.wait(drives, "a current")
+    drive_until(graph, lambda: driven(node), "a current")
 
     def is_stopped() -> bool:
         """Tell by both at once: poses that are still under way may make it drive once more."""
@@ -114,21 +103,18 @@ def test_a_bad_pose_is_not_used(graph, spoil):
 def test_silence_stops_the_coils_and_the_next_command_starts_them(graph):
     node = armed(graph, zero_hold=0.2, pose_timeout=1.0)
     currents, diagnostics = graph.listen(topics.CURRENTS), graph.listen(topics.DIAGNOSTICS)
-    drive(graph)
-    graph.wait(lambda: driven(node), "a current")
+    drive_until(graph, lambda: driven(node), "a current")
     graph.wait(lambda: not applied(node)[-1].any(), "zero current")
     graph.wait(lambda: any("no command for 0.1 s" in d.status[0].message for d in diagnostics), "the reason")
     graph.wait(lambda: bool(currents) and currents[-1].stop == "no command for 0.1 s", "the reason with the currents")
-    drive(graph)
-    graph.wait(lambda: np.any(currents[-1].current), "a current again")
+    drive_until(graph, lambda: np.any(currents[-1].current), "a current again")
 
 
 def test_cease_after_stop(graph):
     """Zeros are published for a while; then the topic is silent, and the driver still told zero."""
     node = armed(graph, zero_hold=0.1)
     currents = graph.listen(topics.CURRENTS)
-    drive(graph)
-    graph.wait(lambda: driven(node), "a current")
+    drive_until(graph, lambda: driven(node), "a current")
     graph.wait(lambda: bool(currents) and currents[-1].stop != "", "zeros")
     told = len(applied(node))
     graph.wait(lambda: len(applied(node)) > told + 60, "more zeros to the driver")
@@ -180,8 +166,7 @@ def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
     graph.publish(topics.NEEDLE_COMMAND, bad)
     graph.wait(lambda: any(words in str(d.status[0].values) for d in diagnostics), "a refusal")
     assert not driven(node)
-    drive(graph)
-    graph.wait(lambda: driven(node), "a good command")
+    drive_until(graph, lambda: driven(node), "a good command")
 
 
 def test_currents_stay_within_their_limit_and_saturation_is_said(graph):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import signal
 import subprocess
@@ -15,11 +16,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents
 from rclpy.node import Node
 
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.jobs.console_hosts import SimulatedHost
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
@@ -28,7 +30,7 @@ from magnetosuture_thread.nodes.console import graph as console_graph
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.inbox import ConsoleTap
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
-from magnetosuture_thread.nodes.messages import MESSAGES, decoded
+from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
@@ -122,6 +124,23 @@ def test_a_stop_waits_for_no_other_action_and_ends_one_that_waits(graph, console
     assert not bridge(console)["armed"]
 
 
+def test_a_stop_that_is_not_kept_over_a_restart_says_so_on_page_and_terminal(graph, console, monkeypatch):
+    node = graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
+    graph.wait(lambda: bridge(console).get("state") == "active", "the bridge")
+
+    def full() -> None:
+        raise InvalidInputError("stop_file", "No space left on device", "a file that can be written")
+
+    monkeypatch.setattr(node.system, "remember", full)
+    assert "No space left" in act(console, "stop")
+    graph.wait(lambda: bridge(console)["emergency_stopped"], "the emergency stop")
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", "coils", "stop"]
+    with subprocess.Popen(command, env=graph_environment(graph.domain), stdout=subprocess.PIPE, text=True) as process:
+        graph.wait(lambda: process.poll() is not None, "the command to end", timeout=60.0)
+        assert process.stdout is not None
+        assert "warning: stop_file: got No space left" in process.stdout.read()
+
+
 def test_a_switch_that_nobody_offers_is_refused_in_words(console, monkeypatch):
     monkeypatch.setattr(console_graph, "TIMEOUT", 0.1)
     assert act(console, "arm") == "no service coils/arm within 0.1 s"
@@ -187,6 +206,51 @@ def test_until_a_scene_is_heard_that_of_the_settings_is_shown(graph, node):
     assert console.state()["scene"]["dish_diameter"] == 0.035
 
 
+def report(names: list[str], text: str = "") -> DiagnosticArray:
+    """Return a report of nodes, each with a text as name, message, key and value."""
+    values = [KeyValue(key=f"{number}{text}", value=text) for number in range(50)] if text else []
+    return DiagnosticArray(
+        status=[DiagnosticStatus(name=f"{name}{text}: state", message=text or "ok", values=values) for name in names]
+    )
+
+
+def test_a_flood_of_diagnostics_keeps_the_state_small_and_our_own_nodes_in_it(graph, console, monkeypatch):
+    graph.add(CoilBridgeNode)
+    graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")
+    tell(graph, topics.DIAGNOSTICS, report(["hello"]), lambda: "hello" in console.nodes(), "another node")
+    for number in range(200):
+        graph.publish(topics.DIAGNOSTICS, report([f"stranger {number}-{part}" for part in range(40)]))
+        graph.publish(topics.DIAGNOSTICS, report([f"long {number}"], "x" * 600))
+        assert len(console.nodes()) <= 32
+        assert len(json.dumps(console.state())) < 300_000
+    tell(graph, topics.DIAGNOSTICS, report(["last"]), lambda: "last" in console.nodes(), "another node")
+    graph.publish(topics.DIAGNOSTICS, report(["huge"], "x" * 100_000))
+    tell(graph, topics.DIAGNOSTICS, report(["after"]), lambda: "after" in console.nodes(), "another node")
+    nodes = console.nodes()
+    assert "coil_bridge" in nodes
+    assert not any(name.startswith("huge") for name in nodes)
+    assert max(len(name) for name in nodes) <= 100
+    monkeypatch.setattr(console_graph, "DROP_TIMEOUT", 0.1)
+    graph.wait(lambda: set(console.nodes()) == {"coil_bridge"}, "the silent nodes to be dropped")
+
+
+def test_texts_and_lists_of_states_are_cut(graph, console):
+    long = CoilBridgeState(reasons=["x" * 500] * 80, driver="y" * 2000, current=[1.0] * 100)
+    tell(graph, topics.BRIDGE_STATE, long, lambda: bridge(console), "the state")
+    assert len(json.dumps(bridge(console))) < 10_000
+    path = MESSAGES.path_message(graph.now(), np.zeros((100, 2)))
+    endless = MESSAGES.path_message(graph.now(), np.zeros((6000, 2)))
+    graph.publish(topics.MEASURED_THREAD, endless)
+    tell(graph, topics.MEASURED_THREAD, path, lambda: len(console.state()["measured"]) == 100, "the path")
+
+
+def test_the_age_of_the_camera_image_is_told(graph, console):
+    assert console.state()["camera"] is None
+    graph.add(RigSimulatorNode, **SMALL)
+    graph.wait(lambda: console.frame() is not None, "a frame")
+    assert 0.0 <= console.state()["camera"]["age"] < 60.0
+
+
 def test_a_node_that_says_no_more_is_silent(graph, console, monkeypatch):
     node = graph.add(CoilBridgeNode)
     graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")
@@ -225,6 +289,7 @@ def test_with_a_simulated_clock_wishes_are_stamped_by_it(graph):
     rig = graph.add(RigSimulatorNode, use_sim_time=True, **SMALL)
     wishes = graph.listen_later(topics.OPERATOR_COMMAND)
     with joined(domain=graph.domain, simulated_clock=True) as node:
+        assert not list(node.services)  # which nobody would answer
         console = ConsoleGraph(node, ConsoleSettings())
         graph.wait(lambda: console.state()["time"] > 1.0, "/clock")
 
@@ -249,7 +314,7 @@ def test_a_rig_is_paused_where_there_is_one(graph, console):
     assert not host.state()["paused"]
     assert not rig.time.paused
     assert "not started from the page" in asyncio.run(host.select_setup("petri_150mm_silk"))
-    assert "--graph" in asyncio.run(host.set_recording(True))
+    assert "--graph" in asyncio.run(host.set_recording(True, "an operator"))
 
 
 def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: Path):
@@ -286,7 +351,7 @@ def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_t
     said = {topic: (arrival, data) for topic, arrival, data in taken}
     arrival, data = said["/coils/currents"]
     assert abs(arrival * 1e-9 - time.time()) < 60.0
-    assert list(decoded(topics.CURRENTS, data).current) == [1.0, 2.0]
+    assert list(topics.CURRENTS.decode(data).current) == [1.0, 2.0]
 
 
 def test_a_bridge_that_is_heard_says_all_that_the_page_shows(graph, console):

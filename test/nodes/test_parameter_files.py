@@ -129,7 +129,7 @@ def test_the_nodes_own_arguments_come_before_those_of_the_process(followed, tmp_
         (COMMON + "path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got '/**, path_follower', expected one"),
         (COMMON + "/lab2/path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got '/**, /lab2/path_follower'"),
         ("", (), "parameter file: got None, expected sections by node"),
-        ("hello", (), "parameter file: got 'hello', expected sections by node"),
+        ("hello", (), "parameter file: got 'content of type str', expected sections by node"),
         ("[1, 2", (), "expected valid YAML"),
         ("/**: {ros__parameters: {speed: 0.1, speed: 0.2}}", (), "speed is given twice"),
         ("/**: {speed: 0.1}", (), "one key, ros__parameters"),

@@ -18,8 +18,10 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.rig_simulator.devices import RigTime
+from magnetosuture_thread.nodes.replay.clock import Timeline
 from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
+from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from test.nodes.scenes import scene_told
 
@@ -72,7 +74,7 @@ def test_a_tick_that_comes_late_leaves_no_frame_out_and_moves_none(graph, monkey
     needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     late = [0.0, 0.05, 0.0, 0.6, 0.02, 0.0, 0.3, 0.85, 0.0]  # of a period
     ticks = iter([0.02 * (1 + number + part) for number, part in enumerate(late)])
-    monkeypatch.setattr(RigTime, "elapsed", lambda rig_time: next(ticks, 1.0))
+    monkeypatch.setattr(Timeline, "running", lambda timeline: next(ticks, 1.0))
     node = graph.add(RigSimulatorNode, frame_rate=50.0, **SMALL)
     graph.wait(lambda: len(needles) > len(late), "a frame for each tick, and one much later")
     steps = np.diff([nanoseconds(needle.header.stamp) for needle in needles[: len(late) + 1]])
@@ -136,6 +138,41 @@ def test_where_the_simulation_fails_the_coils_go_off_and_it_is_said(graph, monke
     assert node.rig.currents.tolist() == [0.0] * 4
 
 
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_rig_that_is_too_slow_lags_and_says_so_while_frames_go_on(graph, monkeypatch, simulated: bool):
+    """A needle that is wedged moves by a tenth of the time; no callback makes up for what was missed before."""
+    needles, clocks = graph.listen_later(topics.GROUND_TRUTH_NEEDLE), graph.listen_later(topics.CLOCK)
+    spans: list[float] = []
+
+    def move(dynamics: RigDynamics, currents: object, dt: float, most: float) -> float:
+        spans.append(dt)
+        return 0.1 * dt
+
+    monkeypatch.setattr(RigDynamics, "step", move)
+    monkeypatch.setattr(Rig, "warm_up", lambda made: None)
+    node = graph.add(RigSimulatorNode, use_sim_time=simulated, **SMALL)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+
+    def late() -> bool:
+        graph.publish(topics.RIG_CURRENTS, currents(graph, 1, 0, 0, 0))
+        texts = [d.status[0].message for d in diagnostics]
+        return any("late: simulated time runs at" in text for text in texts) and len(needles) > 20
+
+    graph.wait(late, "the lag to be reported", timeout=30.0)
+    assert 0.0 < max(spans) < 0.1 + 1e-9
+    values = {value.key: value.value for value in diagnostics[-1].status[0].values}
+    assert float(values["lag [s]"]) > 0.0
+    assert float(values["real_time_factor"]) < 0.9
+    stamps = [nanoseconds(message.header.stamp) for message in needles]
+    assert stamps == sorted(stamps)
+    times = [nanoseconds(message.clock) for message in clocks]
+    assert times == sorted(times)
+    if simulated:  # the clock waits for the rig
+        assert times[-1] < node.time.stamp(node.rig.time) + 0.2e9
+    else:  # what is shown is of now
+        assert abs(stamps[-1] - node.get_clock().now().nanoseconds) < 5e9
+
+
 def test_a_fault_can_be_asked_for_now(graph):
     node = graph.add(RigSimulatorNode, **SMALL)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
@@ -168,7 +205,7 @@ def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
         assert needles[-1].pose.position.x == pytest.approx(0.003, abs=1e-8)
 
         def pulled() -> bool:
-            driver.apply(np.array([5.0, 0.0, -2.0, 0.0]))
+            driver.apply(np.array([5.0, 0.0, -2.0, 0.0]), time.monotonic())
             return bool(needles[-1].pose.position.x > 0.0035)
 
         graph.wait(pulled, "the needle to move")

@@ -7,27 +7,25 @@ from typing import Any
 
 import pytest
 from magnetosuture_msgs.msg import Scene as SceneMessage
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.scene_follower import MAX_MESSAGE_BYTES, SceneFollower, initial_scene, received_scene
+from magnetosuture_thread.nodes.node import PackageNode
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene, received_scene
 from magnetosuture_thread.scene import Scene, read_scene, shape_from_mapping, write_scene
 from test.scene.scenes import every_shape
 
 POST, HERNIA = read_scene("dish_35mm_post"), read_scene("hernia_ring")
 
 
-class FollowerNode(Node):
+class FollowerNode(PackageNode):
     """A node that only follows, and may refuse a scene."""
 
     def __init__(self, file: str = "", **options: Any) -> None:
         super().__init__("follower", **options)
-        self.health = Health(self)
         self.changes: list[Scene] = []
         self.refusal: ConfigurationError | None = None
         self.follower = SceneFollower(self, self.health, initial_scene(file), self.take)
@@ -112,12 +110,12 @@ def test_a_file_that_cannot_be_read_is_refused_at_once(graph, tmp_path: Path):
 def test_bytes_that_are_no_scene_are_refused():
     whole = serialize_message(MESSAGES.scene_message(MESSAGES.time(0), every_shape()))
     assert received_scene(whole) == every_shape()
-    assert len(whole) < MAX_MESSAGE_BYTES
+    assert len(whole) < topics.SCENE.max_bytes
     for length in (0, 4, 40, 100, len(whole) // 2, len(whole) - 9):
         with pytest.raises(InvalidInputError, match=r"^scene"):
             received_scene(whole[:length])
     with pytest.raises(InvalidInputError, match=r"^scene: got 524289 bytes, expected at most 524288"):
-        received_scene(bytes(MAX_MESSAGE_BYTES + 1))
+        received_scene(bytes(topics.SCENE.max_bytes + 1))
     with pytest.raises(InvalidInputError, match=r"^scene\.version: got"):  # ROS replaces what is no UTF-8
         received_scene(whole.replace(b"gripper", b"grip\xff\xfe\xfd"))
 

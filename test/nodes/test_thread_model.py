@@ -343,4 +343,4 @@ def test_a_seen_thread_that_is_cut_off_is_refused_and_ends_nothing(graph):
     node = graph.add(ThreadModelNode)
     whole = serialize_message(Path(header=MESSAGES.header(graph.now()), poses=[PoseStamped()] * 3))
     node.on_measured_thread_message(whole[:-20])
-    assert node._health._refused == 1
+    assert node.health._refused == 1

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from geometry_msgs.msg import TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.coils.watchdog import PublisherCounter
 from magnetosuture_thread.interface import CAMERA
@@ -77,6 +79,6 @@ def test_where_nobody_numbers_messages_the_publishers_are_counted(graph, monkeyp
     topics.NEEDLE_COMMAND.subscribe_numbered(graph.probe, lambda message, number: taken.append(number))
     counter = PublisherCounter()
     for index in range(20):
-        callbacks[0](None, {"publication_sequence_number": unknown})
+        callbacks[0](serialize_message(TwistStamped()), {"publication_sequence_number": unknown})
         counter.update(taken[-1], 0.01 * index)
     assert counter.count(0.2) == speaking

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,6 +24,7 @@ class DriverState:
         warnings: conditions that need attention but no stop.
         currents: measured in each coil, shape (m,) [A]; None where the driver measures none.
         voltages: of the boards' supplies [V]; empty where the driver measures none.
+        timeout: without new currents for this long the power stage stops by itself [s]; inf where it does not.
     """
 
     ready: bool
@@ -31,6 +33,7 @@ class DriverState:
     warnings: tuple[str, ...] = ()
     currents: Vector | None = None
     voltages: tuple[float, ...] = ()
+    timeout: float = math.inf
 
 
 class CoilDriver(Protocol):
@@ -49,8 +52,16 @@ class CoilDriver(Protocol):
         """
         ...
 
-    def apply(self, currents: Vector) -> None:
-        """Set the current of each coil from now on, shape (m,) [A]; ignored while not ready."""
+    def apply(self, currents: Vector, computed: float) -> None:
+        """Set the current of each coil from now on; ignored while not ready.
+
+        A process that is stopped and goes on must not apply what is outdated by then: a driver of hardware sets zero
+        for currents that are older than it allows when they are about to be written.
+
+        Args:
+            currents: of the coils, shape (m,) [A].
+            computed: the monotonic time for which they were computed [s].
+        """
         ...
 
     def state(self) -> DriverState:

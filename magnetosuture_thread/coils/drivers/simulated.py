@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 
@@ -34,8 +35,8 @@ class RecordingDriver:
         """Accept currents from now on."""
         self._open = True
 
-    def apply(self, currents: Vector) -> None:
-        """Record the currents of all coils, shape (coils,) [A].
+    def apply(self, currents: Vector, computed: float) -> None:
+        """Record the currents of all coils, shape (coils,) [A], whenever they were computed.
 
         Raises:
             ValueError: the number of currents is wrong.
@@ -77,8 +78,8 @@ class SimulatedDriver:
         """Send currents from now on."""
         self._open = True
 
-    def apply(self, currents: Vector) -> None:
-        """Send the currents of all coils, shape (coils,) [A]."""
+    def apply(self, currents: Vector, computed: float) -> None:
+        """Send the currents of all coils, shape (coils,) [A], whenever they were computed."""
         if self.state().ready:
             self._send(currents)
 
@@ -92,5 +93,5 @@ class SimulatedDriver:
 
     def close(self) -> None:
         """Send zero currents, and no more after that."""
-        self.apply(np.zeros(self._coils))
+        self.apply(np.zeros(self._coils), math.inf)
         self._open = False

@@ -20,6 +20,7 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.report import JITTER_KEYS, SCHEDULING
+from magnetosuture_thread.nodes.node import GuardedNode
 
 TIMEOUT = 10.0  # s for the bridge to be found and to answer
 DISCOVERY_TIME = 0.5  # s after the first message of the bridge, for it to have discovered this client
@@ -51,7 +52,7 @@ class CoilClient:
     def __enter__(self) -> CoilClient:
         """Join the graph."""
         rclpy.init(context=self._context, args=[])
-        self._node = rclpy.create_node("coil_client", context=self._context)
+        self._node = GuardedNode("coil_client", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
@@ -66,8 +67,11 @@ class CoilClient:
         self._node.destroy_node()
         self._context.try_shutdown()
 
-    def execute(self, action: str) -> None:
+    def execute(self, action: str) -> str:
         """Execute a command: a lifecycle transition, arm, disarm, stop, or reset.
+
+        Returns:
+            What is wrong although it was executed, as an emergency stop that is not kept over a restart; or nothing.
 
         Raises:
             GraphError: no bridge was found, or it rejects the command.
@@ -75,16 +79,17 @@ class CoilClient:
         if action in TRANSITIONS:
             transition = Transition(id=TRANSITIONS[action])
             answer = self._call(ChangeState, "coil_bridge/change_state", ChangeState.Request(transition=transition))
-            refusal = f"the bridge rejected {action}: not possible in its state, or see its log"
+            message = f"the bridge rejected {action}: not possible in its state, or see its log"
         elif action in ("arm", "disarm"):
             answer = self._call(SetBool, ARM, SetBool.Request(data=action == "arm"))
-            refusal = answer.message
+            message = answer.message
         else:
             answer = self._call(Trigger, {"stop": EMERGENCY_STOP, "reset": RESET}[action], Trigger.Request())
-            refusal = answer.message
+            message = answer.message
         if not answer.success:
-            raise GraphError(refusal)
+            raise GraphError(message)
         self._spin(lambda: False, SETTLE_TIME)
+        return "" if action in TRANSITIONS else str(message)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the bridge as text for display.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,15 +14,13 @@ from rclpy.timer import Timer
 
 from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, CoilBridge
-from magnetosuture_thread.coils.coil_system import CoilSystem
+from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
 from magnetosuture_thread.coils.drivers import make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.report import (
-    BridgeServices,
-    CoilReport,
-)
+from magnetosuture_thread.nodes.coil_bridge.report import BridgeServices, CoilReport
+from magnetosuture_thread.nodes.coil_bridge.stop_file import stop_record
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import raise_priority, run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
@@ -38,6 +38,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__("coil_bridge", CoilBridgeSettings, **options)
         self.system = CoilSystem()
+        self.system.recall(stop_record(self))
         self._stamps: dict[str, Any] = {}  # of the last valid command of each input
         self._reactivate = False  # whether a reset activates the node again
         # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
@@ -45,7 +46,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._watchdog: Timer | None = None
         self._report = CoilReport(self, self.system, self._steady)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
-        self._scene = SceneFollower(self, self._report.health, None, self.on_scene)
+        self._scene = SceneFollower(self, self.health, None, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source))
@@ -56,6 +57,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def begin(self, settings: CoilBridgeSettings) -> None:
         """Open the driver; from now on it receives zeros periodically."""
+        self.system.recall(stop_record(self))
+        self.system.remember()
         bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
         driver = make_driver(settings, len(bridge.coils), self._report.send_to_rig, self._report.count_rigs)
         self.system.open(settings, bridge, driver)
@@ -67,28 +70,38 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def pause(self) -> None:
         """Stop at once; activation and arming are needed again."""
-        self.system.latch.deactivate()
-        self.system.zero()
-        self._step()
+        self._rest(self.system.latch.deactivate)
 
     def end(self) -> None:
-        """Set the coils to zero and close the driver."""
+        """Set the coils to zero, close the driver, and publish that."""
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
         self._watchdog, self._reactivate = None, False
         self._stamps.clear()
-        self.system.close()
+        ends = self.stage in ("shuttingdown", FINALIZED)
+        final = self.system.close(FINALIZED if ends else UNCONFIGURED)
+        if ends:
+            self._report.report_unless(partial(self.system.remember, ends=True))
+        if final is not None and self.context.ok():
+            self._report.publish_output(None, final)
+            self._report.publish_state(force=True)
 
-    def arm(self, armed: bool) -> None:
-        """Arm or disarm."""
-        self.system.arm(armed)
-        self._step()
+    def may_start(self) -> bool:
+        """Return whether nothing is latched from the process before; else a reset makes the node active."""
+        self._reactivate = bool(self.system.latch.latched_reason)
+        return not self._reactivate
 
-    def stop(self) -> None:
-        """Latch the emergency stop, in any state."""
-        self.system.latch.stop()
-        self.system.zero()
+    def arm(self, armed: bool) -> str:
+        """Arm, or disarm; return what is wrong all the same."""
+        if not armed:
+            return self._rest(partial(self.system.arm, False))
+        self.system.arm(True)
         self._step()
+        return ""
+
+    def stop(self) -> str:
+        """Latch the emergency stop, in any state, also over a restart; return what is wrong all the same."""
+        return self._rest(self.system.latch.stop)
 
     def reset(self) -> None:
         """Clear the emergency stop and faults; a node that they deactivated is active again, but disarmed."""
@@ -109,17 +122,19 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
                 pose.tail, pose.heading, pose.stamp, number, *self._times(), covariance
             )
         except INPUT_ERRORS as error:
-            self._report.report_refused(error)
+            self.refuse(error)
 
     def on_margins(self, message: SafetyMargins) -> None:
         """Register the thread's margins: slowdown by friction, and the scene of the prediction."""
         if self.system.bridge is None:
             return
         try:
-            stamp, arrival = reading.seconds(message.header.stamp), self._times()[1]
-            self.system.bridge.on_margins(stamp, message.valid, message.slowdown, message.scene_version, arrival)
+            stamp = reading.checked_nanoseconds(message.header.stamp, "thread/margins.header.stamp") * 1e-9
+            self.system.bridge.on_margins(
+                stamp, message.valid, message.slowdown, message.scene_version, self._times()[1]
+            )
         except INPUT_ERRORS as error:
-            self._report.report_refused(error)
+            self.refuse(error)
 
     def on_scene(self, scene: Scene) -> None:
         """Replace the scene, from the next step on."""
@@ -135,10 +150,10 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             return
         try:
             velocity = reading.plane_velocity(message, INPUTS[source])
-            stamp = reading.checked_nanoseconds(message.header.stamp, INPUTS[source]) * 1e-9
+            stamp = reading.checked_nanoseconds(message.header.stamp, f"{INPUTS[source]}.header.stamp") * 1e-9
             self.system.bridge.command(source, velocity, stamp, number, *self._times())
         except INPUT_ERRORS as error:
-            self._report.report_refused(error)
+            self.refuse(error)
         else:
             self._stamps[source] = message.header.stamp
             self._step()
@@ -155,12 +170,16 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         """Set the real-time priority of the loop; meant for a process of its own."""
         self._report.report_scheduling(raise_priority((self.settings or CoilBridgeSettings()).realtime_priority))
 
-    def destroy_node(self) -> None:
-        """Set the coils to zero and close the driver."""
-        try:
-            self.end()
-        finally:
-            super().destroy_node()
+    def refuse(self, problem: Exception) -> None:
+        """Report a message that was refused."""
+        self._report.report_refused(problem)
+
+    def _rest(self, switch: Callable[[], None]) -> str:
+        """Come to rest by a switch, and only then wait for the disk; return what is wrong with that."""
+        switch()
+        self.system.zero()
+        self._step()
+        return self._report.report_unless(self.system.remember)
 
     def _step(self) -> None:
         """Compute, apply and publish the currents."""
@@ -171,7 +190,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def _times(self) -> tuple[float, float]:
         """Return the time of the stamps' clock and a monotonic time [s]."""
-        return self.get_clock().now().nanoseconds * 1e-9, self._steady.now().nanoseconds * 1e-9
+        return self.get_clock().now().nanoseconds * 1e-9, time.monotonic()
 
 
 def main(arguments: list[str] | None = None) -> int:

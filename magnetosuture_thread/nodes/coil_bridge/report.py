@@ -18,14 +18,15 @@ from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.node import PackageNode
 
 
 class BridgeServices:
     """Service servers for arm and disarm, emergency stop, and reset.
 
-    A callback refuses by raising `MagnetosutureError`, whose text is the response.
+    A callback refuses by raising `MagnetosutureError`, whose text is the response; one that succeeds may return a text
+    about what is wrong all the same.
 
     Args:
         node: of the services.
@@ -35,16 +36,20 @@ class BridgeServices:
     """
 
     def __init__(
-        self, node: Node, arm: Callable[[bool], None], stop: Callable[[], None], reset: Callable[[], None]
+        self,
+        node: Node,
+        arm: Callable[[bool], str | None],
+        stop: Callable[[], str | None],
+        reset: Callable[[], str | None],
     ) -> None:
         node.create_service(SetBool, ARM, lambda request, response: _respond(response, lambda: arm(request.data)))
         node.create_service(Trigger, EMERGENCY_STOP, lambda _, response: _respond(response, stop))
         node.create_service(Trigger, RESET, lambda _, response: _respond(response, reset))
 
 
-def _respond(response: Any, act: Callable[[], None]) -> Any:
+def _respond(response: Any, act: Callable[[], str | None]) -> Any:
     try:
-        act()
+        response.message = act() or ""
     except MagnetosutureError as error:
         response.success, response.message = False, str(error)
     else:
@@ -71,15 +76,12 @@ class CoilReport:
         node: the coil bridge.
         system: bridge, driver and latch.
         steady: a clock that does not depend on /clock.
-
-    Attributes:
-        health: of the node, on /diagnostics.
     """
 
-    def __init__(self, node: Node, system: CoilSystem, steady: Clock) -> None:
+    def __init__(self, node: PackageNode, system: CoilSystem, steady: Clock) -> None:
         self._node = node
         self._system = system
-        self.health = self._health = Health(node)
+        self._health = node.health
         self._refused = 0
         self._last_state: object = None
         self._last_log = ""
@@ -90,7 +92,7 @@ class CoilReport:
         self._rig = topics.RIG_CURRENTS.publisher(node)
         node.create_timer(STATE_PERIOD, lambda: self.publish_state(force=True), clock=steady)
         # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
-        self._log("unconfigured", system.driver_state)
+        self._log(system.closed, system.driver_state)
 
     def send_to_rig(self, currents: np.ndarray) -> None:
         """Send currents to the simulated rig."""
@@ -105,6 +107,15 @@ class CoilReport:
         """Log how the process is scheduled."""
         self._health.note(**{SCHEDULING: scheduling})
         self._node.get_logger().info(f"{SCHEDULING}: {scheduling}")
+
+    def report_unless(self, act: Callable[[], object]) -> str:
+        """Do what may fail but must not hold up what comes after; log and return the problem, empty if none."""
+        try:
+            act()
+        except MagnetosutureError as error:
+            self._node.get_logger().error(str(error))
+            return str(error)
+        return ""
 
     def report_refused(self, problem: Exception) -> None:
         """Count and report a refused message."""
@@ -127,7 +138,7 @@ class CoilReport:
         now = (
             latch.state,
             latch.stop_reason,
-            output is None,
+            "" if output else system.closed,
             reasons,
             driver.ready,
             driver.problem,
@@ -147,11 +158,11 @@ class CoilReport:
             driver=system.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"}
         )
         self._last_state = now
-        self._log(latch.state.value if output else "unconfigured", driver)
+        self._log(latch.state.value if output else system.closed, driver)
         if latch.latched_reason:
             self._health.error(f"{FAULT_PREFIX}{latch.latched_reason}")
         elif output is None:
-            self._health.ok("unconfigured")
+            self._health.ok(system.closed)
         elif not driver.ready:
             self._health.warn(f"{latch.stop_reason or 'armed'}; driver: {driver.problem}")
         elif latch.stop_reason:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,25 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread import read_scene
+from magnetosuture_thread import InvalidInputError, read_scene
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, PAUSE_REPLAY, PAUSE_RIG, RESET
+from magnetosuture_thread.interface import (
+    ARM,
+    EMERGENCY_STOP,
+    NODES,
+    PAUSE_REPLAY,
+    PAUSE_RIG,
+    RESET,
+    RIG_NODES,
+    SCENE_SERVER,
+)
+from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.vision.images import unpack_image
 
 TIMEOUT = 10.0  # s for a service to be found and to answer
@@ -55,7 +67,7 @@ class ConsoleServices:
         return bool(self._clients[name].service_is_ready())
 
     async def execute_action(self, action: str) -> str:
-        """Execute one of `ACTIONS`; return an empty text, or the reason of a refusal.
+        """Execute one of `ACTIONS`; return an empty text, the reason of a refusal, or what is wrong all the same.
 
         The latest action has priority: one that still waits for its answer is cancelled.
         """
@@ -85,7 +97,10 @@ class ConsoleServices:
             for number in calls:
                 if number in answers:
                     answer = answers.pop(number)
-                    return "" if answer.success else str(answer.message) or "refused"
+                    told = str(answer.message)
+                    if answer.success:  # where time is paused, that is all the message says
+                        return "" if name in (PAUSE_REPLAY, PAUSE_RIG) else told
+                    return told or "refused"
         if not calls:
             return f"no service {name} within {TIMEOUT:g} s"
         return f"{name} did not answer within {TIMEOUT:g} s"
@@ -103,7 +118,12 @@ class ConsoleServices:
 
 NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 MEASURED_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
-MAX_DIAGNOSTICS = 100  # queued messages of /diagnostics
+SCENE_PERIOD = 0.5  # s; a large scene takes a tenth of that
+MAX_DIAGNOSTICS = 50  # queued messages of /diagnostics
+MAX_NODES = 32  # shown
+MAX_SHOWN_BYTES = 1 << 18  # of a message that becomes a part of the state
+DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
+OWN_NODES = (*NODES, *RIG_NODES, SCENE_SERVER)
 JPEG_QUALITY = 80
 READERS = {
     "tracker": (topics.TRACKER_STATE, messages.tracker, 0.0),
@@ -111,7 +131,7 @@ READERS = {
     "measured": (topics.MEASURED_THREAD, messages.measured_thread, MEASURED_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
     "margins": (topics.MARGINS, messages.margins, 0.0),
-    "scene": (topics.SCENE, messages.scene, 0.0),
+    "scene": (topics.SCENE, messages.scene, SCENE_PERIOD),
     "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
     "bridge": (topics.BRIDGE_STATE, messages.bridge, 0.0),
 }
@@ -125,7 +145,7 @@ ZERO_FILTER_STATE = {
     "overridden": "",
     "age": 0.0,
 }
-AGED_PARTS = ("needle", "predicted", "filter", "bridge")
+AGED_PARTS = ("tracker", "needle", "predicted", "filter", "bridge")
 
 
 class ConsoleGraph:
@@ -200,15 +220,27 @@ class ConsoleGraph:
             "needle_length": settings.needle_length,
             "needle_curvature": settings.needle_curvature,
             **parts,
+            "camera": None if self._camera.value is None else {"age": self._camera.age},
             "scene": parts["scene"] or self._scene,
             "nodes": self.nodes(),
         }
 
     def nodes(self) -> dict[str, dict[str, Any]]:
-        """Return the last diagnostics of each node, and their age."""
+        """Return the last diagnostics of each node, and their age.
+
+        The nodes of this package stay; of all others the latest are kept, for a while.
+        """
         for report, arrived in self._reports.read():
-            for status in report.status:
-                self._diagnostics[status.name.split(":")[0]] = (messages.node_state(status), arrived)
+            for status in report.status[:MAX_NODES]:
+                self._diagnostics[shortened(status.name.split(":")[0])] = (messages.node_state(status), arrived)
+        space = self.node.get_namespace().strip("/")
+        own = {f"{space}/{name}".lstrip("/") for name in OWN_NODES}
+        others = sorted(self._diagnostics.keys() - own, key=lambda name: self._diagnostics[name][1])
+        oldest = time.time_ns() - round(DROP_TIMEOUT * 1e9)
+        too_many = len(others) + len(own) - MAX_NODES
+        for number, name in enumerate(others):
+            if number < too_many or self._diagnostics[name][1] < oldest:
+                del self._diagnostics[name]
         return dict(self._aged_nodes())
 
     def is_active(self, name: str) -> bool:
@@ -225,12 +257,14 @@ class ConsoleGraph:
         """Return the graph's time."""
         clock = self.node.get_clock()
         for message, _ in self._clock.read() if self._clock is not None else ():
-            clock.set_ros_time_override(Time.from_msg(message.clock, clock_type=clock.clock_type))
+            with suppress(InvalidInputError):  # no time at all
+                reading.clock_nanoseconds(message)
+                clock.set_ros_time_override(Time.from_msg(message.clock, clock_type=clock.clock_type))
         return clock.now()
 
     def _open(self, settings: ConsoleSettings, scene: dict[str, Any] | None) -> None:
         self.settings, self._scene = settings, scene
-        self._latest = {name: Latest(self.node, *reader) for name, reader in READERS.items()}
+        self._latest = {name: Latest(self.node, *reader, max_bytes=MAX_SHOWN_BYTES) for name, reader in READERS.items()}
         self._reports = Inbox(self.node, topics.DIAGNOSTICS, MAX_DIAGNOSTICS)
         self._diagnostics: dict[str, tuple[dict[str, Any], int]] = {}
         raw = settings.image_transport == "raw"

@@ -12,7 +12,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import decoded
 from magnetosuture_thread.nodes.topics import Topic
 
 
@@ -35,14 +34,20 @@ class Inbox:
             reliability=topic.qos.reliability or ReliabilityPolicy.RELIABLE,
             durability=topic.qos.durability,
         )
-        self._node = node
+        self._node, self._depth = node, depth
         self._subscription = node.create_subscription(topic.message, topic.name, _never, quality, raw=True)
 
     def take(self) -> Iterator[tuple[bytes, int]]:
-        """Yield the queued messages: their CDR bytes, and their time of arrival [ns]."""
+        """Yield the queued messages, no more than the queue holds: CDR bytes, and time of arrival [ns].
+
+        In a flood there would always be one more.
+        """
         subscription = self._subscription
         with subscription.handle:
-            while (found := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+            for _ in range(self._depth):
+                found = subscription.handle.take_message(subscription.msg_type, True)
+                if found is None:
+                    return
                 data, info = found
                 yield bytes(data), info["received_timestamp"]
 
@@ -50,7 +55,7 @@ class Inbox:
         """Yield the queued messages, and their time of arrival [ns]; invalid ones are skipped."""
         for data, arrived in self.take():
             try:
-                yield decoded(self.topic, data), arrived
+                yield self.topic.decode(data), arrived
             except InvalidInputError:
                 continue
 
@@ -67,13 +72,23 @@ class Latest:
         topic: to subscribe.
         read: converts a message; an `InvalidInputError` keeps the previous value.
         period: minimum between two messages that are read [s].
+        max_bytes: of a message that is read; the topic's own bound if None.
 
     Attributes:
         value: content of the latest message that was read; None before the first.
     """
 
-    def __init__(self, node: Node, topic: Topic, read: Callable[[Any], Any], period: float = 0.0) -> None:
+    def __init__(
+        self,
+        node: Node,
+        topic: Topic,
+        read: Callable[[Any], Any],
+        period: float = 0.0,
+        *,
+        max_bytes: int | None = None,
+    ) -> None:
         self._inbox = Inbox(node, topic, 1)
+        self._max_bytes = topic.max_bytes if max_bytes is None else max_bytes
         self._read = read
         self._period = period
         self._next_read = 0.0
@@ -89,8 +104,10 @@ class Latest:
         if not waiting:
             return False
         data, arrived = waiting[-1]
+        if len(data) > self._max_bytes:
+            return False
         try:
-            self.value = self._read(decoded(self._inbox.topic, data))
+            self.value = self._read(self._inbox.topic.decode(data))
         except InvalidInputError:
             return False
         self._arrived, self._next_read = arrived, now + self._period

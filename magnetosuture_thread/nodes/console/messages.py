@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,15 @@ from magnetosuture_msgs.msg import (
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
 
-from magnetosuture_thread import Disc, Scene, SceneShape
+from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.margins import node_clearance
+from magnetosuture_thread.texts import shortened
 
+MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
+MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page
 DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
 
 TRACKER = {
@@ -70,7 +74,7 @@ def tracker(message: TrackerState) -> dict[str, Any]:
             "rotation": message.camera_rotation,
         }
     state = TRACKER.get(message.state, "searching")
-    return {"state": state, "reason": message.reason, "confidence": message.confidence, "view": view}
+    return {"state": state, "reason": shortened(message.reason), "confidence": message.confidence, "view": view}
 
 
 def measured_thread(message: Path) -> list[list[float]]:
@@ -85,7 +89,7 @@ def predicted(message: PredictedThread) -> dict[str, Any]:
         "vertices": [[vertex.x, vertex.y] for vertex in message.positions],
         "residual": message.residual,
         "step_time": message.step_time,
-        "status": message.solver_status,
+        "status": shortened(message.solver_status),
     }
 
 
@@ -93,9 +97,9 @@ def margins(message: SafetyMargins) -> dict[str, Any]:
     """Return the margins by node and by kind, as distances [m]; no number of a message that is not valid."""
     return {
         "valid": message.valid,
-        "reason": message.reason,
+        "reason": shortened(message.reason),
         "clearance": clearances(message) if message.valid else [],
-        "least": {least.barrier: least.clearance for least in message.minimum},
+        "least": {shortened(least.barrier): least.clearance for least in message.minimum[:MAX_LISTED]},
         "contact": list(message.contact_nodes),
         "friction": {
             "state": FRICTION.get(message.friction_state, "unknown"),
@@ -106,8 +110,15 @@ def margins(message: SafetyMargins) -> dict[str, Any]:
 
 
 def clearances(message: SafetyMargins) -> list[float | None]:
-    """Return each node's least clearance of the wall and any shape [m]; None where none is near."""
-    least = node_clearance(margins_of(message), max(message.node, default=-1) + 1)
+    """Return each node's minimum clearance of the wall and any shape [m]; None where none is near.
+
+    Raises:
+        InvalidInputError: a node that no thread has.
+    """
+    count = max(message.node, default=-1) + 1
+    if count > MAX_THREAD_NODES:
+        raise InvalidInputError("thread/margins.node", count - 1, f"less than {MAX_THREAD_NODES}")
+    least = node_clearance(margins_of(message), count)
     return [value if value < np.inf else None for value in least.tolist()]
 
 
@@ -144,14 +155,14 @@ def _shown_shape(shape: SceneShape, tolerance: float) -> dict[str, Any]:
 def filter_state(message: FilterState) -> dict[str, Any]:
     """Return what the bridge made of the last velocity command [m/s]."""
     return {
-        "source": message.source,
+        "source": shortened(message.source),
         "commanded": _plane(message.commanded),
         "filtered": _plane(message.filtered),
         "applied": _plane(message.applied),
         "slowdown": message.slowdown,
-        "active": list(message.active),
-        "overridden": message.overridden,
-        "reason": message.reason,
+        "active": _texts(message.active),
+        "overridden": shortened(message.overridden),
+        "reason": shortened(message.reason),
     }
 
 
@@ -161,16 +172,16 @@ def bridge(message: CoilBridgeState) -> dict[str, Any]:
         "state": BRIDGE.get(message.state, "fault"),
         "armed": message.armed,
         "emergency_stopped": message.emergency_stopped,
-        "reasons": list(message.reasons),
+        "reasons": _texts(message.reasons),
         "commanded": _plane(message.commanded),
         "filtered": _plane(message.filtered),
         "applied": _plane(message.applied),
         "saturated": message.saturated,
-        "driver": message.driver,
+        "driver": shortened(message.driver),
         "driver_ready": message.driver_ready,
-        "driver_warnings": list(message.driver_warnings),
-        "current": list(message.current),
-        "measured_current": list(message.measured_current),
+        "driver_warnings": _texts(message.driver_warnings),
+        "current": list(message.current[:MAX_LISTED]),
+        "measured_current": list(message.measured_current[:MAX_LISTED]),
         "refused": message.refused,
     }
 
@@ -179,10 +190,14 @@ def node_state(status: DiagnosticStatus) -> dict[str, Any]:
     """Return a node's diagnostic status."""
     return {
         "level": LEVELS.get(status.level, "error"),
-        "message": status.message,
-        "values": {value.key: value.value for value in status.values},
+        "message": shortened(status.message),
+        "values": {shortened(value.key): shortened(value.value) for value in status.values[:MAX_LISTED]},
     }
 
 
 def _plane(velocity: Vector3) -> list[float]:
     return [velocity.x, velocity.y]
+
+
+def _texts(given: Sequence[str]) -> list[str]:
+    return [shortened(text) for text in given[:MAX_LISTED]]

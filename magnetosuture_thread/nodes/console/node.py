@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,9 +23,12 @@ from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.diagnostics import PERIOD, Health
 from magnetosuture_thread.nodes.parameter_files import init, node_options
 from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.run import end_signals
 
 NAME = "console"
 RIG = "rig_simulator"
+# Without an executor no service of the node could answer.
+NO_SERVICE = [Parameter("start_type_description_service", value=False)]
 
 
 @contextmanager
@@ -39,9 +41,8 @@ def joined(*, domain: int | None = None, simulated_clock: bool = False) -> Itera
     """
     context = Context()
     rclpy.init(context=context, domain_id=domain, args=[], signal_handler_options=SignalHandlerOptions.NO)
-    clock = [Parameter("use_sim_time", value=simulated_clock)]
-    # Without an executor its parameter services could not answer.
-    node = rclpy.create_node(NAME, context=context, parameter_overrides=clock, start_parameter_services=False)
+    parameters = [*NO_SERVICE, Parameter("use_sim_time", value=simulated_clock)]
+    node = rclpy.create_node(NAME, context=context, parameter_overrides=parameters, start_parameter_services=False)
     try:
         yield node
     finally:
@@ -92,7 +93,7 @@ class GraphHost:
             self.paused = paused
         return refusal
 
-    async def set_recording(self, recording: bool) -> str:
+    async def set_recording(self, recording: bool, operator: str) -> str:
         """Refuse: this node records no bags."""
         return "the node console writes no bags; `magnetosuture console --graph` does"
 
@@ -105,7 +106,7 @@ class GraphHost:
 async def serve(node: Node, settings: ConsoleSettings) -> None:
     """Serve the page until the process is terminated; the needle is stopped first."""
     loop, terminated = asyncio.get_running_loop(), asyncio.Event()
-    for which in (signal.SIGINT, signal.SIGTERM):
+    for which in end_signals():
         loop.add_signal_handler(which, terminated.set)
     graph = ConsoleGraph(node, settings)
     server = ConsoleServer(settings, graph, GraphHost(graph))
@@ -130,8 +131,8 @@ def main(arguments: list[str] | None = None) -> int:
     node = None
     try:
         init(arguments, signal_handler_options=SignalHandlerOptions.NO)
-        # Without an executor its parameter services could not answer.
-        node = rclpy.create_node(NAME, **node_options(NAME, {"start_parameter_services": False}))
+        options = {"start_parameter_services": False, "parameter_overrides": NO_SERVICE}
+        node = rclpy.create_node(NAME, **node_options(NAME, options))
         asyncio.run(serve(node, declare(node, ConsoleSettings)))
     except (MagnetosutureError, ParameterException, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

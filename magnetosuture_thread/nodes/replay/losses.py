@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.serialization import deserialize_message
-
 from magnetosuture_thread.interface import CAMERA, MARGINS, NEEDLE_POSE, PREDICTED_THREAD
-from magnetosuture_thread.nodes.topics import UNNUMBERED
+from magnetosuture_thread.nodes.topics import DIAGNOSTICS, UNNUMBERED
 
 FRAMES = frozenset(channel.name for channel in CAMERA.values())
 
@@ -63,7 +60,7 @@ class Losses:
 
     def count_diagnostics(self, data: bytes) -> None:
         """Count a node's status on /diagnostics."""
-        for status in deserialize_message(data, DiagnosticArray).status:
+        for status in DIAGNOSTICS.decode(data).status:
             values = {value.key: value.value for value in status.values}
             node = status.name.split(":")[0]
             if node == "vision_tracker":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from typing import Any, Protocol
 
 import rclpy
@@ -15,11 +16,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, PAUSE_REPLAY, SCENE
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import command_stamp
+from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.replay.clock import Timeline
 from magnetosuture_thread.nodes.replay.losses import Losses
 
@@ -98,7 +101,7 @@ class LiveReplay:
         self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain, args=[])
-        self._node = rclpy.create_node("replay", context=self._context)
+        self._node = GuardedNode("replay", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._node.create_service(SetBool, PAUSE_REPLAY, self._on_pause)
@@ -238,6 +241,11 @@ class LiveReplay:
 
         def take(data: bytes, info: dict[str, Any]) -> None:
             self._taken += 1
+            with suppress(InvalidInputError, ValueError):  # no message of ours
+                count(data, info)
+                self._receive(topic.channel.recorded, self._time.now(), bytes(data))
+
+        def count(data: bytes, info: dict[str, Any]) -> None:
             stamp = command_stamp(data) if topic.channel is CURRENTS else header_stamp(data)
             if stamp is not None:
                 # When it reached this process: how long it waited here for its turn is not the graph's delay.
@@ -247,7 +255,6 @@ class LiveReplay:
                 self.losses.heard(name, stamp, info["publication_sequence_number"])
             if topic.channel is DIAGNOSTICS:
                 self.losses.count_diagnostics(data)
-            self._receive(topic.channel.recorded, self._time.now(), bytes(data))
 
         return take
 

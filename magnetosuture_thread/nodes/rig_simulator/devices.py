@@ -19,23 +19,30 @@ from magnetosuture_thread.messages.cdr import time_of
 from magnetosuture_thread.messages.packing import packed_path
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.replay.clock import Timeline
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
+
+FACTOR_PERIOD = 1.0  # s over which the real-time factor is taken
 
 
 class RigTime:
     """Counts the rig's own time, and stamps what happens in it; the node's service `rig/pause` lets it stand still.
 
     By a simulated clock the stamps stand still with the rig. By the time of the day they go on: what the rig shows
-    after a pause is stamped as late as it is shown.
+    after a pause is stamped as late as it is shown. Time for which the computer was too slow is left out in the same
+    way (`slip`).
 
     Args:
         node: that gets the service.
         epoch: the stamp of its beginning, which is now [ns].
         rate: how much faster than real time it runs.
         simulated: whether the stamps are those of a simulated clock.
+
+    Attributes:
+        lag: time that was left out [s].
     """
 
     def __init__(self, node: Node, epoch: int, rate: float, *, simulated: bool) -> None:
@@ -44,6 +51,8 @@ class RigTime:
         self._timeline.begin()
         self._began = time.perf_counter()
         self._stood = 0.0  # s of real time, in all pauses that are over
+        self.lag = 0.0
+        self._mark, self._factor = (0.0, 0.0), 1.0
         node.create_service(SetBool, PAUSE_RIG, self._on_pause)
 
     @property
@@ -53,11 +62,22 @@ class RigTime:
 
     def elapsed(self) -> float:
         """Return the rig's own time since its beginning [s]."""
-        return self._timeline.running() * self._rate
+        return self._timeline.running() * self._rate - self.lag
+
+    def slip(self, seconds: float) -> None:
+        """Leave out time that the simulation did not have [s]."""
+        self.lag += seconds
+
+    def real_time_factor(self, elapsed: float) -> float:
+        """Return the share of time that was not left out, over the last second or two until a time of its own [s]."""
+        now, (then, before) = elapsed + self.lag, self._mark
+        if now - then >= FACTOR_PERIOD:
+            self._mark, self._factor = (now, self.lag), 1.0 - (self.lag - before) / (now - then)
+        return self._factor
 
     def stamp(self, elapsed: float) -> int:
         """Return the stamp of a moment in the rig's own time, given in seconds [ns]."""
-        return self._epoch + round((elapsed + (0.0 if self._simulated else self._stood)) * 1e9)
+        return self._epoch + round((elapsed + (0.0 if self._simulated else self._stood + self.lag)) * 1e9)
 
     def pause(self, still: bool) -> None:
         """Pause the time, or resume it."""
@@ -108,7 +128,7 @@ class FramePublisher:
         self._thread.publish(packed_path(time_of(nanoseconds), frame.thread))
 
 
-PERIOD = 0.005  # s between two looks at the boards, which keep real time whatever the pace
+PERIOD = 0.005  # s between two looks at the boards, which keep real time whatever the rig's own is
 
 
 class RigCurrents:
@@ -128,7 +148,7 @@ class RigCurrents:
     """
 
     def __init__(
-        self, node: Node, settings: RigSettings, clock: Clock, apply: Callable[[NDArray[np.float64]], None]
+        self, node: PackageNode, settings: RigSettings, clock: Clock, apply: Callable[[NDArray[np.float64]], None]
     ) -> None:
         self._apply = apply
         self.stage = stage = settings.power()

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.rig_simulator.devices import (
@@ -33,8 +32,12 @@ from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
 
+MIN_CATCH_UP, CATCH_UP_FRAMES = 0.1, 2.0  # s, or frame periods, for which the rig moves in one callback
+MIN_ITERATIONS, ITERATION_RATE = 1000.0, 1e4  # of Newton in one callback, or for a second's frames; they take 40 us
+MIN_REAL_TIME_FACTOR = 0.9  # below which the status says so
 
-class RigSimulatorNode(Node):
+
+class RigSimulatorNode(PackageNode):
     """Stands in for coils, dish and camera."""
 
     def __init__(self, **options: Any) -> None:
@@ -47,19 +50,21 @@ class RigSimulatorNode(Node):
         scene = initial_scene(settings.scene)
         if scene is None:
             raise ConfigurationError(f"{settings.GROUP}.scene", "", "a scene file: what is simulated has a dish")
-        self.rig = Rig(settings, scene)
+        # What one callback may take, so that frames come and the others of this computer get on: else time lags.
+        self._catch_up = max(MIN_CATCH_UP, CATCH_UP_FRAMES / settings.frame_rate)
+        iterations = max(MIN_ITERATIONS, ITERATION_RATE / settings.frame_rate)
+        self.rig = Rig(settings, scene, max_time=self._catch_up, max_iterations=iterations)
         self.rig.warm_up()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._health = Health(self)
         epoch = EPOCH if simulated else self.get_clock().now().nanoseconds
         self.time = RigTime(self, epoch, rate, simulated=simulated)
         self._phase: float | None = None
-        self._last_index = -1
+        self._last_index, self._clock_stamp = -1, 0
         self._frames = self._skipped = 0
         self._late: deque[tuple[float, int, RigFrame]] = deque()
         self._publisher = FramePublisher(self, self.rig.camera, settings)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
-        self._scene = SceneFollower(self, self._health, scene, self.on_scene)
+        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
         if simulated:
             self._clocks = topics.CLOCK.publisher(self)
             self.create_timer(CLOCK_PERIOD / rate, self.on_clock, clock=self._steady)
@@ -77,16 +82,20 @@ class RigSimulatorNode(Node):
         try:
             self.rig.faults.add(Fault.requested(message.data, max(0.0, self.rig.running)))
         except InvalidInputError as error:
-            self._health.refuse(error)
+            self.health.refuse(error)
 
     def on_clock(self) -> None:
-        """Publish the simulated time."""
-        self._clocks.publish(ClockMessage(clock=Time(nanoseconds=self.time.stamp(self.time.elapsed())).to_msg()))
+        """Publish the simulated time, which waits for the rig where that is late and never goes back."""
+        elapsed = self.time.elapsed()
+        if not self.rig.held:
+            elapsed = min(elapsed, self.rig.time + self._catch_up)
+        self._clock_stamp = max(self._clock_stamp, self.time.stamp(elapsed))
+        self._clocks.publish(ClockMessage(clock=Time(nanoseconds=self._clock_stamp).to_msg()))
 
     def on_frame(self) -> None:
         """Capture the frame that is due; a missed one is left out."""
         if self.time.paused:
-            self._health.ok("paused")
+            self.health.ok("paused")
             return
         elapsed = self.time.elapsed()
         if self._phase is None:
@@ -110,12 +119,21 @@ class RigSimulatorNode(Node):
             super().destroy_node()
 
     def _apply(self, currents: NDArray[np.float64]) -> None:
+        elapsed = self.time.elapsed()
         try:
-            self.rig.apply(currents, self.time.elapsed())
+            self.rig.apply(currents, elapsed)
         except InvalidInputError as error:
-            self._health.refuse(error)
+            self.health.refuse(error)
+            return
         except MagnetosutureError as error:
             self._fail(error)
+        self._leave_out(elapsed - self.rig.time)
+
+    def _leave_out(self, behind: float) -> None:
+        """Let the time lag by what the rig is behind [s]: what it had no time for it never makes good."""
+        if behind > 1e-9:
+            self.time.slip(behind)
+            self._phase = None if self._phase is None else self._phase - behind
 
     def _take(self, elapsed: float) -> None:
         try:
@@ -123,18 +141,28 @@ class RigSimulatorNode(Node):
         except MagnetosutureError as error:
             self._fail(error)
             return
+        finally:
+            self._leave_out(elapsed - self.rig.time)
         stamp = self.time.stamp(frame.time)  # currents may have moved the rig on since the frame was due
         if frame.lateness:
             self._late.append((elapsed + frame.lateness, stamp, frame))
         else:
             self._publisher.publish(stamp, frame)
         self._frames += 1
-        self._health.ok(self.rig.status, taken=self._frames, skipped=self._skipped)
+        factor = self.time.real_time_factor(self.rig.time)
+        late = factor < MIN_REAL_TIME_FACTOR
+        text = self.rig.problem or self.rig.status
+        if late:
+            text = f"{text}; late: simulated time runs at {100.0 * factor:.0f} % of real time"
+        moving = self.health.warn if late else self.health.ok
+        level = self.health.error if self.rig.problem else moving
+        values = {"taken": self._frames, "skipped": self._skipped, "real_time_factor": round(factor, 2)}
+        level(text, **values, **{"lag [s]": round(self.time.lag, 3)})
 
     def _fail(self, error: MagnetosutureError) -> None:
         """Switch the coils off where the simulation does not find its next state, and say so."""
         self.rig.switch_off()
-        self._health.error(str(error))
+        self.health.error(str(error))
 
 
 def main(arguments: list[str] | None = None) -> int:

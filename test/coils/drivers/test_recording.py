@@ -14,7 +14,7 @@ def test_it_keeps_what_it_was_told_and_ends_with_zeros():
     assert isinstance(driver, RecordingDriver)
     driver.open()
     currents = np.array([1.0, 0.0, 0.5, 0.0])
-    driver.apply(currents)
+    driver.apply(currents, 0.0)
     currents[0] = 9.0
     driver.close()
     assert [applied.tolist() for applied in driver.applied] == [[1.0, 0.0, 0.5, 0.0], [0.0] * 4]
@@ -22,8 +22,8 @@ def test_it_keeps_what_it_was_told_and_ends_with_zeros():
 
 def test_it_refuses_what_a_real_driver_would():
     driver = RecordingDriver(4)
-    driver.apply(np.ones(4))
+    driver.apply(np.ones(4), 0.0)
     assert not driver.applied
     driver.open()
     with pytest.raises(ValueError, match="4 currents"):
-        driver.apply(np.zeros(3))
+        driver.apply(np.zeros(3), 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import termios
 import time
 from collections.abc import Callable
@@ -71,6 +72,7 @@ class Board:
         self.voltage = 0.0
         self.currents = (0.0, 0.0)
         self._commanded = (0.0, 0.0)
+        self._expires = math.inf  # of the values of an exchange
         self._written = (0, 0)
         self._signs = [1, 1]
         self._poll_index = 0
@@ -108,20 +110,22 @@ class Board:
         for query in (*protocol.SETTING_QUERIES, Query.STATUS, *first_currents, Query.VOLTAGES):
             self._poll(query)
 
-    def write(self, latest: Callable[[], Vector | None]) -> None:
+    def write(self, latest: Callable[[], Vector | None], expires: Callable[[], float] = lambda: math.inf) -> None:
         """Command the latest currents of its two coils.
 
         They are read again before each attempt, as they may have been stopped in between.
 
         Args:
             latest: returns the currents to apply now, shape (2,) [A]; None is zero in both coils.
+            expires: returns until when they may be written, a time of `time.monotonic` [s].
 
         Raises:
             DeviceError: the board does not acknowledge.
         """
 
         def target_duties() -> tuple[int, ...]:
-            currents = latest()
+            until, currents = expires(), latest()  # in this order: of newer currents, the earlier end
+            self._expires = math.inf if currents is None else until
             duties, self._supply_too_low = (
                 ((0, 0), False) if currents is None else protocol.duties_for(currents, self._resistances, self.voltage)
             )
@@ -231,9 +235,10 @@ class Board:
                 if self._no_retry():
                     break
                 time.sleep(RETRY_DELAY)
+            self._expires = math.inf
             sent = values()
             try:
-                self._port.begin()
+                self._port.begin(self._expires)
                 result = call(self._address, *sent)
             except (BasicmicroError, serial.SerialException, OSError, termios.error):
                 continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,9 +30,9 @@ class RoboClawDriver:
     ends when they agree or less is commanded.
 
     Each serial port has its own thread. It applies the latest currents while every board is ready, and zero
-    otherwise: if one board fails, if `apply` is not called for `apply_timeout`, and after every loss until the
+    otherwise: if one board fails, if the currents are older than `apply_timeout`, and after every loss until the
     first `apply` after all are ready again. Currents are read again for each board and each attempt to write, so
-    that a stop takes effect in between.
+    that a stop takes effect in between, and their age is checked once more when the packet is about to be written.
 
     Every board has its own current limit, and stops by itself without a packet for `driver_timeout`; a board that
     does not confirm both is never ready. Both are polled, with two boards on a line within about a second: a board
@@ -40,7 +41,8 @@ class RoboClawDriver:
     Args:
         settings: of the bridge.
         coils: number of coils; that of the settings' angles if None.
-        apply_timeout: without `apply` for this long the coils go to zero [s]; `command_timeout` if None.
+        apply_timeout: currents older than this are zero [s]; if None the smaller of `command_timeout` and
+            `driver_timeout`, after which the boards have stopped by themselves.
 
     Raises:
         DriverError: ports, addresses, baud rate or timeout are invalid.
@@ -51,7 +53,8 @@ class RoboClawDriver:
     ) -> None:
         self._settings = settings
         self._coils = len(settings.coil_angles) if coils is None else coils
-        self._apply_timeout = settings.command_timeout if apply_timeout is None else apply_timeout
+        usual = min(settings.command_timeout, settings.driver_timeout)
+        self._apply_timeout = usual if apply_timeout is None else apply_timeout
         self._ports = _boards_by_port(settings, self._coils)
         self._mailbox: Mailbox | None = None
         self._lines: list[LineThread] = []
@@ -69,8 +72,12 @@ class RoboClawDriver:
         for line in self._lines:
             line.start()
 
-    def apply(self, currents: Vector) -> None:
-        """Set the current of each coil from now on, shape (m,) [A]; ignored while not ready.
+    def apply(self, currents: Vector, computed: float) -> None:
+        """Set the current of each coil from now on, for `apply_timeout` at the most; ignored while not ready.
+
+        Args:
+            currents: of the coils, shape (m,) [A].
+            computed: the time of `time.monotonic` for which they were computed [s].
 
         Raises:
             ValueError: the number of currents is wrong, or one is not finite.
@@ -79,11 +86,13 @@ class RoboClawDriver:
             raise ValueError(f"{self._coils} finite currents expected, got {currents.tolist()}")
         if self._mailbox is not None:
             limit = self._settings.max_current
-            self._mailbox.put(np.clip(currents, -limit, limit), time.monotonic())
+            self._mailbox.put(np.clip(currents, -limit, limit), computed)
 
     def state(self) -> DriverState:
         """Return the present state."""
-        return DriverState(False, "not open") if self._mailbox is None else self._mailbox.state()
+        if self._mailbox is None:
+            return DriverState(False, "not open")
+        return replace(self._mailbox.state(), timeout=self._settings.driver_timeout)
 
     def close(self) -> None:
         """Set all currents to zero and disconnect, within 0.3 s; no effect if not open."""

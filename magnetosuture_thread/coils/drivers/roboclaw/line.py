@@ -59,22 +59,26 @@ class Mailbox:
         self._problems = list(problems)  # a line without a problem is ready
         self._reports: list[LineReport | None] = [None] * len(problems)
         self._currents: Vector | None = None
-        self._put_at = 0.0
+        self._computed = 0.0
         self._timed_out = False
         self._losses = 0
 
-    def put(self, currents: Vector, now: float) -> None:
-        """Set the currents, shape (m,) [A]; they are dropped unless every line is ready."""
+    def put(self, currents: Vector, computed: float) -> None:
+        """Set the currents, shape (m,) [A], and when they were computed; dropped unless every line is ready."""
         with self._lock:
             if any(self._problems):
                 return
-            self._currents, self._put_at, self._timed_out = currents.copy(), now, False
+            self._currents, self._computed, self._timed_out = currents.copy(), computed, False
         self._wake()
+
+    def expires(self) -> float:
+        """Return until when the currents may be applied [s]."""
+        return self._computed + self._timeout
 
     def latest(self, now: float) -> Vector | None:
         """Return the currents to apply now, shape (m,) [A]; None is zero in all coils."""
         with self._lock:
-            if self._currents is not None and now - self._put_at > self._timeout:
+            if self._currents is not None and now - self._computed > self._timeout:
                 self._timed_out = bool(np.any(self._currents))
                 self._currents = None
             return self._currents
@@ -208,7 +212,7 @@ class LineThread:
             self._wake.wait(KEEP_ALIVE_PERIOD)
             self._wake.clear()
             for number, board in self._boards.items():
-                board.write(partial(self._latest, number))
+                board.write(partial(self._latest, number), self._mailbox.expires)
             # New currents go first, but the boards must be polled all the same.
             if not self._wake.is_set() or time.monotonic() - polled_at > POLL_PERIOD:
                 list(self._boards.values())[turn % len(self._boards)].poll()

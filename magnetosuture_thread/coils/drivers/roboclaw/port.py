@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import select
 import time
@@ -35,15 +36,20 @@ class ExchangePort(serial.Serial):
         self.answer_timeout = answer_timeout
         self._packet = bytearray()
         self.answer = bytearray()
-        self._until = 0.0
+        self._until = self._expires = 0.0
         try:
             # The lock comes first, so that a process that holds the port is not disturbed.
             super().__init__(path, baud_rate, timeout=answer_timeout, exclusive=True)
         except (serial.SerialException, ValueError) as error:
             raise DeviceError(_open_problem(path, error)) from error
 
-    def begin(self) -> None:
-        """Begin an exchange; discard late bytes of the last one."""
+    def begin(self, expires: float = math.inf) -> None:
+        """Begin an exchange; discard late bytes of the last one.
+
+        Args:
+            expires: when the packet is outdated, and is not sent any more: a time of `time.monotonic` [s].
+        """
+        self._expires = expires
         self.reset_input_buffer()
         self._packet.clear()
         self.answer.clear()
@@ -81,6 +87,9 @@ class ExchangePort(serial.Serial):
         The library's own write reports a sent packet as not sent if this thread was delayed after the system call.
         """
         _, room, _ = select.select([], [self], [], max(0.0, self._until - time.monotonic()))
+        # At the last moment: this process may have been stopped for long, and gone on just now.
+        if time.monotonic() >= min(self._until, self._expires):
+            raise serial.SerialTimeoutException("an outdated packet")
         if not room or os.write(self.fileno(), packet) < len(packet):
             raise serial.SerialTimeoutException("no room for a packet")
 

@@ -90,7 +90,7 @@ class Bench:
 
         def ask() -> None:
             while not ends.wait(0.005):
-                driver.apply(np.array(currents))
+                driver.apply(np.array(currents), time.monotonic())
 
         thread = threading.Thread(target=ask)
         thread.start()

@@ -40,7 +40,7 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=sys.argv[1:], driver_timeout=0.3))
 driver.open()
 while True:
-    driver.apply(np.array([3.0, -6.0, 1.5, 0.0]))
+    driver.apply(np.array([3.0, -6.0, 1.5, 0.0]), time.monotonic())
     time.sleep(0.005)
 """
 
@@ -90,7 +90,7 @@ def test_currents_beyond_the_limit_are_cut_at_it(bench):
 
 def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
     driver = bench.open(command_timeout=0.1, driver_timeout=1.0)
-    bench.wait(lambda: driver.apply(np.array(CURRENTS)) or bench.duties(0) == DUTIES[0], "the duties")
+    bench.wait(lambda: driver.apply(np.array(CURRENTS), time.monotonic()) or bench.duties(0) == DUTIES[0], "the duties")
     bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
     (zero_at, _) = bench.boards[0].timeline[-1]
     assert zero_at < bench.boards[0].heard + 1.0  # it was told, and has not stopped by its own timeout
@@ -103,7 +103,7 @@ def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
 
 def test_what_stays_in_force_is_written_often_enough(bench):
     driver = bench.open(apply_timeout=60.0, driver_timeout=0.5, **PATIENT)
-    driver.apply(np.array(CURRENTS))
+    driver.apply(np.array(CURRENTS), time.monotonic())
     bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
     since = bench.boards[0].timeline[0][0]
     bench.wait(lambda: bench.boards[0].heard > since + 1.2, "twice the timeout to pass")
@@ -334,12 +334,12 @@ def test_a_stop_wins_over_what_was_asked_before_it(bench, shared: bool):
     driver = bench.open(apply_timeout=60.0, **PATIENT)
 
     def stop(answer: bytes) -> bytes:
-        driver.apply(np.zeros(4))
+        driver.apply(np.zeros(4), time.monotonic())
         return answer if shared else b""  # lost: there is a second attempt
 
     told = tapped(bench.boards[0], stop)
     others = tapped(bench.boards[1], bytes)
-    driver.apply(np.array(CURRENTS))
+    driver.apply(np.array(CURRENTS), time.monotonic())
     bench.wait(lambda: DUTIES[0] in told and told[-1] == (0, 0), "the duties, and zero")
     bench.heard(0)
     bench.heard(1)
@@ -421,7 +421,7 @@ def test_nothing_waits_for_a_board(bench):
     longest = 0.0
     for _ in range(200):
         began = time.perf_counter()
-        driver.apply(np.array(CURRENTS))
+        driver.apply(np.array(CURRENTS), time.monotonic())
         driver.state()
         longest = max(longest, time.perf_counter() - began)
         time.sleep(0.001)
@@ -442,13 +442,13 @@ def test_what_is_no_current_is_refused(bench):
     driver = bench.open()
     for currents in (np.zeros(3), np.array([math.nan, 0.0, 0.0, 0.0]), np.full(4, math.inf)):
         with pytest.raises(ValueError, match="4 finite currents"):
-            driver.apply(currents)
+            driver.apply(currents, time.monotonic())
     assert driver.state().ready
 
 
 def test_it_does_nothing_before_it_is_opened(bench):
     driver = RoboClawDriver(bench.settings())
-    driver.apply(np.zeros(4))
+    driver.apply(np.zeros(4), time.monotonic())
     assert driver.state().problem == "not open"
     driver.close()
 

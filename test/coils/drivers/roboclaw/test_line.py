@@ -94,7 +94,7 @@ class DeadPort(serial.Serial):
         self.answer = bytearray()
         self.exchanges = 0
 
-    def begin(self) -> None:
+    def begin(self, expires: float) -> None:
         """Begin an exchange."""
         self.exchanges += 1
         self._clock.now += ANSWER_TIMEOUT
@@ -173,7 +173,7 @@ class Hearing:
         self.asked: list[list[float] | None] = []
         self._between = between
 
-    def write(self, newest: Callable[[], Vector | None]) -> None:
+    def write(self, newest: Callable[[], Vector | None], expires: Callable[[], float]) -> None:
         """Take currents twice."""
         for _ in range(2):
             currents = newest()

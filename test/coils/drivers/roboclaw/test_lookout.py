@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ def test_a_board_whose_power_was_gone_is_a_loss_however_soon_it_is_back(
     if shared:
         bench.share()
     driver = bench.open(apply_timeout=60.0, roboclaw_answer_timeout=0.5)  # no loss that is only the busy machine's
-    driver.apply(np.array(currents))
+    driver.apply(np.array(currents), time.monotonic())
     bench.wait(lambda: bench.duties(1) == (DUTIES[1] if any(currents) else (0, 0)), "the duties")
     with bench.stage.lines[-1].lock:
         bench.boards[1].power_cycle()
@@ -27,7 +29,7 @@ def test_a_board_whose_power_was_gone_is_a_loss_however_soon_it_is_back(
     bench.heard(0)
     bench.heard(1)
     assert bench.duties(0) == bench.duties(1) == (0, 0)
-    driver.apply(np.array(CURRENTS))
+    driver.apply(np.array(CURRENTS), time.monotonic())
     bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties again")
     assert driver.state().losses == 1
 

@@ -1,0 +1,47 @@
+"""A process that was stopped and goes on writes no duty of before: SIGSTOP, a debugger, a virtual machine."""
+
+from __future__ import annotations
+
+import select
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.drivers.roboclaw import port
+
+CURRENTS = np.array([3.0, -6.0, 1.5, 2.0])
+
+
+def duties_during(bench, seconds: float) -> set[tuple[int, int]]:
+    """Return all duties that the boards have for a while."""
+    until, found = time.monotonic() + seconds, set()
+    while time.monotonic() < until:
+        found |= {bench.duties(0), bench.duties(1)}
+        time.sleep(0.001)
+    return found
+
+
+def test_currents_that_were_computed_long_ago_are_zero(bench):
+    """As where the bridge is stopped between a command and the driver."""
+    driver = bench.open(apply_timeout=0.1)
+    driver.apply(CURRENTS, time.monotonic() - 0.45)
+    assert duties_during(bench, 0.3) == {(0, 0)}
+
+
+def test_currents_that_grow_old_before_their_packet_is_written_are_zero(bench, monkeypatch: pytest.MonkeyPatch):
+    """As where the thread of the line is stopped between looking at their age and writing."""
+    driver = bench.open(apply_timeout=0.1, roboclaw_answer_timeout=1.0, driver_timeout=1.0)
+    real = select.select
+
+    def stopped(*waited: Any) -> Any:
+        time.sleep(0.15)
+        return real(*waited)
+
+    monkeypatch.setattr(port, "select", SimpleNamespace(select=stopped))
+    for _ in range(4):
+        driver.apply(CURRENTS, time.monotonic())
+        assert duties_during(bench, 0.3) == {(0, 0)}
+    assert driver.state().ready

@@ -1,0 +1,67 @@
+"""Bridge, driver and latch as one unit."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.bridge import CoilBridge
+from magnetosuture_thread.coils.coil_system import CoilSystem
+from magnetosuture_thread.coils.drivers import RecordingDriver
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.coils.stop_record import StopRecord
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.scene import Scene
+
+
+class TimedDriver(RecordingDriver):
+    """A driver that records when its currents were computed."""
+
+    def __init__(self, coils: int) -> None:
+        super().__init__(coils)
+        self.computed: list[float] = []
+
+    def apply(self, currents: np.ndarray, computed: float) -> None:
+        """Record."""
+        super().apply(currents, computed)
+        self.computed.append(computed)
+
+
+@pytest.fixture
+def system() -> CoilSystem:
+    """An open system."""
+    made, settings = CoilSystem(), CoilBridgeSettings()
+    made.open(settings, CoilBridge(settings, made.latch, Scene()), TimedDriver(4))
+    return made
+
+
+def test_a_driver_is_told_for_when_currents_were_computed(system):
+    system.step(500.0, 100.0)
+    assert system.driver.computed == [100.0]  # not when they came to the driver
+    system.zero()
+    assert system.driver.computed[-1] == math.inf  # zeros never grow old
+
+
+def test_its_end_is_zero_with_the_reason(system):
+    system.step(500.0, 100.0)
+    final = system.close("finalized")
+    assert not final.allocation.currents.any()
+    assert (final.reasons, final.publish) == (("finalized",), True)
+    assert system.closed_reasons == ("finalized",)
+    assert system.close() is None
+
+
+def test_where_arming_cannot_be_recorded_it_does_not_arm(system, tmp_path: Path):
+    (tmp_path / "state").write_text("a file in the place of the folder")
+    system.recall(StopRecord(tmp_path / "state" / "bridge.stop"))
+    system.latch.reset("")
+    system.latch.activate()
+    with pytest.raises(InvalidInputError, match="stop_file"):
+        system.arm(True)
+    assert not system.latch.armed
+    system.arm_when_ready()
+    system.step(500.0, 100.0)
+    assert "stop_file" in system.latch.fault

@@ -1,0 +1,277 @@
+"""How the coil bridge ends and begins again: zeros and a last word, and an emergency stop that outlives the process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from lifecycle_msgs.msg import Transition
+from magnetosuture_msgs.msg import CoilBridgeState
+
+from magnetosuture_thread.coils.coil_system import UNCLEAN_END
+from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread.interface import EMERGENCY_STOP, RESET
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.processes import graph_environment
+from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from test.nodes.bridge import (
+    LONG,
+    READY,
+    applied,
+    arm,
+    armed,
+    change,
+    drive,
+    driven,
+    press,
+    reasons,
+    set_parameter,
+    stage,
+)
+
+LAST = (topics.CURRENTS, topics.RIG_CURRENTS, topics.NEEDLE_SETPOINT, topics.BRIDGE_STATE)
+PATIENCE = 60.0  # s for a process on a busy machine
+
+
+@contextmanager
+def process(graph, **parameters: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a bridge as a process in the test's graph, whose wires end at the test."""
+    given = {"driver": "simulated", **READY, **LONG, **parameters}
+    command = [sys.executable, "-m", "magnetosuture_thread.nodes.coil_bridge", "--ros-args"]
+    for name, value in given.items():
+        command += ["-p", f"{name}:={value}"]
+    ended = subprocess.Popen(command, env=graph_environment(graph.domain))
+    try:
+        yield ended
+    finally:
+        ended.kill()
+        ended.wait()
+
+
+def last(graph) -> dict[str, list[Any]]:
+    """Return the lists of messages of the topics that must end with zeros."""
+    return {topic.name: graph.listen_later(topic) for topic in LAST}
+
+
+def says(heard: dict[str, list[Any]], ending: str) -> bool:
+    """Return whether the last of each topic is zero, and the state says why."""
+    state = heard[topics.BRIDGE_STATE.name]
+    return (
+        bool(state)
+        and ending in state[-1].reasons
+        and not state[-1].armed
+        and not any(state[-1].current)
+        and all(heard[topic.name] and not np.any(heard[topic.name][-1].current) for topic in LAST[:2])
+        and not any(vars_of(heard[topics.NEEDLE_SETPOINT.name][-1].twist.linear))
+        and heard[topics.CURRENTS.name][-1].stop == ending
+    )
+
+
+def vars_of(vector: Any) -> tuple[float, float]:
+    """Return x and y."""
+    return vector.x, vector.y
+
+
+def moving(heard: dict[str, list[Any]]) -> bool:
+    """Return whether the last currents on the wires are not zero."""
+    wires = heard[topics.RIG_CURRENTS.name]
+    return bool(wires) and bool(np.any(wires[-1].current))
+
+
+def armed_and_driving(graph, heard: dict[str, list[Any]], moves: Callable[[], bool] | None = None) -> None:
+    """Arm a bridge in another process and command it until something moves, by default the currents on the wires."""
+    states = heard[topics.BRIDGE_STATE.name]
+    graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", PATIENCE)
+
+    def drives() -> bool:
+        if not states[-1].armed:
+            arm(graph)
+        drive(graph)
+        return moving(heard) if moves is None else moves()
+
+    graph.wait(drives, "a current", PATIENCE)
+
+
+@pytest.mark.parametrize("which", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_the_last_messages_of_a_bridge_that_is_ended_are_zeros_and_why(graph, which: signal.Signals):
+    heard = last(graph)
+    with process(graph) as bridge:
+        armed_and_driving(graph, heard)
+        bridge.send_signal(which)
+        assert bridge.wait(PATIENCE) == 0
+    graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
+
+
+@pytest.mark.parametrize(
+    ("transitions", "ending"),
+    [
+        ([Transition.TRANSITION_ACTIVE_SHUTDOWN], "finalized"),
+        ([Transition.TRANSITION_DEACTIVATE], "inactive"),
+        ([Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP], "unconfigured"),
+    ],
+)
+def test_every_transition_out_of_work_says_so_with_zeros(graph, transitions: list[int], ending: str):
+    heard = last(graph)
+    armed(graph, driver="simulated", **LONG)
+    drive(graph)
+    graph.wait(lambda: moving(heard), "a current")
+    for transition in transitions:
+        assert change(graph, transition)
+    graph.wait(lambda: says(heard, ending), "zeros and the reason")
+
+
+def test_a_finalized_bridge_is_reported_as_such(graph):
+    graph.add(CoilBridgeNode, **READY)
+    states, diagnostics = graph.listen(topics.BRIDGE_STATE), graph.listen(topics.DIAGNOSTICS)
+    assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert stage(graph) == "finalized"
+    graph.wait(lambda: reasons(states) == "finalized", "the state")
+    graph.wait(lambda: diagnostics[-1].status[0].message == "finalized", "the diagnostics")
+
+
+def test_all_can_be_set_before_a_bridge_is_first_configured(graph):
+    node = graph.add(CoilBridgeNode, autostart="unconfigured")
+    assert set_parameter(graph, "max_current", 3.0).successful
+    assert not set_parameter(graph, "max_current", 3000.0).successful
+    assert change(graph, Transition.TRANSITION_CONFIGURE)
+    assert node.settings.max_current == 3.0
+
+
+def test_an_emergency_stop_outlives_the_bridge(graph):
+    """A node that is destroyed without a transition leaves what a crash leaves."""
+    node = armed(graph, **LONG)
+    assert press(graph, EMERGENCY_STOP).success
+    graph.remove(node)
+    node = graph.add(CoilBridgeNode, autostart="armed", **READY, **LONG)
+    states = graph.listen(topics.BRIDGE_STATE)
+    graph.wait(lambda: bool(states) and states[-1].emergency_stopped, "the stop")
+    assert stage(graph) == "inactive"
+    assert not arm(graph).success
+    told = len(applied(node))
+    drive(graph)
+    graph.wait(lambda: len(applied(node)) > told + 20, "some steps")
+    assert not driven(node)
+    assert press(graph, RESET).success
+    assert stage(graph) == "active"
+    assert not node.system.latch.armed  # not by itself either
+    assert arm(graph).success
+    assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    graph.remove(node)
+    assert armed(graph, **LONG).system.latch.armed
+
+
+def test_an_emergency_stop_outlives_an_end_in_order_too(graph):
+    node = graph.add(CoilBridgeNode, autostart="unconfigured", **READY)
+    assert press(graph, EMERGENCY_STOP).success
+    assert change(graph, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+    graph.remove(node)
+    node = graph.add(CoilBridgeNode, autostart="unconfigured", **READY)
+    assert node.system.latch.emergency
+    assert press(graph, RESET).success
+    graph.remove(node)
+    assert not graph.add(CoilBridgeNode, **READY).system.latch.latched_reason
+
+
+def test_a_bridge_that_was_killed_while_armed_waits_for_a_reset(graph):
+    heard = last(graph)
+    states = heard[topics.BRIDGE_STATE.name]
+    with process(graph, autostart="armed") as bridge:
+        armed_and_driving(graph, heard)
+        bridge.kill()
+        bridge.wait()
+    states.clear()
+    with process(graph, autostart="armed") as bridge:
+        # The last message of the one before may still be on its way.
+        graph.wait(lambda: bool(states) and UNCLEAN_END in reasons(states), "the fault", PATIENCE)
+        graph.wait(lambda: bool(states[-1].driver_ready), "the driver", PATIENCE)
+        assert states[-1].state == CoilBridgeState.STATE_FAULT
+        assert not arm(graph).success
+        assert press(graph, EMERGENCY_STOP).success
+        bridge.kill()  # at once after the answer
+        bridge.wait()
+    states.clear()
+    with process(graph, autostart="armed") as bridge:
+        graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", PATIENCE)
+        assert states[-1].emergency_stopped
+        assert not any(state.armed for state in states)
+        assert press(graph, RESET).success
+        armed_and_driving(graph, heard)
+
+
+def test_a_bridge_that_was_frozen_while_it_drove_is_in_fault(graph, tmp_path: Path):
+    """Its boards, on pseudo-terminals, stop by themselves meanwhile; a person has to look where the needle is."""
+    heard, ports = last(graph), [str(tmp_path / "a"), str(tmp_path / "b")]
+    states = heard[topics.BRIDGE_STATE.name]
+    boards = {"power_stage": "roboclaw", "power_stage_ports": ports, "scene": READY["scene"], "frame_rate": 5.0}
+    rig = graph.add(RigSimulatorNode, **boards).rig
+    with process(graph, driver="roboclaw", roboclaw_ports=f"[{', '.join(ports)}]") as bridge:
+        armed_and_driving(graph, heard, lambda: bool(np.abs(rig.currents).max() > 0.1))
+        bridge.send_signal(signal.SIGSTOP)
+        graph.wait(lambda: bool(np.abs(rig.currents).max() < 1e-3), "the boards to stop")
+        states.clear()
+        bridge.send_signal(signal.SIGCONT)
+
+        def is_in_fault() -> bool:
+            assert np.abs(rig.currents).max() < 1e-3  # from the first moment on
+            return bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT
+
+        graph.wait(is_in_fault, "the fault", PATIENCE)
+        until = time.monotonic() + 0.5
+        while time.monotonic() < until:
+            drive(graph)
+            assert np.abs(rig.currents).max() < 1e-3
+
+
+def test_two_bridges_of_other_names_keep_their_own(graph, tmp_path: Path):
+    node = graph.add(CoilBridgeNode, stop_file=str(tmp_path / "left.stop"), **READY)
+    assert press(graph, EMERGENCY_STOP).success
+    graph.remove(node)
+    graph.remove(graph.add(CoilBridgeNode, stop_file=str(tmp_path / "right.stop"), **READY))
+    assert (tmp_path / "left.stop").read_text() == "stopped\n"
+    assert (tmp_path / "right.stop").read_text() == "disarmed\n"
+
+
+@pytest.mark.parametrize("file", ["/dev/full", "/proc/nowhere/bridge.stop", "/dev"])
+def test_a_stop_that_cannot_be_kept_is_an_error_at_configure(graph, file: str):
+    with pytest.raises(InvalidInputError, match=r"coil_bridge\.stop_file: got .*, expected a file that can"):
+        graph.add(CoilBridgeNode, stop_file=file, **READY)
+
+
+def test_a_full_disk_holds_up_no_stop(graph, monkeypatch: pytest.MonkeyPatch):
+    node = armed(graph, **LONG)
+    drive(graph)
+    graph.wait(lambda: driven(node), "a current")
+    seen: list[bool] = []
+
+    def full() -> None:
+        seen.append(bool(applied(node)[-1].any()))
+        raise InvalidInputError("stop_file", "No space left on device", "a file that can be written")
+
+    monkeypatch.setattr(node.system, "remember", full)
+    answer = press(graph, EMERGENCY_STOP)
+    assert answer.success
+    assert "No space left" in answer.message
+    assert seen[0] is False  # the coils were at zero before the disk was asked
+
+
+@pytest.mark.parametrize("name", ["calibration", "scene", "stop_file"])
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_no_file_of_a_parameter_holds_up_the_bridge(graph, tmp_path: Path, name: str, kind: str):
+    path = tmp_path / "pipe.yaml"
+    os.mkfifo(path)
+    given = {**READY, name: "/dev/zero" if kind == "device" else str(path)}
+    node = graph.add(CoilBridgeNode, autostart="unconfigured", **given)
+    assert not change(graph, Transition.TRANSITION_CONFIGURE)
+    assert isinstance(node.problem, MagnetosutureError)
+    assert Path(str(given[name])).name in str(node.problem)  # of a long path the middle is left out
+    assert press(graph, EMERGENCY_STOP).success
