@@ -21,8 +21,11 @@ HELLO_TIMEOUT = 5.0  # after the connection [s]
 SEND_TIMEOUT = 2.0  # after which a page that does not receive is disconnected [s]
 MAX_LATE_TIME = 1.0  # after which a page whose messages are all late must reconnect [s]
 MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
+MAX_WATCHER_RATE = 20  # per second, besides receipts; beyond, a page without the token is disconnected
+MAX_RECEIPT_CHARS = 100
+ACKNOWLEDGE, VISIBILITY = '"acknowledge"', '"visibility"'  # all that such a page has to say
 MAX_EXCESS_MESSAGES = 2000  # beyond that rate, in total, after which the connection is closed
-EMERGENCY_STOP = messages.BridgeAction("stop")
+EMERGENCY_STOP, DISARM = messages.BridgeAction("stop"), messages.BridgeAction("disarm")
 MAX_PENDING_REQUESTS = 4  # of one page, besides emergency stops
 UNLEASED_ACTIONS = ("stop", "disarm")  # allowed for every page with the token, with or without control
 
@@ -42,12 +45,13 @@ class RequestHandler:
         self._graph, self._host, self._jog = graph, host, jog
         self._pending: dict[asyncio.Task[None], int] = {}
 
-    def start(self, client: int, message: messages.ClientMessage, reply: Reply) -> None:
+    def start(self, client: int, message: messages.ClientMessage, operator: str, reply: Reply) -> None:
         """Start a request of a page with the token.
 
         Args:
             client: its number.
             message: the request.
+            operator: who commands the page, as recordings note it.
             reply: called with the request's name and the refusal, empty on success.
 
         Raises:
@@ -62,7 +66,7 @@ class RequestHandler:
             )
         if not isinstance(message, messages.RecordBag) and message != messages.BridgeAction("arm"):
             self._jog.stop()
-        task = asyncio.create_task(self._execute(message, reply))
+        task = asyncio.create_task(self._execute(message, operator, reply))
         self._pending[task] = client
         task.add_done_callback(lambda done: self._pending.pop(done, None))
 
@@ -73,14 +77,14 @@ class RequestHandler:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _execute(self, message: messages.ClientMessage, reply: Reply) -> None:
+    async def _execute(self, message: messages.ClientMessage, operator: str, reply: Reply) -> None:
         try:
-            refusal = await self._request(message)
+            refusal = await self._request(message, operator)
         except MagnetosutureError as error:
             refusal = str(error)
         reply(_name(message), refusal)
 
-    def _request(self, message: messages.ClientMessage) -> Awaitable[str]:
+    def _request(self, message: messages.ClientMessage, operator: str) -> Awaitable[str]:
         if isinstance(message, messages.BridgeAction):
             return self._graph.execute_action(message.action)
         if isinstance(message, messages.SelectSetup):
@@ -88,7 +92,7 @@ class RequestHandler:
         if isinstance(message, messages.Pause):
             return self._host.set_paused(message.paused)
         if isinstance(message, messages.RecordBag):
-            return self._host.set_recording(message.recording)
+            return self._host.set_recording(message.recording, operator)
         raise InvalidInputError("message", _name(message), "a request")
 
 
@@ -107,19 +111,25 @@ class Client:
         token: that permits commands.
         jog: control lease and jog commands.
         requests: handler of all other requests.
+
+    Attributes:
+        address: of the page's computer.
+        has_token: whether it has shown the token, with the connection or in its greeting.
+        is_script: whether a program commands it, and no person.
     """
 
     def __init__(
         self,
         number: int,
         socket: web.WebSocketResponse,
-        request: web.Request,
+        request: web.BaseRequest,
         settings: ConsoleSettings,
         token: str,
         jog: JogController,
         requests: RequestHandler,
     ) -> None:
-        self.number = number
+        self.number, self.address, self.has_token = number, request.remote or "", False
+        self.is_script = True
         self._socket, self._request = socket, request
         self._settings, self._token = settings, token
         self._jog, self._requests = jog, requests
@@ -136,16 +146,20 @@ class Client:
         self._wake.set()
 
     async def serve(self) -> None:
-        """Handle messages until the page disconnects; the needle is stopped in any case."""
+        """Handle messages until the page disconnects; the bridge is disarmed then if the page had control."""
         sending = None
         try:
             if not await self._handshake():
                 return
             sending = asyncio.create_task(self._send_all())
+            receive = self._on_message if self._can_command else self._on_watcher_message
             async for message in self._socket:
-                await self._on_message(message.type, message.data)
+                await receive(message.type, message.data)
         finally:
-            self._jog.release_control(self.number)
+            if self._jog.holder == self.number:
+                self._jog.release_control(self.number)
+                # Nobody is there who would see what the needle does.
+                self._requests.start(self.number, DISARM, "nobody", lambda name, refusal: None)
             if sending is not None:
                 sending.cancel()
                 await asyncio.gather(sending, return_exceptions=True)
@@ -163,7 +177,9 @@ class Client:
         if not isinstance(parsed, messages.Hello):
             await self._socket.close(code=1008, message=b"expected hello first")
             return False
-        self._can_command = same_token(parsed.token, self._token)
+        self._can_command = self.has_token = same_token(parsed.token, self._token)
+        # Programs other than browsers name no origin.
+        self.is_script = parsed.automated is not False or not self._request.headers.get("Origin")
         settings = self._settings
         self._reply(
             "welcome",
@@ -191,9 +207,6 @@ class Client:
             if isinstance(parsed, messages.Acknowledge):
                 self._outbox.acknowledge(parsed.kind)
                 self._wake.set()
-            elif not self._can_command:
-                if not isinstance(parsed, messages.Visibility):
-                    raise InvalidInputError("token", "none", "the one in the console's address: this page only watches")
             else:
                 await self._dispatch(parsed, now)
         except InvalidInputError as error:
@@ -201,6 +214,19 @@ class Client:
             self._reply("error", text=str(error))
             if self._excess > MAX_EXCESS_MESSAGES:
                 await self._socket.close(code=1008, message=b"too many messages")
+
+    async def _on_watcher_message(self, kind: WSMsgType, data: Any) -> None:
+        """Handle a message of a page without the token: receipts count, all else is not even parsed."""
+        text = data[:MAX_RECEIPT_CHARS] if kind is WSMsgType.TEXT else ""
+        if ACKNOWLEDGE in text and self._outbox.acknowledge("frame" if '"frame"' in text else "state"):
+            self._wake.set()
+            return
+        self._count_message(asyncio.get_running_loop().time())
+        if self._message_count > MAX_WATCHER_RATE:
+            self._abort()  # at once, without the formalities of closing
+        elif VISIBILITY not in text:
+            expected = "the one in the console's address: this page only watches"
+            self._reply("error", text=str(InvalidInputError("token", "none", expected)))
 
     async def _dispatch(self, message: messages.ClientMessage, now: float) -> None:
         if isinstance(message, messages.Jog):
@@ -216,7 +242,10 @@ class Client:
             self._jog.set_visible(self.number, message.visible)
         elif not isinstance(message, (messages.Hello, messages.Acknowledge)):
             self._requests.start(
-                self.number, message, lambda name, refusal: self._reply("result", request=name, refusal=refusal)
+                self.number,
+                message,
+                "a script" if self.is_script else "an operator",
+                lambda name, refusal: self._reply("result", request=name, refusal=refusal),
             )
 
     async def _on_jog(self, message: messages.Jog, now: float) -> None:
@@ -227,7 +256,8 @@ class Client:
                 self._reply("error", text="jog: this page does not have control; take control first")
             return
         self._jog.interrupt(self.number)
-        self._reply("error", text=f"jog: {delay:.2f} s late, expected at most {self._settings.hold_timeout:g} s")
+        expected = f"expected at most {self._settings.hold_timeout:g} s"
+        self._reply("error", text=f"jog: computer or network {delay:.2f} s late, {expected}", delay=delay)
         if now - self._last_in_time > MAX_LATE_TIME:
             await self._socket.close(code=1008, message=b"all messages are late")
 
@@ -251,9 +281,12 @@ class Client:
                 while (message := self._outbox.next()) is not None:
                     await asyncio.wait_for(self._send(message), SEND_TIMEOUT)
         except (asyncio.TimeoutError, ConnectionError):
-            transport = self._request.transport
-            if transport is not None:
-                transport.abort()
+            self._abort()
+
+    def _abort(self) -> None:
+        transport = self._request.transport
+        if transport is not None:
+            transport.abort()
 
     async def _send(self, message: Message) -> None:
         if isinstance(message, str):

@@ -48,10 +48,19 @@ class ClientMessage:
 
 @dataclass(frozen=True)
 class Hello(ClientMessage):
-    """First message of a page, with the token; empty for a page that only watches."""
+    """First message of a page.
+
+    Attributes:
+        token: empty for a page that only watches.
+        automated: whether a script drives the browser, as this says of itself; None if it is no browser.
+    """
 
     TYPE = "hello"
     token: str = _text()
+    automated: bool | None = field(
+        default=None,
+        metadata={"valid": lambda value: value is None or isinstance(value, bool), "expected": "true, false or null"},
+    )
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
                             "disc": [x, y, r]}   # or, in place of the disc,
                            | {..., "outline": [[x, y], ...], "holes": [[[x, y], ...], ...]}]} | None,
       "needle": {"tail": [x, y], "heading": rad, "age": s} | None,
+      "camera": {"age": s} | None,     # of the latest image
       "tracker": {"state": "tracked|lost|searching", "reason": str, "confidence": float,
-                  "view": {"centre": [u, v], "scale": m_per_px, "rotation": rad} | None} | None,
+                  "view": {"centre": [u, v], "scale": m_per_px, "rotation": rad} | None, "age": s} | None,
       "measured": [[x, y], ...],       # the measured centreline, may be empty
       "predicted": {"vertices": [[x, y], ...], "residual": float, "step_time": float, "status": str, "age": s} | None,
       "margins": {"valid": bool, "reason": str,
@@ -74,5 +75,10 @@ class Host(Protocol):
     async def set_paused(self, paused: bool) -> str:
         """Pause or resume time; return an empty text, or the reason of a refusal."""
 
-    async def set_recording(self, recording: bool) -> str:
-        """Start or end a recording; return an empty text, or the reason of a refusal."""
+    async def set_recording(self, recording: bool, operator: str) -> str:
+        """Start or end a recording; return an empty text, or the reason of a refusal.
+
+        Args:
+            recording: whether to start.
+            operator: who commands the page that has control, "an operator" or "a script"; noted in the recording.
+        """

@@ -88,6 +88,11 @@ class DeadManSwitch:
         return self._velocity is not None
 
     @property
+    def latched(self) -> bool:
+        """Whether nothing is sent until a release."""
+        return self._latched
+
+    @property
     def deadline(self) -> float:
         """Time at which the last jog message becomes stale [s]."""
         return self._arrival + self._timeout
@@ -180,6 +185,11 @@ class JogController:
     def available(self) -> bool:
         """Whether another client may acquire control now."""
         return self._lease.available(_now())
+
+    @property
+    def must_release(self) -> bool:
+        """Whether the present jog was stopped, and must be released before the next."""
+        return self._switch.latched
 
     def acquire_control(self, client: int) -> str:
         """Give control to a client; return an empty text, or the reason of a refusal."""

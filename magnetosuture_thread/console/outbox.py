@@ -35,9 +35,11 @@ class Outbox:
         """Set the latest `state` or `frame`; it replaces one that was not sent."""
         self._latest[kind] = message
 
-    def acknowledge(self, kind: str) -> None:
-        """Register that the page received a `state` or `frame`."""
-        self._in_flight[kind] = max(0, self._in_flight[kind] - 1)
+    def acknowledge(self, kind: str) -> bool:
+        """Register that the page received a `state` or `frame`; return whether one was in flight."""
+        was_in_flight = self._in_flight[kind] > 0
+        self._in_flight[kind] -= was_in_flight
+        return was_in_flight
 
     def next(self) -> Message | None:
         """Return the next message to send, None while there is none or the page is behind."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import gc
+from collections import Counter
 from importlib.resources import files
 
 from aiohttp import web
-from aiohttp.typedefs import Handler
 
-from magnetosuture_thread.console.access import host_refusal, is_any, new_token, origin_refusal, page_url
+from magnetosuture_thread.console.access import host_refusal, is_any, new_token, origin_refusal, page_url, same_token
 from magnetosuture_thread.console.client import Client, RequestHandler
 from magnetosuture_thread.console.graph import Graph, Host
 from magnetosuture_thread.console.jog_controller import JogController
@@ -17,7 +17,9 @@ from magnetosuture_thread.console.outbox import encode_frame, encode_state
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 
-MAX_CLIENTS = 16
+MAX_CLIENTS = 16  # with the token
+MAX_WATCHERS = 8  # without it, from one address, and twice as many in all; they take no place of the others
+MAX_NEW_WATCHERS = 20  # from one address in a second
 MAX_MESSAGE_BYTES = 65536  # beyond, the connection is closed before the whole message is read
 FRAME_POLL_PERIOD = 0.005  # of the check for a new camera frame [s]
 HEARTBEAT_PERIOD = 5.0  # a page that does not answer a ping within half of this is disconnected [s]
@@ -53,10 +55,11 @@ class ConsoleServer:
         self._jog = JogController(graph.publish_velocity, settings.rate, settings.hold_timeout)
         self._requests = RequestHandler(graph, host, self._jog)
         self._clients: dict[int, Client] = {}
+        self._new_watchers: tuple[int, Counter[str]] = 0, Counter()  # of this second, by address
         self._count = 0
         self._port = 0
         self._frame_number, self._frame = -1, b""
-        self._runner: web.AppRunner | None = None
+        self._runner: web.ServerRunner | None = None
         self._broadcast_task: asyncio.Task[None] | None = None
 
     async def start(self) -> str:
@@ -65,11 +68,7 @@ class ConsoleServer:
         Raises:
             ConfigurationError: the address cannot be bound.
         """
-        application = web.Application(middlewares=[self._check_host])
-        application.router.add_get("/socket", self._connect)
-        application.router.add_get("/{name:[^/]*}", self._serve_file)
-        application.on_response_prepare.append(_add_headers)
-        runner = web.AppRunner(application, access_log=None, shutdown_timeout=1.0)
+        runner = web.ServerRunner(_Server(self._respond), shutdown_timeout=1.0)
         await runner.setup()
         address = self._settings.address
         try:
@@ -103,30 +102,38 @@ class ConsoleServer:
         if task is not None and not task.cancelled():
             task.result()
 
-    @web.middleware
-    async def _check_host(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
         refusal = host_refusal(request.headers.get("Host", ""), self._settings.address, self._port)
         if refusal:
-            return web.Response(status=403, text=refusal)
-        return await handler(request)
-
-    async def _serve_file(self, request: web.Request) -> web.Response:
+            return _answer(403, refusal)
+        if request.method not in ("GET", "HEAD"):
+            return _answer(405, "only GET")
+        if request.path == "/socket":
+            try:
+                return await self._connect(request)
+            except web.HTTPBadRequest as error:  # no WebSocket
+                return _answer(error.status, error.text or "")
         found = self._files.get(request.path)
         if found is None:
-            return web.Response(status=404, text="there is no such file")
+            return _answer(404, "there is no such file")
         content_type, body = found
-        return web.Response(body=body, content_type=content_type, charset="utf-8")
+        return web.Response(body=body, content_type=content_type, charset="utf-8", headers=HEADERS)
 
-    async def _connect(self, request: web.Request) -> web.StreamResponse:
+    async def _connect(self, request: web.BaseRequest) -> web.StreamResponse:
         refusal = origin_refusal(request.headers.get("Origin", ""), request.headers.get("Host", ""))
         if refusal:
-            return web.Response(status=403, text=refusal)
-        if len(self._clients) >= MAX_CLIENTS:
-            return web.Response(status=503, text=f"{MAX_CLIENTS} pages are connected already")
+            return _answer(403, refusal)
+        # Only for a place: commands need the token of the greeting.
+        has_token = same_token(request.query.get("token"), self._token)
+        full = self._no_place(has_token, request.remote or "")
+        if full:
+            return _answer(503, full)
         socket = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_PERIOD, max_msg_size=MAX_MESSAGE_BYTES)
+        socket.headers.update(HEADERS)
         self._count += 1
         number = self._count
         client = Client(number, socket, request, self._settings, self._token, self._jog, self._requests)
+        client.has_token = has_token
         self._clients[number] = client
         if self._frame:
             client.send_latest("frame", self._frame)
@@ -136,6 +143,21 @@ class ConsoleServer:
         finally:
             del self._clients[number]
         return socket
+
+    def _no_place(self, has_token: bool, address: str) -> str:
+        """Return why a connection from an address has no place; empty if it has one."""
+        if has_token:
+            count = sum(client.has_token for client in self._clients.values())
+            return f"{MAX_CLIENTS} pages are connected already" if count >= MAX_CLIENTS else ""
+        second = int(asyncio.get_running_loop().time())
+        if second != self._new_watchers[0]:
+            self._new_watchers = second, Counter()
+        self._new_watchers[1][address] += 1
+        watchers = [client.address for client in self._clients.values() if not client.has_token]
+        too_many = watchers.count(address) >= MAX_WATCHERS or len(watchers) >= 2 * MAX_WATCHERS
+        if too_many or self._new_watchers[1][address] > MAX_NEW_WATCHERS:
+            return "too many pages without the token are connected already"
+        return ""
 
     async def _broadcast(self) -> None:
         loop = asyncio.get_running_loop()
@@ -156,14 +178,44 @@ class ConsoleServer:
             client.send_latest(kind, message)
 
     def _state(self) -> str:
-        lease = {"holder": self._jog.holder, "available": self._jog.available, "pages": len(self._clients)}
+        lease = {
+            "holder": self._jog.holder,
+            "available": self._jog.available,
+            "release_first": self._jog.must_release,
+            "pages": len(self._clients),
+        }
         graph = self._graph.state()
         self._jog.set_armed(bool((graph.get("bridge") or {}).get("armed")))
         return encode_state(graph, self._host.state(), lease)
 
 
-async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
-    response.headers.update(HEADERS)
+def _answer(status: int, text: str) -> web.Response:
+    return web.Response(status=status, text=text, headers=HEADERS)
+
+
+class _Connection(web.RequestHandler):
+    """HTTP connection whose errors carry our headers too; what is no HTTP is answered, not logged."""
+
+    def handle_error(
+        self,
+        request: web.BaseRequest,
+        status: int = 500,
+        exc: BaseException | None = None,
+        message: str | None = None,
+    ) -> web.StreamResponse:
+        """Return the response to a request that cannot be handled; it closes the connection."""
+        malformed = status < 500
+        response = _answer(status, "malformed request") if malformed else super().handle_error(request, status, exc)
+        response.headers.update(HEADERS)
+        response.force_close()
+        return response
+
+
+class _Server(web.Server):
+    """Makes such connections."""
+
+    def __call__(self) -> _Connection:
+        return _Connection(self, loop=asyncio.get_running_loop(), access_log=None)  # type: ignore[arg-type]
 
 
 def page_files() -> dict[str, tuple[str, bytes]]:

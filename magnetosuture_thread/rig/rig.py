@@ -9,13 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.rig.camera.dish_camera import Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, find_collision
 
 Vector = NDArray[np.float64]
+
+MIN_SPAN = 1e-9  # s, the resolution of ROS times; what is nearer to the rig's own time waits for the next call
+RELEASE_TIME = 1.0  # s without currents asked for, after which a rig with a problem tries again
 
 
 @dataclass(frozen=True)
@@ -42,25 +45,39 @@ class RigFrame:
 class Rig:
     """Needle and thread in the coils' field, under a camera. Time comes in as seconds since the start.
 
-    A power stage that gets no new currents for `driver_timeout` switches off, as real ones do. The times of
-    faults count from the first current that is not zero, so that they do not depend on how long the other
-    nodes take to start.
+    Until the first current that is not zero, needle and thread are held fixed, as a thread that is bent at the start
+    would straighten and pull the needle away. A power stage that gets no new currents for `driver_timeout` switches
+    off, as real ones do. The times of faults count from the first current that is not zero, so that they do not depend
+    on how long the other nodes take to start.
+
+    Where the mechanics find no next state, as of a needle that is wedged, the coils are off and everything stays where
+    it is, until no currents have been asked for during `RELEASE_TIME` and then some are.
 
     Args:
         settings: of the rig.
         scene: in which needle and thread are.
+        max_time: for which they move in one call at the most [s]; the rest of the time is lost.
+        max_iterations: of Newton in one call, after which the rest of the time is lost.
 
     Attributes:
         scene: as it is now.
         time: up to which needle and thread have moved [s].
         currents: in force, shape (m,) [A].
         began: time of the first current that was not zero, inf before [s].
+        problem: why everything stays where it is; empty if it does not.
 
     Raises:
         ConfigurationError: needle or thread would start in the wall or in a shape.
     """
 
-    def __init__(self, settings: RigSettings, scene: Scene) -> None:
+    def __init__(
+        self,
+        settings: RigSettings,
+        scene: Scene,
+        *,
+        max_time: float = math.inf,
+        max_iterations: float = math.inf,
+    ) -> None:
         settings.check_scene(scene)
         self._settings, self.scene = settings, scene
         self._dynamics = settings.dynamics(scene)
@@ -71,6 +88,9 @@ class Rig:
         self.began = math.inf
         self.currents = np.zeros(len(settings.coil_angles))
         self._applied_at = 0.0
+        self._max_time, self._max_iterations = max_time, max_iterations
+        self.problem = ""
+        self._asked_at = -math.inf  # last time that currents were asked for since the problem
 
     def warm_up(self) -> None:
         """Compile what a frame needs, on a temporary needle and thread.
@@ -116,21 +136,47 @@ class Rig:
         self.advance(time)
         limit = self._settings.coil_max_current
         currents = np.clip(currents, -limit, limit)
+        if self.problem:
+            if not np.any(currents):
+                return
+            waited, self._asked_at = self.time - self._asked_at, self.time
+            if waited < RELEASE_TIME:
+                return
+            self.problem = ""
         if np.any(currents):
             self.began = min(self.began, self.time)
         stuck = self.currents[0]
         self.currents = currents.copy()
         if COIL_STUCK in self.faults.kinds(self.running):
             self.currents[0] = stuck
-        self._applied_at = time
+        self._applied_at = min(time, self.time)
+
+    @property
+    def held(self) -> bool:
+        """Whether needle and thread are held where they are."""
+        return self.began == math.inf or bool(self.problem)
 
     def advance(self, time: float) -> None:
-        """Let needle and thread move up to a time since the start [s]; nothing happens for one that is past."""
+        """Let needle and thread move up to a time since the start [s]; nothing happens for one that is past.
+
+        Raises:
+            SolverError: they have no next state; they stay where they are from now on.
+        """
+        if self.held:
+            self.time = max(self.time, time)
+            return
+        time = min(time, self.time + self._max_time)
         off_at = max(self.time, self._applied_at + self._settings.driver_timeout)
-        if off_at < time:
-            self._move(off_at)
+        try:
+            if off_at < time:
+                if not self._move(off_at):
+                    return
+                self.switch_off()
+            self._move(time)
+        except SolverError as error:
+            self.problem, self._asked_at = str(error), self.time
             self.switch_off()
-        self._move(time)
+            raise
 
     def switch_off(self) -> None:
         """Set all currents to zero, but that of a stuck coil."""
@@ -138,10 +184,14 @@ class Rig:
         self.currents = np.zeros_like(self.currents)
         self.currents[0] = stuck
 
-    def _move(self, time: float) -> None:
-        if time > self.time:
-            self._dynamics.step(self.currents, time - self.time)
-            self.time = time
+    def _move(self, time: float) -> bool:
+        """Move up to a time [s]; return whether it was reached within the iterations."""
+        span = time - self.time
+        if span < MIN_SPAN:
+            return True
+        moved = self._dynamics.step(self.currents, span, self._max_iterations)
+        self.time = time if moved >= span else self.time + moved
+        return moved >= span
 
     @property
     def running(self) -> float:
@@ -152,7 +202,7 @@ class Rig:
     def status(self) -> str:
         """What goes on, for a person."""
         faults = ", ".join(sorted(self.faults.kinds(self.running)))
-        text = "running" if self.running >= 0.0 else "waiting for the first current"
+        text = "running" if self.running >= 0.0 else "held until the first current"
         return f"{text}, with {faults}" if faults else text
 
     def look(self, time: float) -> RigFrame:

@@ -209,6 +209,7 @@ class RecordingHost:
 
     def __init__(self) -> None:
         self.requests: list[tuple[str, object]] = []
+        self.operator = ""
         self.shown: dict[str, Any] = {
             "mode": "simulated",
             "setup": "hernia_ring",
@@ -239,8 +240,9 @@ class RecordingHost:
         self.shown["paused"] = paused
         return ""
 
-    async def set_recording(self, recording: bool) -> str:
+    async def set_recording(self, recording: bool, operator: str) -> str:
         """Record start and end of a recording."""
+        self.operator = operator
         self.requests.append(("record", recording))
         self.shown["recording"] = "output/console/take_1" if recording else ""
         return ""

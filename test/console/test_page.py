@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -366,10 +367,161 @@ def test_without_the_token_every_control_is_off(browser: Browser, served: Served
     context.close()
 
 
+def choose(page: Page, setup: str) -> None:
+    """Choose a setup in the list, and confirm that the run ends."""
+    page.click("#setup")
+    page.click(f'#setups [data-name="{setup}"]')
+    page.click("#confirm")
+
+
+def test_keys_released_in_the_setup_list_stop_the_needle_and_space_does_too(operator: Operator):
+    """The popup of a native list swallowed both; the needle went on for as long as one watched."""
+    operator.take_control()
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+    operator.page.click("#setup")
+    operator.last(REST)
+    operator.nothing_more()
+    operator.page.keyboard.press("Space")
+    operator.until(lambda: operator.served.graph.actions == ["stop"])
+    operator.page.keyboard.up("ArrowRight")
+    expect(operator.page.locator("#setups")).to_be_visible()
+
+
+@pytest.mark.parametrize("target", ["#speed", "#setup"])
+def test_a_hold_ends_when_the_focus_enters_what_takes_keys(operator: Operator, target: str):
+    operator.take_control()
+    operator.page.keyboard.down("ArrowUp")
+    operator.last((0.0, 0.003))
+    operator.page.focus(target)
+    if target == "#setup":
+        operator.page.keyboard.press("Enter")
+    operator.last(REST)
+    operator.nothing_more()
+
+
+def test_the_context_menu_stays_closed_and_ends_a_hold(operator: Operator):
+    operator.take_control()
+    for target in ("#dish", "h1", "#speed", "#nodes"):
+        operator.page.keyboard.down("ArrowUp")
+        operator.last((0.0, 0.003))
+        operator.page.evaluate(
+            "addEventListener('contextmenu', (event) => { window.prevented = event.defaultPrevented; })"
+        )
+        operator.page.click(target, button="right")
+        operator.last(REST)
+        assert operator.page.evaluate("window.prevented") is True
+        operator.page.keyboard.up("ArrowUp")
+
+
+def test_a_release_reaches_the_page_whatever_element_has_the_focus(operator: Operator):
+    """Each element is entered by keyboard and mouse, with what it opens left open, while a key is held and let go."""
+    operator.take_control()
+    count = operator.page.evaluate(
+        """() => {
+            const all = [...document.querySelectorAll("button, input, canvas, [tabindex], h1, #nodes")];
+            const harmless = all.filter(({id}) => !["stop", "control", "disarm", "pause"].includes(id));
+            window.elements = harmless.filter((element) => element.checkVisibility() && !element.disabled);
+            return window.elements.length;
+        }"""
+    )
+    assert count > 10
+    for number in range(count):
+        element = operator.page.evaluate_handle(f"window.elements[{number}]").as_element()
+        assert element is not None
+        for enter in (element.focus, partial(element.click, force=True), partial(element.press, "Enter")):
+            operator.page.locator("#dish").focus()
+            operator.page.keyboard.down("ArrowUp")
+            operator.until(lambda: operator.served.graph.last and operator.served.graph.last[1] > 0.0)
+            enter()
+            operator.page.keyboard.up("ArrowUp")
+            operator.last(REST)
+            operator.page.keyboard.press("Escape")
+    operator.nothing_more()
+
+
+@pytest.mark.parametrize("key", ["F1", "F10", "ContextMenu", "Alt", "Control", "Meta"])
+def test_a_key_that_may_open_a_menu_of_the_browser_ends_a_hold(operator: Operator, key: str):
+    operator.take_control()
+    operator.page.keyboard.down("ArrowUp")
+    operator.last((0.0, 0.003))
+    operator.page.evaluate(f"window.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', code: '{key}'}}))")
+    operator.last(REST)
+    operator.nothing_more()
+
+
+def test_a_stick_is_let_go_of_when_the_focus_is_lost_without_an_event(operator: Operator):
+    operator.take_control()
+    pad = "navigator.getGamepads = () => [{{connected: true, axes: [{}, {}]}}]"
+    operator.page.evaluate(pad.format(0.0, 0.0))
+    operator.nothing_more()
+    operator.page.evaluate(pad.format(0.0, -1.0))
+    operator.last((0.0, 0.003))
+    operator.page.evaluate("document.hasFocus = () => false")
+    operator.last(REST)
+    operator.nothing_more()
+
+
+def test_no_element_of_the_page_opens_a_native_popup(operator: Operator):
+    assert operator.page.locator("select, dialog, [popover], input:not([type=range]), details, [list]").count() == 0
+
+
+def test_a_setup_is_chosen_by_the_keyboard_and_asked_about_before(operator: Operator):
+    operator.take_control()
+    operator.page.focus("#setup")
+    operator.page.keyboard.press("Enter")
+    operator.page.keyboard.press("ArrowDown")
+    operator.page.keyboard.press("Enter")
+    expect(operator.page.locator("#question")).to_contain_text("This ends the run")
+    assert operator.served.host.requests == []
+    operator.page.keyboard.press("Enter")  # the focus is on Cancel
+    expect(operator.page.locator("#question")).to_be_hidden()
+    assert operator.served.host.requests == []
+    operator.page.click("#again")
+    expect(operator.page.locator("#question")).to_contain_text("Start again?")
+    operator.page.click("#confirm")
+    operator.until(lambda: len(operator.served.host.requests) == 1)
+    assert operator.served.host.requests == [("select_setup", operator.served.host.shown["setup"])]
+
+
+def test_direction_buttons_jog_while_they_are_held(browser: Browser, served: ServedConsole):
+    context = browser.new_context(viewport={"width": 800, "height": 1000})
+    operator = Operator(context.new_page(), served)
+    operator.take_control()
+    place = operator.page.locator('[data-direction="0,1"]').bounding_box()
+    assert place is not None
+    operator.page.mouse.move(place["x"] + 10.0, place["y"] + 10.0)
+    operator.page.mouse.down()
+    operator.last((0.0, 0.003))
+    operator.more_commands(3)
+    operator.page.evaluate(
+        """() => document.querySelector('[data-direction="0,1"]').dispatchEvent(new PointerEvent(
+            'contextmenu', {pointerType: 'touch', bubbles: true, cancelable: true}))"""
+    )
+    operator.more_commands(3)  # a finger that rests on it
+    operator.page.mouse.up()
+    operator.last(REST)
+    top = {name: operator.page.locator(name).bounding_box() for name in ("#stop", "#dish", "#plots")}
+    assert top["#stop"]["y"] < top["#dish"]["y"] < place["y"] < top["#plots"]["y"]  # type: ignore[index]
+    context.close()
+
+
+def test_the_stop_button_stays_where_it_is(operator: Operator):
+    operator.take_control()
+    stop = operator.page.locator("#stop")
+    before = stop.bounding_box()
+    operator.page.click("#record")
+    expect(operator.page.locator("#recording")).to_contain_text("output/console/take_1")
+    assert stop.bounding_box() == before
+    operator.page.click("#record")
+    expect(operator.page.locator("#recording")).to_be_empty()
+    assert stop.bounding_box() == before
+
+
 def test_setup_pause_and_record_reach_the_host(operator: Operator):
     expect(operator.page.locator("#pause")).to_be_disabled()
     operator.take_control()
-    operator.page.select_option("#setup", "petri_35mm_polyamide")
+    choose(operator.page, "petri_35mm_polyamide")
     operator.until(lambda: operator.served.host.shown["setup"] == "petri_35mm_polyamide")
     operator.page.click("#pause")
     expect(operator.page.locator("#headline")).to_have_text("Paused")
@@ -397,6 +549,12 @@ HEADLINES = [
     ("needle", {"age": 2.0}, "No needle pose for 2"),
     ("filter", {"commanded": [0.003, 0.0], "reason": "no prediction"}, "At rest: no prediction"),
     ("filter", {"commanded": [0.003, 0.0], "active": ["ring"]}, "At rest: stopped by ring"),
+    ("filter", {"commanded": [0.003, 0.0]}, "At rest: the filter lets nothing through, and gives no reason"),
+    ("bridge", {"commanded": [0.003, 0.0], "reasons": ["no scene"]}, "At rest: no scene"),
+    ("bridge", {"commanded": [0.003, 0.0], "filtered": [0.002, 0.0]}, "At rest: the coils give no motion"),
+    ("filter", {"commanded": [0.003, 0.0], "slowdown": 1e-4}, "At rest: slowed to 0 % by friction"),
+    ("nodes", {"rig_simulator": {"level": "silent", "message": "", "age": 7.0}}, "Simulator silent for 7"),
+    ("nodes", {"rig_simulator": {"level": "error", "message": "no convergence", "age": 0.1}}, "no convergence"),
     ("bridge", {"filtered": [0.003, 0.0], "applied": [0.0021, 0.0]}, "Moving at 2.1 mm/s"),
 ]
 
@@ -407,6 +565,80 @@ def test_headline_shows_why_the_needle_rests(operator: Operator):
         operator.served.graph.shown = state()
         operator.served.graph.shown[part].update(changes)
         expect(headline).to_contain_text(said)
+
+
+def test_a_simulation_that_lags_is_shown_whatever_the_needle_does(operator: Operator):
+    shown = operator.served.graph.shown
+    rig = {
+        "level": "warn",
+        "message": "running; late: simulated time runs at 40 % of real time",
+        "values": {"real_time_factor": "0.4"},
+    }
+    shown["nodes"]["rig_simulator"] = {**rig, "age": 0.1}
+    for changes in ({}, {"armed": False}, {"filtered": [0.003, 0.0], "applied": [0.003, 0.0]}):
+        shown["bridge"].update(changes)
+        expect(operator.page.locator("#reasons")).to_contain_text("Computer late: simulated time runs at 40 %")
+    expect(operator.page.locator("#nodes li", has_text="rig simulator")).to_contain_text("simulated time runs at 40 %")
+
+
+CAUSES: list[tuple[str, dict[str, Any], str]] = [  # why nothing moves, in the order in which they are to be resolved
+    ("bridge", {"emergency_stopped": True, "state": "fault"}, "Emergency stop is pressed"),
+    ("host", {"paused": True}, "Paused"),
+    ("bridge", {"state": "inactive"}, "Coil bridge is inactive"),
+    ("tracker", {"state": "lost", "reason": "no needle"}, "Needle lost: no needle"),
+    ("nodes", {"rig_simulator": {"level": "silent", "message": "", "age": 9.0}}, "Simulator silent for 9"),
+    ("needle", {"age": 2.0}, "Camera silent for 3"),  # the camera's age is added below
+    ("bridge", {"driver_ready": False}, "Driver simulated is not ready"),
+    ("view", {"late": 0.3}, "Computer or network late"),
+    ("bridge", {"armed": False}, "Disarmed: press Arm"),
+    ("filter", {"reason": "stopped by ring"}, "At rest: stopped by ring"),
+    ("bridge", {"reasons": ["no thread prediction yet"]}, "At rest: no thread prediction yet"),
+    ("filter", {"active": ["wall"]}, "At rest: stopped by wall"),
+    ("filter", {"slowdown": 0.001}, "At rest: slowed to 0 % by friction"),
+    ("bridge", {"saturated": True}, "At rest: the coils are at their limit"),
+]
+LOOK = "(view) => import('/status.js').then(({motionStatus}) => view.map(motionStatus))"
+
+
+def held_key(random: np.random.Generator) -> tuple[dict[str, Any], str]:
+    """Return a look at a page on which a key is held and nothing moves, for some causes at random, and the first."""
+    graph = {**state(), "camera": {"age": 3.0}}
+    graph["tracker"]["age"] = 0.05
+    view = {"link": "open", "since": 0.0, "graph": graph, "client": 1, "canCommand": True, "jogging": True, "late": 0}
+    view.update(host={"mode": "simulated"}, lease={"holder": 1, "release_first": bool(random.integers(2))})
+    for part in ("filter", "bridge") if random.integers(2) else ("filter",):
+        graph[part]["commanded"] = random.uniform(1e-4, 1e-2, 2).tolist()
+    count = int(random.integers(0, len(CAUSES)))
+    chosen = sorted(random.choice(len(CAUSES), count, replace=False).tolist())
+    for number in reversed(chosen):
+        part, changes, _ = CAUSES[number]
+        {**graph, **view, "view": view}[part].update(changes)
+    return view, CAUSES[chosen[0]][2] if chosen else "At rest: the filter lets nothing through"
+
+
+def test_a_held_key_without_motion_always_has_a_reason_the_most_helpful_first(operator: Operator):
+    random = np.random.default_rng(5)
+    looks = [held_key(random) for _ in range(2000)]
+    told = operator.page.evaluate(LOOK, [view for view, _ in looks])
+    for (_, expected), found in zip(looks, told, strict=True):
+        assert found["headline"].startswith(expected)
+
+
+def test_a_key_that_was_held_through_a_stop_is_to_be_pressed_again(operator: Operator):
+    operator.take_control()
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+    operator.page.click("#pause")  # the jog is stopped, and latched
+    operator.last(REST)
+    operator.page.click("#pause")
+    expect(operator.page.locator("#pause")).to_have_text("Pause")
+    operator.served.graph.shown["filter"]["commanded"] = [0.0, 0.0]
+    expect(operator.page.locator("#headline")).to_have_text("At rest: release the key and press it again")
+    operator.nothing_more()
+    operator.page.keyboard.up("ArrowRight")
+    expect(operator.page.locator("#headline")).to_have_text("Ready to jog")
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
 
 
 def test_silent_and_missing_nodes_are_shown(operator: Operator):

@@ -11,7 +11,8 @@ from typing import Any
 import aiohttp
 import pytest
 
-from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
+from magnetosuture_thread.console.server import HEADERS, ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 from test.console.scene import RecordingGraph, RecordingHost, picture
@@ -297,3 +298,112 @@ def test_what_ends_the_broadcast_task_is_raised_at_the_end():
             await socket.close()
 
     asyncio.run(test())
+
+
+def test_rubbish_of_a_page_without_the_token_costs_the_page_with_control_nothing(monkeypatch: pytest.MonkeyPatch):
+    """10,000 messages a second, and as many new connections as there can be."""
+    parsed: list[str] = []
+
+    def parse(text: str, max_speed: float) -> ClientMessage:
+        parsed.append(text)
+        return parse_client_message(text, max_speed)
+
+    async def flood(here: Console) -> None:
+        page = await here.page("")
+        with contextlib.suppress(ConnectionError):
+            for _ in range(500):
+                await page.socket.send_str(json.dumps({"type": "select_setup", "setup": "[" * 3000}))
+        await until(lambda: page.socket.closed)
+
+    async def test(here: Console) -> None:
+        holder = await here.jogging_page()
+        refused = 0
+        for _ in range(60):
+            try:
+                await flood(here)
+            except aiohttp.WSServerHandshakeError:
+                refused += 1
+            await holder.jog(1, 0)
+        assert 0 < refused < 60
+        assert not any("select_setup" in text for text in parsed)
+        await holder.jog(0, 1)
+        await until(lambda: here.graph.last == NORTH)
+        assert holder.lease["holder"] == holder.number
+
+    monkeypatch.setattr("magnetosuture_thread.console.client_messages.parse_client_message", parse)
+    monkeypatch.setattr("magnetosuture_thread.console.server.MAX_NEW_WATCHERS", 5)
+    run(test, hold_timeout=1.0)
+
+
+def test_pages_without_the_token_take_no_place_of_those_with_it():
+    async def test(here: Console) -> None:
+        watchers = [await here.connect() for _ in range(8)]
+        with pytest.raises(aiohttp.WSServerHandshakeError) as full:
+            await here.connect()
+        assert full.value.status == 503
+        with pytest.raises(aiohttp.WSServerHandshakeError):
+            await here.session.ws_connect(here.url + "socket?token=wrong")
+        here.sockets.append(await here.session.ws_connect(here.url + f"socket?token={TOKEN}"))
+        operator = Page(here.sockets[-1])
+        await operator.send(type="hello", token=TOKEN)
+        await until(lambda: operator.of("welcome"))
+        assert operator.of("welcome")[0]["can_command"] is True
+        assert not any(watcher.closed for watcher in watchers)
+
+    run(test)
+
+
+MALFORMED = [
+    "\x00\x01\x02\r\n\r\n",
+    "GET / HTTP/9\r\n\r\n",
+    "GET /\x7f HTTP/1.1\r\nHost x\r\n\r\n",
+    "POST / HTTP/1.1\r\nHost: a\r\nContent-Length: -4\r\n\r\n",
+    "GET / HTTP/1.1\r\n" + "a: b\r\n" * 5000 + "\r\n",
+    "GET /" + "x" * 20000 + " HTTP/1.1\r\n\r\n",
+]
+
+
+@pytest.mark.parametrize("request_text", MALFORMED)
+def test_malformed_requests_get_our_headers_and_print_nothing(request_text: str, caplog: pytest.LogCaptureFixture):
+    async def test(here: Console) -> None:
+        port = int(here.url.rstrip("/").rsplit(":", 1)[1])
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(request_text.encode())
+        answer = await asyncio.wait_for(reader.read(), WAIT_TIMEOUT)
+        writer.close()
+        assert answer.startswith(b"HTTP/1.1 40") or answer.startswith(b"HTTP/1.0 40")
+        for name in HEADERS:
+            assert name.encode() in answer
+        assert b"Traceback" not in answer
+
+    run(test)
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("path", ["", "nothing", "socket"])
+def test_every_answer_has_the_security_headers(path: str):
+    async def test(here: Console) -> None:
+        for method in ("GET", "POST", "DELETE"):
+            async with here.session.request(method, here.url + path) as response:
+                assert HEADERS.items() <= response.headers.items()
+        socket = await here.connect()
+        assert HEADERS.items() <= socket._response.headers.items()
+
+    run(test)
+
+
+@pytest.mark.parametrize(
+    ("is_browser", "automated", "operator"),
+    [(True, False, "an operator"), (True, True, "a script"), (True, None, "a script"), (False, False, "a script")],
+)
+def test_the_host_is_told_whether_a_person_or_a_script_steers(is_browser: bool, automated: bool | None, operator: str):
+    async def test(here: Console) -> None:
+        page = Page(await here.connect(**({"origin": here.url.rstrip("/")} if is_browser else {})))
+        await page.send(type="hello", token=TOKEN, automated=automated)
+        page.number = (await until(lambda: page.of("welcome")))[0]["client"]
+        await page.acquire_control()
+        await page.send(type="record", recording=True)
+        await until(lambda: here.host.requests)
+        assert here.host.operator == operator
+
+    run(test)

@@ -76,6 +76,19 @@ def test_lost_connection_stops_the_needle_before_the_timeout():
     run(test, hold_timeout=1.0)
 
 
+def test_the_bridge_is_disarmed_when_the_page_with_control_is_gone_and_not_when_another_is():
+    async def test(here: Console) -> None:
+        operator, watcher = await here.page(), await here.page()
+        await operator.acquire_control()
+        watcher.tear()
+        await until(lambda: operator.lease["pages"] == 1)
+        assert not here.graph.actions
+        operator.tear()
+        await until(lambda: here.graph.actions == ["disarm"])
+
+    run(test)
+
+
 def test_late_jog_messages_are_rejected_and_a_late_page_is_disconnected():
     async def test(here: Console) -> None:
         page = await here.page()

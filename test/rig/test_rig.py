@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.rig.settings import RigSettings
@@ -23,8 +23,13 @@ def scene(*geometries: Disc | Polygon, diameter: float = 0.035, kind: str = "ins
 
 def rig(*geometries: Disc | Polygon, diameter: float = 0.035, **changes: Any) -> Rig:
     """Return a rig whose needle points east, with a straight thread behind it, among shapes."""
+    return Rig(*rig_arguments(*geometries, diameter=diameter, **changes))
+
+
+def rig_arguments(*geometries: Disc | Polygon, diameter: float = 0.035, **changes: Any) -> tuple[RigSettings, Scene]:
+    """Return what such a rig is made of."""
     settings = RigSettings(**{"needle_start": (0.003, 0.0, 0.0), "thread_segments": 20, **changes})
-    return Rig(settings, scene(*geometries, diameter=diameter))
+    return settings, scene(*geometries, diameter=diameter)
 
 
 def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
@@ -48,6 +53,61 @@ def test_without_current_nothing_moves():
     made = rig()
     before, after = made.look(0.0), made.look(2.0)
     np.testing.assert_allclose(after.tail, before.tail, atol=1e-7)
+
+
+def test_a_bent_thread_is_held_until_the_first_current_and_pulls_the_needle_then():
+    made = rig(thread_start_curvature=-60.0)
+    before, after = made.look(0.0), made.look(60.0)
+    np.testing.assert_array_equal(after.thread, before.thread)
+    assert after.time == 60.0
+    made.apply(1e-9 * EASTWARDS, 60.0)
+    assert np.abs(made.look(65.0).thread - before.thread).max() > 1e-4
+
+
+def test_currents_that_come_hardly_after_others_are_no_step_of_their_own(monkeypatch: pytest.MonkeyPatch):
+    made = rig()
+    made.apply(EASTWARDS, 0.1)
+    monkeypatch.setattr(made._dynamics, "step", lambda *arguments: pytest.fail("a step"))
+    made.apply(-EASTWARDS, np.nextafter(0.1, 1.0))
+    assert made.currents.tolist() == (-EASTWARDS).tolist()
+    assert made.time == 0.1
+
+
+def test_what_one_call_has_no_time_for_is_left_out():
+    made = Rig(*rig_arguments(), max_time=0.1)
+    made.apply(EASTWARDS, 3.0)
+    assert made.look(67.0).time == pytest.approx(3.1)
+    made = Rig(*rig_arguments(), max_iterations=20)
+    made.apply(EASTWARDS, 3.0)
+    assert 3.0 < made.look(67.0).time < 3.2
+    assert made.currents.tolist() == EASTWARDS.tolist()  # which are as old as the rig's own time tells
+
+
+def test_a_rig_that_finds_no_next_state_says_so_once_and_tries_again_after_a_rest(monkeypatch: pytest.MonkeyPatch):
+    made, tries = rig(), [0]
+    made.apply(EASTWARDS, 1.0)
+
+    def fail(*arguments: object) -> tuple[int, float, float]:
+        tries[0] += 1
+        return -1, 1.0, 1.0
+
+    with monkeypatch.context() as context:
+        context.setattr("magnetosuture_thread.rig.mechanics.dynamics.advance", fail)
+        with pytest.raises(SolverError):
+            made.advance(1.1)
+        assert made.currents.tolist() == [0.0] * 4
+        assert "no convergence" in made.problem
+        count, where = tries[0], made.look(1.1).tail
+        for time in np.arange(1.2, 5.0, 0.1):
+            made.apply(EASTWARDS, time)  # somebody goes on asking
+        made.apply(0.0 * EASTWARDS, 5.0)
+        made.apply(EASTWARDS, 5.1)
+    assert (tries[0], made.problem != "") == (count, True)
+    np.testing.assert_array_equal(made.look(5.5).tail, where)
+    made.apply(0.0 * EASTWARDS, 5.6)
+    made.apply(EASTWARDS, 7.0)
+    assert made.problem == ""
+    assert made.look(7.1).tail[0] > where[0] + 1e-5
 
 
 def test_a_power_stage_that_hears_nothing_switches_off():

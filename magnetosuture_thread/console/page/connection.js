@@ -14,11 +14,11 @@ export class Connection {
 
   open() {
     clearTimeout(this.timer);
-    const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`);
+    const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket?token=${encodeURIComponent(this.token)}`);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     socket.onopen = () => {
-      this.send({ type: "hello", token: this.token });
+      this.send({ type: "hello", token: this.token, automated: navigator.webdriver === true });
       this.handlers.opened();
     };
     socket.onmessage = ({ data }) => {

@@ -1,5 +1,7 @@
-// Jog input: keys, a gamepad's stick, or dragging from the needle. All of it is cleared when the page loses focus, is
-// hidden, or the mouse leaves; keys that were held then must be pressed again.
+// Jog input: keys, direction buttons, a gamepad's stick, or dragging from the needle. All of it is cleared when the page
+// loses focus, is hidden, the mouse leaves, the focus enters anything that takes keys itself, or a key is pressed that may
+// open a menu or dialog of the browser; keys that were held then must be pressed again. Nothing on the page opens a native
+// popup, as these swallow the release of a key.
 
 const KEYS = {
   ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0],
@@ -10,12 +12,16 @@ const MAX_DRAG = 90; // [px] a longer drag is not faster
 const MIN_DRAG = 8; // [px]
 const GRIP_RADIUS = 36; // [px] around the needle
 
-const typing = (target) => target instanceof Element && target.closest("input, select, textarea") !== null;
+const TAKES_KEYS = "input, textarea, select, [contenteditable], [role=listbox], [role=alertdialog]";
+const OPENS_MENU = /^(F\d+|ContextMenu|Alt|AltGraph|Control|Meta|OS|PrintScreen)$/;
+const takesKeys = (target) => target instanceof Element && target.closest(TAKES_KEYS) !== null;
 
 export class Input {
   // changed() is called when the input changes, stop() when Space is pressed; needle() returns points in pixels of the page.
-  constructor(canvas, { changed, stop, needle }) {
+  constructor(canvas, directions, { changed, stop, needle }) {
     this.pressed = new Set();
+    this.released = new Set(); // keys that are held but no longer count
+    this.button = null; // direction of the button that is held
     this.pointer = null; // [px] during a drag
     this.stick = [0, 0];
     this.stickCentred = false; // a stick must be centred once before it jogs
@@ -23,28 +29,41 @@ export class Input {
     this.needle = needle;
     addEventListener("keydown", (event) => this.#down(event, stop), true);
     addEventListener("keyup", (event) => this.#up(event), true);
-    addEventListener("blur", () => this.clear());
-    addEventListener("pagehide", () => this.clear());
-    addEventListener("offline", () => this.clear());
-    addEventListener("gamepaddisconnected", () => this.clear());
+    addEventListener("focusin", ({ target }) => takesKeys(target) && this.clear());
+    for (const swallowing of ["contextmenu", "dragstart"]) {
+      addEventListener(swallowing, (event) => {
+        event.preventDefault();
+        // A finger that rests on a direction button opens a menu too, which stays closed; the hold goes on.
+        if (!(event.pointerType === "touch" && this.button)) this.clear();
+      }, true);
+    }
+    for (const lost of ["blur", "pagehide", "beforeprint", "offline", "gamepaddisconnected"]) addEventListener(lost, () => this.clear());
     document.addEventListener("visibilitychange", () => document.hidden && this.clear());
     canvas.addEventListener("pointerdown", (event) => this.#startDrag(event));
     canvas.addEventListener("pointermove", (event) => this.#updateDrag(event));
     for (const end of ["pointerup", "pointerleave", "pointercancel"]) canvas.addEventListener(end, () => this.#endDrag());
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    directions.addEventListener("pointerdown", (event) => this.#holdButton(event));
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) directions.addEventListener(end, () => this.#releaseButton());
+  }
+
+  // Whether a key is held that has to be pressed again.
+  get stale() {
+    return this.released.size > 0;
   }
 
   clear() {
+    if (document.hasFocus()) this.pressed.forEach((code) => this.released.add(code));
+    else this.released.clear(); // their release would not be heard
     this.pressed.clear();
-    this.pointer = null;
+    this.pointer = this.button = null;
     this.stick = [0, 0];
     this.stickCentred = false;
     this.changed();
   }
 
-  // Poll the gamepad, which sends no events.
+  // Poll the focus, which some of the browser's own popups take without an event, and the gamepad, which sends none.
   poll() {
-    if (!document.hasFocus() || document.hidden) return;
+    if (!document.hasFocus() || document.hidden) return this.clear();
     const pad = [...(navigator.getGamepads?.() ?? [])].find((entry) => entry?.connected && entry.axes.length >= 2);
     const [x, y] = pad ? [pad.axes[0], -pad.axes[1]] : [0, 0];
     const size = Math.hypot(x, y);
@@ -63,6 +82,7 @@ export class Input {
   // Jog direction, of length 1 at most.
   direction() {
     if (this.pointer) return this.drag()?.direction ?? [0, 0];
+    if (this.button) return this.button;
     let [x, y] = [0, 0];
     for (const code of this.pressed) {
       x += Math.sign(KEYS[code][0]);
@@ -90,16 +110,34 @@ export class Input {
       if (!event.repeat) stop();
       return;
     }
-    if (!(event.code in KEYS) || event.ctrlKey || event.altKey || event.metaKey || typing(event.target)) return;
+    if (OPENS_MENU.test(event.key)) this.clear();
+    if (!(event.code in KEYS) || event.ctrlKey || event.altKey || event.metaKey || takesKeys(event.target)) return;
     event.preventDefault();
+    if (event.repeat && !this.pressed.has(event.code)) this.released.add(event.code);
     if (event.repeat || this.pressed.has(event.code)) return;
+    this.released.delete(event.code);
     this.pressed.add(event.code);
     this.changed();
   }
 
   #up(event) {
     if (event.code === "Space") event.preventDefault();
+    this.released.delete(event.code);
     if (this.pressed.delete(event.code)) this.changed();
+  }
+
+  #holdButton(event) {
+    const held = event.target.closest("[data-direction]");
+    if (event.button !== 0 || !held || held.disabled) return;
+    held.setPointerCapture(event.pointerId);
+    this.button = held.dataset.direction.split(",").map(Number);
+    this.changed();
+  }
+
+  #releaseButton() {
+    if (!this.button) return;
+    this.button = null;
+    this.changed();
   }
 
   #startDrag(event) {

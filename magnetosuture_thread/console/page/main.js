@@ -5,12 +5,14 @@ import { Dish } from "./dish.js";
 import { Input } from "./input.js";
 import { showPanel } from "./panel.js";
 import { Plots } from "./plots.js";
+import { SetupPicker } from "./setup_picker.js";
 import { SILENCE_TIMEOUT } from "./status.js";
 
 const JOG_PERIOD = 30; // [ms] between two jog messages
 const PANEL_PERIOD = 100; // [ms]
 const PLOT_PERIOD = 250; // [ms]
 const FRAME_DELAY = 0.06; // [s] after a state, after which a camera frame is drawn without waiting for the next
+const LATE_TIME = 1; // [s] for which a late jog message is shown
 const NOTICE_TIME = 7000; // [ms]
 
 const stats = { fps: 0, drawn: 0, states: 0, frames: 0, errors: 0 };
@@ -24,10 +26,11 @@ const clock = () => performance.now() / 1000;
 const state = {
   link: "connecting", problem: "", graph: null, host: null, lease: null, received: 0, client: null, canCommand: false,
   speed: 0.003, maxSpeed: 0.01, adjusted: false, jogging: false, stopped: false,
+  late: { delay: 0, at: 0 },
 };
 const dish = new Dish(find("dish"));
 const plots = new Plots(document);
-const input = new Input(find("dish"), {
+const input = new Input(find("dish"), find("directions"), {
   changed: () => sendJog(), stop: () => emergencyStop(), needle: () => dish.needlePoints(state.graph),
 });
 const connection = new Connection({ opened, closed, received, frame });
@@ -53,7 +56,8 @@ function received(message) {
     Object.assign(state, { client: message.client, canCommand: message.can_command, maxSpeed: message.max_speed });
     if (!state.adjusted) setSpeed(message.speed);
     if (message.refusal) notice(message.refusal);
-  } else if (message.type === "error") notice(message.text);
+  } else if (message.type === "error" && message.delay) state.late = { delay: message.delay, at: clock() };
+  else if (message.type === "error") notice(message.text);
   else if (message.type === "result" && message.refusal) notice(`${message.request}: ${message.refusal}`);
 }
 
@@ -113,7 +117,11 @@ function setSpeed(speed) {
   find("speed").value = String(state.speed * 1e3);
 }
 
-const request = (id, message) => find(id).addEventListener("click", () => connection.send(message()));
+// A button that is disabled as it has done its work would leave the focus nowhere.
+const request = (id, message) => find(id).addEventListener("click", () => {
+  connection.send(message());
+  find("dish").focus({ preventScroll: true });
+});
 find("stop").addEventListener("click", emergencyStop);
 for (const action of ["arm", "disarm", "reset"]) request(action, () => ({ type: "bridge_action", action }));
 request("control", () => {
@@ -122,10 +130,11 @@ request("control", () => {
 });
 request("pause", () => ({ type: "pause", paused: !state.host.paused }));
 request("record", () => ({ type: "record", recording: !state.host.recording }));
-find("setup").addEventListener("change", ({ target }) => {
-  connection.send({ type: "select_setup", setup: target.value });
-  target.blur(); // arrow keys jog again
+const setups = new SetupPicker({
+  select: (setup) => connection.send({ type: "select_setup", setup }),
+  running: () => (state.host?.recording ? `the run and its recording to ${state.host.recording}` : "the run"),
 });
+find("again").addEventListener("click", () => setups.ask(state.host.setup));
 find("speed").addEventListener("input", ({ target }) => {
   state.adjusted = true;
   state.speed = Number(target.value) / 1e3;
@@ -165,7 +174,8 @@ function update() {
   showPanel({
     link: state.link, open: state.link === "open", problem: state.problem, since: since(), graph: state.graph, host: state.host,
     lease: state.lease, client: state.client, hasControl: hasControl(), canCommand: state.canCommand, jogging: state.jogging, hasImage: dish.image !== null,
-    fps: stats.fps, speed: state.speed, maxSpeed: state.maxSpeed,
+    stale: input.stale, late: now - state.late.at < LATE_TIME ? state.late.delay : 0,
+    fps: stats.fps, speed: state.speed, maxSpeed: state.maxSpeed, setups,
   });
 }
 

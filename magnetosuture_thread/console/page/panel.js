@@ -47,21 +47,19 @@ function showStatus(view) {
 }
 
 function showLink({ link, since, fps, client, problem }) {
+  // Not in the live region, which would be read out at every change.
+  write("fps", link === "open" && since <= SILENCE_TIMEOUT ? `${fps} frames/s` : "");
   if (link !== "open") {
     write("link", link === "closed" ? `Disconnected${problem ? `: ${problem}` : ""}` : "Connecting …", link === "closed" ? "error" : "warn");
   } else if (since > SILENCE_TIMEOUT) write("link", `No data for ${seconds(since)}`, "error");
-  else write("link", `Connected as page ${client ?? "…"} · ${fps} frames/s`, "ok");
+  else write("link", `Connected as page ${client ?? "…"}`, "ok");
 }
 
-function showHost({ host, hasControl, open }) {
-  const select = find("setup");
+function showHost({ host, hasControl, open, setups }) {
   const names = host?.setups ?? [];
-  if ([...select.options].map((option) => option.value).join("\n") !== names.join("\n")) {
-    select.replaceChildren(...names.map((name) => new Option(displayName(name), name)));
-  }
-  if (host && document.activeElement !== select && select.value !== host.setup) select.value = host.setup;
-  const allowed = open && hasControl && host && !host.busy;
-  select.disabled = !allowed || names.length < 2;
+  const allowed = Boolean(open && hasControl && host && !host.busy);
+  setups.show(names, host?.setup ?? "", allowed && names.length > 1, displayName);
+  find("again").disabled = !(allowed && names.includes(host.setup));
   const pause = find("pause");
   pause.disabled = !(allowed && host.can_pause);
   pause.setAttribute("aria-pressed", String(Boolean(host?.paused)));
@@ -93,7 +91,9 @@ function showCoils({ graph, host, since, canCommand, hasControl, open }) {
   find("reset").disabled = !(open && hasControl && !host?.busy && latched);
   const warnings = bridge?.driver_warnings ?? [];
   const driver = bridge ? [`Driver ${bridge.driver}: ${bridge.driver_ready ? "ready" : "not ready"}`, ...warnings].join(" · ") : "Driver: no data";
-  write("driver", bridge?.refused ? `${driver} · ${bridge.refused} commands refused` : driver);
+  const why = graph?.nodes?.coil_bridge?.values?.["last refusal"] ?? "none";
+  const refused = bridge?.refused ? `${plural(bridge.refused, "message")} not followed${why === "none" ? "" : `, the last: ${why}`}` : "";
+  write("driver", refused ? `${driver} · ${refused}` : driver);
 }
 
 function showControl({ lease, client, hasControl, canCommand, open, maxSpeed, speed }) {
@@ -105,10 +105,13 @@ function showControl({ lease, client, hasControl, canCommand, open, maxSpeed, sp
   const control = find("control");
   control.disabled = !(open && canCommand && lease && (hasControl || lease.available));
   write("control", hasControl ? "Release control" : "Take control");
+  for (const button of find("directions").children) button.disabled = !(open && hasControl);
   const slider = find("speed");
   const limit = (maxSpeed * 1e3).toFixed(1);
   if (slider.max !== limit) slider.max = limit;
-  write("speed-now", `${(speed * 1e3).toFixed(1)} mm/s`);
+  const speedNow = `${(speed * 1e3).toFixed(1)} mm/s`;
+  write("speed-now", speedNow);
+  if (slider.getAttribute("aria-valuetext") !== speedNow) slider.setAttribute("aria-valuetext", speedNow);
   write("hint", open && client !== null && !canCommand
     ? "This page only watches: it was opened without the token"
     : "Arrows, WASD, gamepad, or drag from the needle");

@@ -1,46 +1,100 @@
-// Status headline: whether the needle moves, and why not. The first matching reason is the first to resolve.
+// Status headline: whether the needle moves, and why not. The first matching reason is the first to resolve, and a command
+// that yields no motion always has one.
 
 import { capital, isNumber, length, plural, seconds, speedText } from "./format.js";
 
-export const SILENCE_TIMEOUT = 1.0; // [s] after which states of bridge and needle are stale
-const MIN_SPEED = 5e-5; // [m/s]
+export const SILENCE_TIMEOUT = 1.0; // [s] after which states of bridge, needle and camera are stale
+const NODE_TIMEOUT = 3.0; // [s] after which the diagnostics of a node are
+const MIN_SPEED = 1e-5; // [m/s]
+const MIN_REAL_TIME_FACTOR = 0.9; // below which it is reported as late
 
-// view: {link: "open"|"closed"|"connecting", since: s, graph, host, lease, client, canCommand, jogging}
+// view: {link: "open"|"closed"|"connecting", since: s, graph, host, lease, client, canCommand, jogging, stale, late: s}
+// `stale`: a key is held that has to be released first; `late`: delay of a jog message that came too late, else 0.
 // Returns {level, headline, reasons}.
 export function motionStatus(view) {
-  const { link, since, graph, host, lease } = view;
+  const { link, since, graph, host } = view;
   if (link === "closed") return result("error", "Not connected: this page can neither jog nor stop the needle", ["Reconnecting. Control must be taken again."]);
   if (!graph) return result("silent", "No data from the server yet", []);
   if (since > SILENCE_TIMEOUT) return result("error", `No data from the server for ${seconds(since)}`, ["The drawing is old. The jog has ended."]);
   const bridge = graph.bridge;
-  const stopped = bridge?.emergency_stopped;
-  if (stopped) return result("error", "Emergency stop is pressed", ["The bridge keeps all coils at zero. To resume: Reset, then Arm.", ...others(bridge, ["emergency stop"])]);
+  if (bridge?.emergency_stopped) return result("error", "Emergency stop is pressed", ["The bridge keeps all coils at zero. To resume: Reset, then Arm.", ...others(bridge, ["emergency stop"])]);
   if (host?.busy) return result("warn", capital(host.busy), ["Please wait."]);
   if (host?.paused) return result("warn", "Paused", []);
+  const blocked = bridgeStatus(view) ?? perceptionStatus(view);
+  if (blocked) return blocked;
+  const { level, headline, reasons } = readiness(view) ?? (speeds(view).applied > MIN_SPEED ? moving(view) : resting(view));
+  const factor = Number(graph.nodes?.rig_simulator?.values?.real_time_factor ?? 1);
+  return factor < MIN_REAL_TIME_FACTOR
+    ? result(level === "error" ? level : "warn", headline, [...reasons, `Computer late: simulated time runs at ${(100 * factor).toFixed(0)} %.`])
+    : result(level, headline, reasons);
+}
+
+function bridgeStatus({ since, graph: { bridge }, host }) {
   if (!bridge) return result("silent", "No data from the coil bridge yet", host?.mode === "replay" ? ["A bag is replayed."] : []);
   if (bridge.age + since > SILENCE_TIMEOUT) return result("error", `Coil bridge silent for ${seconds(bridge.age + since)}`, ["Check its node and the network."]);
   if (bridge.state === "fault") return result("error", `Fault: ${first(bridge.reasons, "no reason given")}`, [...bridge.reasons.slice(1), "To resume: Reset, then Arm."]);
   if (bridge.state !== "active") return result("warn", `Coil bridge is ${bridge.state}`, others(bridge, [bridge.state]));
-  if (!bridge.driver_ready) return result("error", `Driver ${bridge.driver} is not ready`, others(bridge, []));
-  if (!bridge.armed) return result("warn", "Disarmed: press Arm to enable commands", others(bridge, ["disarmed"]));
-  const tracker = graph.tracker;
-  if (tracker && tracker.state !== "tracked") return result("error", `Needle ${tracker.state}${tracker.reason ? `: ${tracker.reason}` : ""}`, others(bridge, []));
-  if (graph.needle && graph.needle.age + since > SILENCE_TIMEOUT) return result("error", `No needle pose for ${seconds(graph.needle.age + since)}`, others(bridge, []));
-  const filter = graph.filter && graph.filter.age + since < SILENCE_TIMEOUT ? graph.filter : null;
-  const filtered = length(bridge.filtered) ?? 0;
-  const applied = length(bridge.applied) ?? 0;
-  if (filtered > MIN_SPEED) return moving(applied, bridge, filter, graph);
-  if (filter && (length(filter.commanded) ?? 0) > MIN_SPEED) {
-    const why = filter.reason || (filter.active.length ? `stopped by ${filter.active.join(", ")}` : "");
-    return result("warn", why ? `At rest: ${why}` : "At rest", others(bridge, [filter.reason]));
-  }
-  if (view.jogging) return result("warn", "Jogging, but no command has arrived", others(bridge, []));
-  if (lease && lease.holder === view.client) return result("rest", "Ready to jog", ["Hold an arrow key, or drag from the needle."]);
-  const holder = lease?.holder === null ? "no page" : `page ${lease?.holder}`;
-  return result("rest", `At rest: ${holder} has control`, [view.canCommand ? "Take control to move the needle." : "This page only watches: it was opened without the token."]);
+  return null;
 }
 
-function moving(applied, bridge, filter, graph) {
+function perceptionStatus({ since, graph, host }) {
+  const { bridge, tracker, needle, camera } = graph;
+  const age = (part) => (part?.age ?? 0) + since;
+  if (tracker && tracker.state !== "tracked" && age(tracker) <= SILENCE_TIMEOUT) {
+    return result("error", `Needle ${tracker.state}${tracker.reason ? `: ${tracker.reason}` : ""}`, others(bridge, []));
+  }
+  const rig = graph.nodes?.rig_simulator;
+  const again = host?.mode === "simulated" ? "If that does not help: Start again." : "Check its node.";
+  if (rig && (rig.level === "silent" || age(rig) > NODE_TIMEOUT)) return result("error", `Simulator silent for ${seconds(age(rig))}`, [again]);
+  if (rig?.level === "error") return result("error", `Simulator: ${rig.message}`, [`To resume: Disarm, then Arm. ${again}`]);
+  const unseen = !needle || age(needle) > SILENCE_TIMEOUT;
+  if (unseen && camera && age(camera) > SILENCE_TIMEOUT) return result("error", `Camera silent for ${seconds(age(camera))}`, ["Check its node and cable."]);
+  if (needle && unseen) return result("error", `No needle pose for ${seconds(age(needle))}`, others(bridge, []));
+  return null;
+}
+
+function readiness({ graph: { bridge }, late }) {
+  if (!bridge.driver_ready) return result("error", `Driver ${bridge.driver} is not ready`, others(bridge, []));
+  if (late) return result("error", `Computer or network late: key presses come ${seconds(late)} late`, ["The needle rests until they come in time.", ...others(bridge, [])]);
+  if (!bridge.armed) return result("warn", "Disarmed: press Arm to enable commands", others(bridge, ["disarmed"]));
+  return null;
+}
+
+// Speeds [m/s] of the latest of both messages that tell them.
+function speeds({ since, graph: { bridge, filter } }) {
+  const both = [bridge, filter && filter.age + since < SILENCE_TIMEOUT ? filter : null];
+  const speed = (name) => Math.max(...both.map((part) => length(part?.[name]) ?? 0));
+  return { commanded: speed("commanded"), filtered: speed("filtered"), applied: speed("applied") };
+}
+
+function resting(view) {
+  const { since, graph, lease, client, canCommand, jogging, stale } = view;
+  const { bridge } = graph;
+  const filter = graph.filter && graph.filter.age + since < SILENCE_TIMEOUT ? graph.filter : null;
+  const { commanded, filtered } = speeds(view);
+  if (commanded > MIN_SPEED) {
+    const why = filter?.reason || bridge.reasons[0] || restingAt(filter, bridge, filtered);
+    return result("warn", `At rest: ${why}`, others(bridge, [why]));
+  }
+  if (stale || (jogging && lease?.release_first)) return result("warn", "At rest: release the key and press it again", ["It was held while the needle was stopped.", ...others(bridge, [])]);
+  if (jogging) return result("warn", "Jogging, but no command has arrived", others(bridge, []));
+  if (lease && lease.holder === client) return result("rest", "Ready to jog", ["Hold an arrow key, or drag from the needle."]);
+  const holder = lease?.holder === null ? "no page" : `page ${lease?.holder}`;
+  return result("rest", `At rest: ${holder} has control`, [canCommand ? "Take control to move the needle." : "This page only watches: it was opened without the token."]);
+}
+
+// Why a command yields no motion, where neither filter nor bridge says so.
+function restingAt(filter, bridge, filtered) {
+  const active = filter?.active ?? [];
+  if (active.length) return `stopped by ${active.join(", ")}`;
+  if (isNumber(filter?.slowdown) && filter.slowdown < 0.999) return `slowed to ${(100 * filter.slowdown).toFixed(0)} % by friction`;
+  if (bridge.saturated) return "the coils are at their limit";
+  return filtered > MIN_SPEED ? "the coils give no motion, and the coil bridge gives no reason" : "the filter lets nothing through, and gives no reason";
+}
+
+function moving(view) {
+  const { graph } = view;
+  const { bridge, filter } = graph;
   const notes = [];
   const friction = graph.margins?.valid ? graph.margins.friction : null;
   const slowdown = filter?.slowdown ?? 1;
@@ -52,7 +106,7 @@ function moving(applied, bridge, filter, graph) {
   if (limits.length) notes.push(`Limited by ${limits.join(", ")}.`);
   if (filter?.overridden) notes.push(`Commands of the input ${filter.overridden} are overridden.`);
   if (bridge.saturated) notes.push("The coils are at their limit.");
-  return result(notes.length ? "warn" : "ok", `Moving at ${speedText(applied)}`, notes);
+  return result(notes.length ? "warn" : "ok", `Moving at ${speedText(speeds(view).applied)}`, notes);
 }
 
 const first = (list, otherwise) => list?.[0] ?? otherwise;

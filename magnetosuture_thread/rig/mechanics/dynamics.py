@@ -16,7 +16,7 @@ from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
 from magnetosuture_thread.rig.mechanics.field import CoilField
 from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody
-from magnetosuture_thread.rig.mechanics.newton import advance, make_buffers
+from magnetosuture_thread.rig.mechanics.newton import MAX_FULL_STEPS, MAX_ITERATIONS, advance, make_buffers
 from magnetosuture_thread.rig.mechanics.rod import Rod
 from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
 
@@ -25,6 +25,7 @@ __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 MAX_STEP = 2e-3  # s
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 MAX_HALVINGS = 8
+FAILED_ITERATIONS = MAX_FULL_STEPS + MAX_ITERATIONS  # of a step that does not converge
 GREATEST_GROWTH = 2.0  # of a step; the formula is stable up to 1 + sqrt(2)
 MAX_CONTACTS = 48  # points of the needle's outline
 
@@ -168,12 +169,14 @@ class RigDynamics:
         # The last two states may be farther apart than a step that touches something can follow.
         self._before, self._last_dt = self._q.copy(), 0.0
 
-    def step(self, currents: ArrayLike, dt: float) -> None:
-        """Move on under coil currents, which are held.
+    def step(self, currents: ArrayLike, dt: float, max_iterations: float = math.inf) -> float:
+        """Move on under coil currents, which are held; return for how long [s].
 
         Args:
             currents: signed, one for each coil, shape (k,) [A].
             dt: time, in which the rig takes as many steps as it needs [s].
+            max_iterations: of Newton, those of steps that fail too, after which no other step begins: less than dt has
+                passed then.
 
         Raises:
             InvalidInputError: a value is not finite, or of the wrong shape.
@@ -185,7 +188,7 @@ class RigDynamics:
         if not np.array_equal(amperes, self._held):
             # Speeds jump with currents: a formula that looks back over the jump would lag by part of a step.
             self._held, self._last_dt = amperes.copy(), 0.0
-        self._integrate(span, amperes, None)
+        return self._integrate(span, amperes, None, max_iterations)
 
     def drive(self, tail: ArrayLike, heading: float, dt: float) -> None:
         """Move the needle at constant velocity and turn rate, and the thread with it.
@@ -203,13 +206,22 @@ class RigDynamics:
         goal[0] = self._q[0] + math.remainder(goal[0] - self._q[0], 2.0 * math.pi)
         self._integrate(_positive("rig.dt", dt), None, goal)
 
-    def _integrate(self, dt: float, currents: NDArray[np.float64] | None, goal: NDArray[np.float64] | None) -> None:
-        """Take steps until dt is over; a step that does not converge is halved."""
-        regular = dt / math.ceil(dt / self._largest_step - 1e-9)
+    def _integrate(
+        self,
+        dt: float,
+        currents: NDArray[np.float64] | None,
+        goal: NDArray[np.float64] | None,
+        max_iterations: float = math.inf,
+    ) -> float:
+        """Take steps until dt is over, or the iterations are used up; a step that does not converge is halved."""
+        regular = dt / max(math.ceil(dt / self._largest_step - 1e-9), 1)
         done, h, tries = 0.0, regular, 0
         self.iterations = self.substeps = self.halvings = 0
         begin = self._q[:3].copy()
         while (left := dt - done) > 1e-12 * dt:
+            # At least one step is taken, or fails for good: nothing is tried again and again in call after call.
+            if done and self.iterations + FAILED_ITERATIONS * self.halvings >= max_iterations:
+                return done
             if self._last_dt > 0.0:
                 h = min(h, GREATEST_GROWTH * self._last_dt)
             # What is left is taken whole or in two like steps, never with a sliver at the end.
@@ -226,6 +238,7 @@ class RigDynamics:
                 raise SolverError("rig", "no convergence", self._move, TOLERANCE)
             self.halvings += 1
             h *= 0.5
+        return dt
 
     def _take(self, h: float, currents: NDArray[np.float64] | None) -> bool:
         """Take one step; return whether it converged, and change nothing if not."""

@@ -115,6 +115,13 @@ def test_a_thread_that_is_pulled_lengthwise():
     np.testing.assert_allclose(made.thread[-1, 0], 30 * FRAME * speed - 19e-3, atol=2e-7)
 
 
+@pytest.mark.parametrize("dt", [1e-17, 1e-13])
+def test_however_short_a_time_is_a_step(dt: float):
+    made = rig()
+    made.step(np.zeros(4), dt)
+    assert made.time == dt
+
+
 def test_a_turn_does_not_stretch_the_thread_and_leaves_what_it_was_told():
     made = rig(CLAMPED)
     for k in range(1, 121):
@@ -327,6 +334,23 @@ def test_a_step_that_fails_is_halved_and_the_time_is_kept(monkeypatch: pytest.Mo
     steered(made, FRAME)
     assert made.time == pytest.approx(2.0 * FRAME)
     np.testing.assert_allclose(made.thread, plain.thread, atol=1e-4)
+
+
+def test_a_call_takes_no_more_iterations_than_it_may_and_says_how_far_it_came(monkeypatch: pytest.MonkeyPatch):
+    made, failed = rig(), [0]
+
+    def wedged(*arguments: Any) -> tuple[int, float, float]:
+        if arguments[2] < 1e-4:
+            return advance(*arguments)
+        failed[0] += 1
+        return -1, 1.0, 1.0
+
+    monkeypatch.setattr("magnetosuture_thread.rig.mechanics.dynamics.advance", wedged)
+    moved = made.step(np.zeros(4), 60.0, 1000)
+    assert 0.0 < moved < 0.01
+    assert made.time == pytest.approx(moved)
+    assert 1 < failed[0] < 25  # each counts as 72
+    assert made.step(np.zeros(4), 1e-3, 1) > 0.0  # however few
 
 
 def test_a_step_that_never_converges_is_an_error(monkeypatch: pytest.MonkeyPatch):
