@@ -45,6 +45,7 @@ def main(install: Path) -> int:
     setup = install.resolve() / "setup.sh"
     environment = {
         **os.environ,
+        "XDG_STATE_HOME": str(install.resolve() / "state"),
         "ROS_DOMAIN_ID": "101",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",

@@ -7,22 +7,21 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from benchmarks import keep_out
+from benchmarks.attack import command as attack
 from benchmarks.bridge import command as bridge
 from benchmarks.page import command as page
 from benchmarks.solver import command as solver
-from magnetosuture_thread.cli.arguments import EXIT_CODES, output_file
+from magnetosuture_thread.cli.arguments import EXIT_CODES, STANDARD_OUTPUT, check_outputs, output_file
 from magnetosuture_thread.cli.main import exit_code
-from magnetosuture_thread.cli.terminal import make_console
+from magnetosuture_thread.cli.terminal import make_console, write_json
 
 # Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
-BENCHMARKS: dict[str, Any] = {"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out}
-STANDARD_OUTPUT = Path("-")
+BENCHMARKS: dict[str, Any] = {"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out, "attack": attack}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,13 +48,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(run: Callable[[argparse.Namespace, Console], tuple[dict[str, Any], bool]], options: argparse.Namespace) -> int:
     """Run a benchmark and write its figures; tables go to standard error where the JSON goes to standard output."""
+    check_outputs(options)
     to_standard_output = options.json == STANDARD_OUTPUT
-    figures, passed = run(options, Console(stderr=True, highlight=False) if to_standard_output else make_console())
-    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    figures, passed = run(options, make_console(errors=to_standard_output))
     if to_standard_output:
-        sys.stdout.write(text)
-    elif options.json:
-        options.json.write_text(text)
+        sys.stdout.write(json.dumps(figures, indent=2, allow_nan=False) + "\n")
+    else:
+        write_json(options.json, figures)
     return 0 if passed else 1
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import signal
+import tempfile
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +26,10 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+STATE = Path(tempfile.mkdtemp(prefix="magnetosuture_test_"))
+atexit.register(shutil.rmtree, STATE, ignore_errors=True)
+os.environ["XDG_STATE_HOME"] = str(STATE)
+
 VIEW = DishView((322.0, 238.0), 8e-5)
 POST = Disc((0.006, -0.004), 0.0015)
 
@@ -32,6 +40,14 @@ def arc(tail: np.ndarray, angle: float, curvature: float, length: float = 0.019,
     turned = angle + curvature * s
     steps = np.diff(s)[:, None] * np.column_stack([np.cos(turned), np.sin(turned)])[:-1]
     return np.vstack([tail, tail + np.cumsum(steps, axis=0)])
+
+
+@pytest.fixture(autouse=True)
+def state_home(monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Give each test a folder of its own for what nodes keep over a restart, and return it; made where it is used."""
+    folder = STATE / uuid.uuid4().hex
+    monkeypatch.setenv("XDG_STATE_HOME", str(folder))
+    return folder
 
 
 @pytest.fixture

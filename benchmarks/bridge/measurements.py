@@ -152,6 +152,7 @@ class BridgeBench:
             try:
                 # Another each time: the one that is not heard may be the client.
                 with self._client() as client:
+                    client.execute("reset")  # one that was killed while armed waits for it
                     client.execute("arm")
                 return
             except GraphError as error:

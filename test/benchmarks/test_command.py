@@ -28,6 +28,7 @@ FIGURES = {
         ("bridge", ["--trials", "--kills", "--hostile"]),
         ("page", ["--presses"]),
         ("keep-out", ["--seconds", "--seed"]),
+        ("attack", ["--count", "--seed"]),
     ],
 )
 def test_every_benchmark_has_help(name: str, options: list[str], capsys: pytest.CaptureFixture[str]):
@@ -49,6 +50,9 @@ def test_every_benchmark_has_help(name: str, options: list[str], capsys: pytest.
         ["solver", "--json"],
         ["solver", "--peers", "all"],
         ["bridge", "--kills", "-1"],
+        ["attack"],
+        ["attack", "moon"],
+        ["attack", "bags", "--count", "0"],
         ["page", "--json", "/no/such/folder/x.json"],
     ],
 )

@@ -1,0 +1,1 @@
+"""Attacks varied at random: damaged bags, against what is promised of them."""

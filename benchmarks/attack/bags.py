@@ -1,0 +1,236 @@
+"""Damages bags at random, and checks what reading, repairing and salvaging make of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import select
+import shutil
+import signal
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagWriter
+
+from magnetosuture_thread.bags.bag_folder import METADATA_FILE
+from magnetosuture_thread.bags.message_types import MESSAGES, typestore
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.repair import write_repaired_bag
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import MagnetosutureError
+
+MAX_SECONDS, MAX_MEGABYTES = 5.0, 300.0
+GRACE = 10.0  # s after `MAX_SECONDS`, after which a reader is ended
+MESSAGES_EACH = 500  # of each topic
+PERIOD = 33_000_000  # ns between two messages of a topic
+SECOND = 10**9
+KINDS = ("flip", "zeros", "noise", "cut", "remove", "repeat", "swap")
+PROMISES = ("altered_as_sound", "silently_lost", "tracebacks", "too_slow", "too_large")
+TYPES = {
+    "/thread/measured": "nav_msgs/msg/Path",
+    "/needle/measured_cp": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/note": "std_msgs/msg/String",
+}
+
+Message = tuple[str, int, bytes]
+
+
+def attack_bags(
+    count: int, seed: int, progress: Callable[[float], None] = lambda share: None
+) -> tuple[dict[str, Any], list[str], bool]:
+    """Damage bags of both formats in turn, and judge what becomes of each.
+
+    Args:
+        count: of damaged bags.
+        seed: of the damage.
+        progress: called with the share done, 0 to 1.
+
+    Returns:
+        Figures by format, lines for a person, and whether all promises were kept.
+    """
+    figures: dict[str, Any] = {}
+    examples: list[str] = []
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        bags = {"mcap": _write_mcap(folder / "mcap"), "sqlite3": _write_sqlite(folder / "sqlite3")}
+        original = Counter(original_messages())
+        totals = {name: Counter[str]() for name in bags}
+        worst = dict.fromkeys(bags, (0.0, 0.0))
+        for index in range(count):
+            name = list(bags)[index % len(bags)]
+            chance = random.Random(f"{seed} {index}")
+            target = folder / "damaged"
+            kinds = _damaged_copy(bags[name], target, chance)
+            found, seconds, megabytes = judged(target, original)
+            found["too_slow"] += seconds > MAX_SECONDS
+            found["too_large"] += megabytes > MAX_MEGABYTES
+            totals[name] += found
+            worst[name] = max(worst[name][0], seconds), max(worst[name][1], megabytes)
+            examples += [f"{name}, attack {index} ({kinds}): {promise}" for promise in PROMISES if found[promise]]
+            progress((index + 1) / count)
+    lines = []
+    for name, total in totals.items():
+        seconds, megabytes = worst[name]
+        figures[name] = {key: total[key] for key in (*OUTCOMES, *PROMISES)}
+        figures[name] |= {"bags": sum(total[key] for key in OUTCOMES), "max_s": seconds, "max_mb": megabytes}
+        shown = ", ".join(f"{total[key]} {key.replace('_', ' ')}" for key in (*OUTCOMES, *PROMISES))
+        lines.append(f"{name}: {figures[name]['bags']} bags: {shown}; at most {seconds:.1f} s and {megabytes:.0f} MB")
+    broken = sum(total[promise] for total in totals.values() for promise in PROMISES)
+    figures["broken"] = examples
+    return figures, [*lines, *examples[:20]], not broken
+
+
+OUTCOMES = ("whole", "damage_noticed", "refused", "altered_and_unchecked", "ended")
+
+
+def original_messages() -> list[Message]:
+    """Return the messages of a bag: a needle that moves, its thread, and texts."""
+    store, found = typestore(), list[Message]()
+    for index in range(MESSAGES_EACH):
+        at = SECOND + index * PERIOD
+        header = MESSAGES.header(at, "dish")
+        along = np.linspace(0.0, 0.015, 12)
+        bend = 0.002 * np.sin(300.0 * along + 0.05 * index)
+        upright = (0.0, 0.0, 0.0, 1.0)
+        points = [MESSAGES.pose((x, y, 0.0), upright) for x, y in zip(along, bend, strict=True)]
+        pose = MESSAGES.pose_with_covariance(header, points[0], np.zeros(36))
+        messages = (MESSAGES.path(header, points), pose, store.types["std_msgs/msg/String"](f"note {index}"))
+        for (topic, kind), message in zip(TYPES.items(), messages, strict=True):
+            found.append((topic, at, bytes(store.serialize_cdr(message, kind))))
+    return found
+
+
+def _write_mcap(folder: Path) -> Path:
+    with BagWriter(folder, {"simulated": "all of it"}) as bag:
+        for topic, kind in TYPES.items():
+            bag.add_topic(topic, kind)
+        for topic, at, data in original_messages():
+            bag.write(topic, at, data)
+    return folder
+
+
+def _write_sqlite(folder: Path) -> Path:
+    with RosbagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
+        own = {topic: bag.add_connection(topic, kind, typestore=typestore()) for topic, kind in TYPES.items()}
+        for topic, at, data in original_messages():
+            bag.write(own[topic], at, data)
+    return folder
+
+
+def _damaged_copy(bag: Path, target: Path, chance: random.Random) -> str:
+    """Write a damaged copy of a bag; now and then without its metadata.yaml. Return the kinds of damage."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(bag, target)
+    (file,) = (path for path in target.iterdir() if path.name != METADATA_FILE)
+    data = bytearray(file.read_bytes())
+    kinds = [chance.choice(KINDS) for _ in range(chance.choice((1, 1, 1, 2, 4)))]
+    for kind in kinds:
+        data = _damaged(data, kind, chance)
+    file.write_bytes(data)
+    if chance.random() < 0.3:
+        (target / METADATA_FILE).unlink()
+    return " and ".join(kinds)
+
+
+def _damaged(data: bytearray, kind: str, chance: random.Random) -> bytearray:
+    size = len(data)
+    if not size:
+        return data
+    # Half of all damage is near the head or the end, where the structure of a file is.
+    places = (chance.randrange(size), chance.randrange(4096), size - 1 - chance.randrange(4096))
+    at = max(0, min(size - 1, chance.choice(places)))
+    length = min(size - at, int(2 ** chance.uniform(0.0, 14.0)))
+    other = chance.randrange(size)
+    if kind == "flip":
+        for _ in range(chance.choice((1, 1, 2, 8))):
+            data[chance.choice((at, chance.randrange(size)))] ^= 1 << chance.randrange(8)
+    elif kind == "zeros":
+        data[at : at + length] = bytes(length)
+    elif kind == "noise":
+        data[at : at + length] = chance.randbytes(length)
+    elif kind == "cut":
+        del data[at:]
+    elif kind == "remove":
+        del data[at : at + length]
+    elif kind == "repeat":
+        data[other:other] = data[at : at + length]
+    else:
+        part = data[other : other + length]
+        data[at : at + len(part)], data[other : other + len(part)] = part, data[at : at + len(part)]
+    return data
+
+
+def judged(bag: Path, original: Counter[Message]) -> tuple[Counter[str], float, float]:
+    """Return what became of a bag, in a process of its own; and its time [s] and greatest memory [MB]."""
+    reading, writing = os.pipe()
+    began = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            os.close(reading)
+            os.write(writing, json.dumps(_judge(bag, original)).encode())
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    os.close(writing)
+    is_ready, _, _ = select.select([reading], [], [], MAX_SECONDS + GRACE)
+    answer = os.read(reading, 1 << 16) if is_ready else b""
+    os.close(reading)
+    if not is_ready:
+        os.kill(child, signal.SIGKILL)
+    _, _, usage = os.wait4(child, 0)
+    found: Counter[str] = Counter(json.loads(answer)) if answer else Counter(ended=1, tracebacks=int(bool(is_ready)))
+    return found, time.monotonic() - began, usage.ru_maxrss / 1024.0
+
+
+def _judge(bag: Path, original: Counter[Message]) -> dict[str, int]:
+    """Return what reading, repairing and salvaging make of a bag."""
+    found: Counter[str] = Counter()
+    try:
+        opened = Bag(bag)
+    except MagnetosutureError:
+        return {"refused": 1}
+    refused: Counter[str] = Counter()
+    try:
+        read = Counter((record.topic, record.time, record.data) for _, record in opened.every_record(refused))
+    except MagnetosutureError:
+        return {"refused": 1}
+    altered, missing = (read - original).total(), (original - read).total()
+    is_noticed = opened.damage is not None or bool(refused) or bool(opened.unverified)
+    is_doubted = is_noticed or bool(opened.unchecked)
+    if is_noticed:
+        found["damage_noticed"] = 1
+    elif altered or missing:
+        found["altered_and_unchecked"] = 1
+    else:
+        found["whole"] = 1
+    # Of a message that was altered unnoticed the original is missing, and the altered one is there in its place.
+    found["silently_lost"] += missing > altered and not is_noticed
+    found["altered_as_sound"] += altered > 0 and (not is_doubted or (is_noticed and not opened.unverified))
+    for unverified in (False, True):
+        output = bag.with_name(f"repaired_{unverified}")
+        shutil.rmtree(output, ignore_errors=True)
+        try:
+            write_repaired_bag(opened, output, "repaired", unverified=unverified)
+            new = Bag(output)
+        except MagnetosutureError:
+            continue
+        finally:
+            repaired = output.is_dir() and any(output.glob("*.mcap"))
+        if not repaired:
+            continue
+        made = Counter((record.topic, record.time, record.data) for _, record in new.every_record(Counter()))
+        is_marked = bool(new.unverified) or (bool(new.unchecked) and not is_noticed)
+        found["altered_as_sound"] += (made - original).total() > 0 and not is_marked
+    return dict(found)
