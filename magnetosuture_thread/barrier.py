@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.texts import shortened
 
 NO_OBSTACLE = -1
 CONNECTIVITY, COMPRESSION, OBSTACLE = "connectivity", "compression", "obstacle"
@@ -177,6 +179,13 @@ def check_barriers(barriers: tuple[Barrier, ...]) -> None:
         taken.add(name)
 
 
+def import_barriers(names: Sequence[str]) -> None:
+    """Import the modules of barriers, each named `module:class`; what fails, `load_barriers` reports."""
+    for name in names:
+        with suppress(Exception):
+            import_module(name.partition(":")[0])
+
+
 def load_barriers(names: Sequence[str], parameter: str = "barriers") -> tuple[Barrier, ...]:
     """Return barriers by name, as nodes get them by a parameter.
 
@@ -201,7 +210,8 @@ def load_barriers(names: Sequence[str], parameter: str = "barriers") -> tuple[Ba
         except ConfigurationError:
             raise
         except Exception as error:  # whatever a user's module raises, its name has to be reported
-            words = f"a class that can be imported and made without arguments, but {type(error).__name__}: {error}"
+            problem = f"{type(error).__name__}: {shortened(str(error))}"
+            words = f"a class that can be imported and made without arguments, but {problem}"
             raise ConfigurationError(parameter, name, words) from error
     check_barriers(tuple(barriers))
     return tuple(barriers)

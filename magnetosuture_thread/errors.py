@@ -26,7 +26,7 @@ class ConfigurationError(MagnetosutureError):
         self.value = value
         self.expectation = expectation
         self.source = source
-        where = f"{source}: " if source else ""
+        where = f"{shortened(source, MAX_NAME_CHARS)}: " if source else ""
         super().__init__(
             f"{where}{shortened(name, MAX_NAME_CHARS)}: got {shortened(repr(value))}, expected {expectation}"
         )

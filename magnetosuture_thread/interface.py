@@ -16,6 +16,7 @@ SCENE_SERVER = "scene_server"  # besides, where the scene changes while the othe
 # As they run here: tracker and model in one process, so that a prediction waits for no message; the bridge alone.
 PROCESSES = ("perception", "coil_bridge")
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
+ALL_NODES = (*NODES, SCENE_SERVER, *RIG_NODES)
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"
 

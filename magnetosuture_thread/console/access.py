@@ -9,9 +9,24 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import secrets
+from collections import Counter
 from urllib.parse import quote, urlsplit
 
 TOKEN_BYTES = 18
+
+
+class RateCounter:
+    """Counts what comes from each address within a second."""
+
+    def __init__(self) -> None:
+        self._second, self._counts = 0, Counter[str]()
+
+    def count(self, address: str, now: float) -> int:
+        """Count one at a time of the loop [s]; return how many have come in the same second."""
+        if int(now) != self._second:
+            self._second, self._counts = int(now), Counter()
+        self._counts[address] += 1
+        return self._counts[address]
 
 
 def is_loopback(address: str) -> bool:

@@ -154,7 +154,10 @@ class Client:
             sending = asyncio.create_task(self._send_all())
             receive = self._on_message if self._can_command else self._on_watcher_message
             async for message in self._socket:
-                await receive(message.type, message.data)
+                if message.type in (WSMsgType.PING, WSMsgType.PONG):
+                    await self._on_ping(message.type, message.data)
+                else:
+                    await receive(message.type, message.data)
         finally:
             if self._jog.holder == self.number:
                 self._jog.release_control(self.number)
@@ -195,6 +198,14 @@ class Client:
         if kind is not WSMsgType.TEXT:
             raise InvalidInputError("message", kind.name.lower(), "text")
         return messages.parse_client_message(data, self._settings.max_speed)
+
+    async def _on_ping(self, kind: WSMsgType, data: bytes) -> None:
+        """Answer a ping, and count it like any message: no page sends one, but other programs may."""
+        exceeded = self._count_message(asyncio.get_running_loop().time())
+        if exceeded or (not self._can_command and self._message_count > MAX_WATCHER_RATE):
+            self._abort()
+        elif kind is WSMsgType.PING:
+            await self._socket.pong(data)
 
     async def _on_message(self, kind: WSMsgType, data: Any) -> None:
         now = asyncio.get_running_loop().time()

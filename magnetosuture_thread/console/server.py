@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import gc
-from collections import Counter
 from importlib.resources import files
 
 from aiohttp import web
 
-from magnetosuture_thread.console.access import host_refusal, is_any, new_token, origin_refusal, page_url, same_token
+from magnetosuture_thread.console.access import (
+    RateCounter,
+    host_refusal,
+    is_any,
+    new_token,
+    origin_refusal,
+    page_url,
+    same_token,
+)
 from magnetosuture_thread.console.client import Client, RequestHandler
 from magnetosuture_thread.console.graph import Graph, Host
 from magnetosuture_thread.console.jog_controller import JogController
@@ -20,6 +27,7 @@ from magnetosuture_thread.errors import ConfigurationError
 MAX_CLIENTS = 16  # with the token
 MAX_WATCHERS = 8  # without it, from one address, and twice as many in all; they take no place of the others
 MAX_NEW_WATCHERS = 20  # from one address in a second
+MAX_REQUESTS = 100  # from one address in a second; those beyond wait for the next second
 MAX_MESSAGE_BYTES = 65536  # beyond, the connection is closed before the whole message is read
 FRAME_POLL_PERIOD = 0.005  # of the check for a new camera frame [s]
 HEARTBEAT_PERIOD = 5.0  # a page that does not answer a ping within half of this is disconnected [s]
@@ -55,7 +63,7 @@ class ConsoleServer:
         self._jog = JogController(graph.publish_velocity, settings.rate, settings.hold_timeout)
         self._requests = RequestHandler(graph, host, self._jog)
         self._clients: dict[int, Client] = {}
-        self._new_watchers: tuple[int, Counter[str]] = 0, Counter()  # of this second, by address
+        self._new_watchers, self._request_rate = RateCounter(), RateCounter()
         self._count = 0
         self._port = 0
         self._frame_number, self._frame = -1, b""
@@ -103,6 +111,9 @@ class ConsoleServer:
             task.result()
 
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
+        now = asyncio.get_running_loop().time()
+        if self._request_rate.count(request.remote or "", now) > MAX_REQUESTS:
+            await asyncio.sleep(1.0 - now % 1.0)
         refusal = host_refusal(request.headers.get("Host", ""), self._settings.address, self._port)
         if refusal:
             return _answer(403, refusal)
@@ -128,7 +139,10 @@ class ConsoleServer:
         full = self._no_place(has_token, request.remote or "")
         if full:
             return _answer(503, full)
-        socket = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_PERIOD, max_msg_size=MAX_MESSAGE_BYTES)
+        # Pings are left to the client, which counts them.
+        socket = web.WebSocketResponse(
+            compress=False, autoping=False, heartbeat=HEARTBEAT_PERIOD, max_msg_size=MAX_MESSAGE_BYTES
+        )
         socket.headers.update(HEADERS)
         self._count += 1
         number = self._count
@@ -149,13 +163,10 @@ class ConsoleServer:
         if has_token:
             count = sum(client.has_token for client in self._clients.values())
             return f"{MAX_CLIENTS} pages are connected already" if count >= MAX_CLIENTS else ""
-        second = int(asyncio.get_running_loop().time())
-        if second != self._new_watchers[0]:
-            self._new_watchers = second, Counter()
-        self._new_watchers[1][address] += 1
+        new = self._new_watchers.count(address, asyncio.get_running_loop().time())
         watchers = [client.address for client in self._clients.values() if not client.has_token]
         too_many = watchers.count(address) >= MAX_WATCHERS or len(watchers) >= 2 * MAX_WATCHERS
-        if too_many or self._new_watchers[1][address] > MAX_NEW_WATCHERS:
+        if too_many or new > MAX_NEW_WATCHERS:
             return "too many pages without the token are connected already"
         return ""
 

@@ -165,7 +165,7 @@ class RecordingHost(GraphHost):
         }
 
     def notes(self, operator: str) -> dict[str, str]:
-        """Return the notes of a recording, begun by the page that has control.
+        """Return the notes of a recording, which the page that has control began.
 
         Args:
             operator: who commands that page.
@@ -173,7 +173,9 @@ class RecordingHost(GraphHost):
         text = self.setup.path.read_text(encoding="utf-8")
         notes = {"setup": self.setup.name, SETUP_NOTE: text}
         if self.graph.is_active(RIG):
-            notes["simulated"] = f"the whole rig, jogged by {operator}, setup {self.setup.name}"
+            notes["simulated"] = (
+                f"the whole rig, setup {self.setup.name}; control was with {operator} when the recording began"
+            )
         return notes
 
     def start(self) -> None:

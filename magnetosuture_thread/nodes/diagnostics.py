@@ -11,6 +11,7 @@ from magnetosuture_thread.texts import shortened
 
 PERIOD = 1.0  # s
 MAX_TEXT_CHARS = 400  # of a status or a value, whatever is in it
+MAX_VALUES = 100  # that are read of one status
 
 
 class Health:
@@ -95,3 +96,9 @@ class Health:
     def _publish_late(self) -> None:
         self._late.cancel()
         self.publish()
+
+
+def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
+    """Return message and values of a status, of anybody, with texts of bounded length."""
+    values = {shortened(each.key): shortened(each.value, MAX_TEXT_CHARS) for each in status.values[:MAX_VALUES]}
+    return shortened(status.message, MAX_TEXT_CHARS), values

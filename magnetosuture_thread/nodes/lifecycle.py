@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.configuration import ROS_PARAMETERS, Configuration
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.nodes.node import PackageNode
+from magnetosuture_thread.nodes.node import PackageNode, reason_of
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 
@@ -166,7 +166,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
 
     def _failed(self, error: Exception) -> TransitionCallbackReturn:
         self.problem = error
-        self.get_logger().error(str(error))
+        self.get_logger().error(reason_of(error))
         return FAILURE
 
     def _keep(self, parameters: list[Parameter]) -> SetParametersResult:

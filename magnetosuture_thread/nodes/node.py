@@ -137,21 +137,22 @@ class _GuardedCallback:
                 return response
             return self._call(request, response)
         except Exception as error:
-            self._log(reason := _reason(error))
+            self._log(reason := reason_of(error))
             return _refused(type(response)(), reason, request)
 
     def _set(self, parameter: Any) -> SetParametersResult:
         try:
             answer = self._call(SetParameters.Request(parameters=[parameter]), SetParameters.Response())
         except Exception as error:
-            return SetParametersResult(successful=False, reason=_reason(error))
+            return SetParametersResult(successful=False, reason=reason_of(error))
         return answer.results[0]
 
     def _log(self, reason: str) -> None:
         self._logger.warning(f"{self._name} refused: {reason}", throttle_duration_sec=LOG_PERIOD)
 
 
-def _reason(error: Exception) -> str:
+def reason_of(error: Exception) -> str:
+    """Return the text of an error as it may be logged and answered."""
     return shortened(str(error) or type(error).__name__, MAX_REASON_CHARS)
 
 

@@ -12,8 +12,9 @@ from rclpy.context import Context
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.interface import DIAGNOSTICS
+from magnetosuture_thread.interface import ALL_NODES, DIAGNOSTICS
 from magnetosuture_thread.messages.reading import clock_nanoseconds
+from magnetosuture_thread.nodes.diagnostics import read_status
 from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.topics import CLOCK, Topic
 
@@ -36,7 +37,7 @@ class Recorder:
 
     Attributes:
         taken: messages of each topic so far, by its name with a leading slash.
-        said: of each node, what it last said of itself: message and values.
+        status_texts: of each node of this package, message and values of its last status.
     """
 
     def __init__(
@@ -90,8 +91,9 @@ class Recorder:
         if topic.channel is DIAGNOSTICS:
             with suppress(InvalidInputError):
                 for status in topic.decode(data).status:
-                    values = {value.key: value.value for value in status.values}
-                    self.status_texts[status.name.split(":")[0]] = (status.message, values)
+                    name = status.name.split(":")[0]
+                    if name in ALL_NODES:
+                        self.status_texts[name] = read_status(status)
 
     def _quality(self, topic: Topic) -> QoSProfile:
         """Return the topic's own quality of service, with a longer queue."""

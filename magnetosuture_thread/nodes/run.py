@@ -122,7 +122,7 @@ def end_signals() -> tuple[signal.Signals, ...]:
 class _Ending(Future):
     """Done when a signal has asked the process to end: amid its start by a KeyboardInterrupt, later between callbacks.
 
-    rclpy's own handlers would take the nodes out of the graph at once, before they can publish their last.
+    rclpy's own handlers would take the nodes out of the graph at once, before they can publish their final messages.
     """
 
     def __init__(self) -> None:
@@ -164,7 +164,7 @@ def run(
 ) -> int:
     """Run a node, or several in one process, until it is interrupted, terminated or hung up.
 
-    A node then says its last while the graph is still there: see `GuardedNode.finish`.
+    A node then publishes its final messages while the graph is still there: see `GuardedNode.finish`.
 
     Args:
         make: makes the node, or all of them.
@@ -220,7 +220,7 @@ def run(
 
 
 def _finish(nodes: tuple[Node, ...]) -> None:
-    """Let nodes say their last, and give the middleware the time to deliver it."""
+    """Let nodes publish their final messages, and give the middleware the time to deliver them."""
     if not rclpy.ok():
         return
     for node in nodes:

@@ -55,6 +55,7 @@ class VisionTrackerNode(PackageNode):
         self._settings = settings
         self._session = TrackerSession(settings, scene) if scene is not None else None
         self._scene = SceneFollower(self, self.health, scene, self.on_scene)
+        self._camera = CAMERA[settings.image_transport].name
         self._words = "nothing seen"
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -69,7 +70,7 @@ class VisionTrackerNode(PackageNode):
             topics.IMAGE.subscribe(self, self.on_image)
         self.create_timer(0.5 * SILENCE, self.on_watch, clock=self._steady)
         self.health.warn("no camera frame yet" if scene is not None else NO_SCENE)
-        self.get_logger().info(f"ready: frames from {self.resolve_topic_name(CAMERA[settings.image_transport].name)}")
+        self.get_logger().info(f"ready: frames from {self.resolve_topic_name(self._camera)}")
 
     def on_scene(self, scene: Scene) -> None:
         """Look for the needle in another scene."""
@@ -108,6 +109,11 @@ class VisionTrackerNode(PackageNode):
     def _take(self, message: Image | CompressedImage, decode: Callable[[], Any]) -> None:
         self._last_frame = self._arrival()
         stamp, taken = message.header.stamp, 0.0
+        try:
+            reading.checked_nanoseconds(stamp, f"{self._camera}.header.stamp")
+        except InvalidInputError as error:  # nothing that is published could be stamped by it
+            self.health.refuse(error)
+            return
         if self._session is None:
             self._states.publish(MESSAGES.tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
             self.health.warn(NO_SCENE)

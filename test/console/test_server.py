@@ -353,6 +353,30 @@ def test_pages_without_the_token_take_no_place_of_those_with_it():
     run(test)
 
 
+def test_a_page_without_the_token_that_pings_is_disconnected():
+    async def test(here: Console) -> None:
+        watcher = await here.page("")
+        await watcher.socket.ping(b"once")
+        with contextlib.suppress(ConnectionError):
+            for _ in range(500):
+                await watcher.socket.ping(b"x" * 100)
+        await until(lambda: watcher.socket.closed)
+
+    run(test)
+
+
+def test_who_asks_for_too_many_files_waits_for_the_next_second(monkeypatch: pytest.MonkeyPatch):
+    async def test(here: Console) -> None:
+        began = asyncio.get_running_loop().time()
+        for _ in range(20):
+            async with here.session.get(here.url) as answer:
+                assert answer.status == 200
+        assert asyncio.get_running_loop().time() - began > 2.0  # five in each second at the most
+
+    monkeypatch.setattr("magnetosuture_thread.console.server.MAX_REQUESTS", 5)
+    run(test)
+
+
 MALFORMED = [
     "\x00\x01\x02\r\n\r\n",
     "GET / HTTP/9\r\n\r\n",

@@ -254,7 +254,7 @@ def check(path: Path) -> Bag:
     """Check that a recording is whole and holds what was steered."""
     bag = Bag(path)
     assert bag.damage is None
-    assert "jogged by a script" in bag.notes["simulated"]
+    assert "control was with a script when the recording began" in bag.notes["simulated"]
     assert "thread_model" in bag.notes["scenario"]
     for name in ("/operator/servo_cv", "/needle/filter_state", "/camera/image_raw/compressed", "/scene"):
         assert bag.counts[name] > 0, name

@@ -283,3 +283,11 @@ def test_barriers_are_loaded_by_the_name_of_their_class(my_barriers: str):
             load_barriers([name])
     with pytest.raises(ConfigurationError, match="a name that no other barrier has"):
         load_barriers([f"{my_barriers}:TipKeepIn"] * 2)
+
+
+def test_what_a_module_says_as_it_fails_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "loud_barriers.py").write_text("raise RuntimeError('x' * 1_000_000)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ConfigurationError, match="RuntimeError: xxx") as refused:
+        load_barriers(["loud_barriers:KeepIn"])
+    assert len(str(refused.value)) < 1000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 import pytest
@@ -46,9 +47,13 @@ class Graph:
         self.executor.add_node(node)
         return node
 
+    def between_callbacks(self) -> AbstractContextManager[Any]:
+        """Return a context in which no callback is at work."""
+        return self._spinning
+
     def remove(self, node: Node) -> None:
         """Take a node out of the graph and destroy it, once no callback of it is at work."""
-        with self._spinning:
+        with self.between_callbacks():
             self.executor.remove_node(node)
             self.nodes.remove(node)
             node.destroy_node()

@@ -28,7 +28,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.console import graph as console_graph
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
-from magnetosuture_thread.nodes.console.inbox import ConsoleTap
+from magnetosuture_thread.nodes.console.inbox import ConsoleTap, Latest
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.processes import graph_environment
@@ -403,3 +403,25 @@ def test_the_node_refuses_parameters_in_one_line(graph, parameter: str, words: s
     assert process.returncode == 1
     assert words in errors
     assert errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("failure", [MemoryError(), OverflowError("too large"), InvalidInputError("a", "b", "c")])
+def test_a_message_that_cannot_be_read_ends_no_page(graph, node: Node, failure: Exception):
+    """Whatever goes wrong in it, the page keeps the one before."""
+    asked: list[float] = []
+
+    def read(message: CoilCurrents) -> float:
+        asked.append(message.current[0])
+        if message.current[0] < 0.0:
+            raise failure
+        return float(message.current[0])
+
+    latest = Latest(node, topics.RIG_CURRENTS, read)
+
+    def polled() -> int:
+        latest.poll()
+        return len(asked)
+
+    tell(graph, topics.RIG_CURRENTS, CoilCurrents(current=[1.0]), polled, "the first")
+    tell(graph, topics.RIG_CURRENTS, CoilCurrents(current=[-1.0]), lambda: polled() and asked[-1] < 0.0, "the bad one")
+    assert latest.value == 1.0

@@ -6,9 +6,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.msg import CoilBridgeState
+from rclpy.parameter import Parameter
 
 from magnetosuture_thread.coils.coil_system import UNCLEAN_END
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
@@ -24,6 +25,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from magnetosuture_thread.scene import read_scene
 from test.nodes.bridge import (
     LONG,
     READY,
@@ -32,6 +34,7 @@ from test.nodes.bridge import (
     armed,
     change,
     drive,
+    drive_until,
     driven,
     press,
     reasons,
@@ -226,10 +229,38 @@ def test_a_bridge_that_was_frozen_while_it_drove_is_in_fault(graph, tmp_path: Pa
             return bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT
 
         graph.wait(is_in_fault, "the fault", PATIENCE)
-        until = time.monotonic() + 0.5
-        while time.monotonic() < until:
-            drive(graph)
-            assert np.abs(rig.currents).max() < 1e-3
+
+
+def test_a_scene_that_waited_while_the_bridge_was_frozen_hides_no_fault(graph, monkeypatch: pytest.MonkeyPatch):
+    node = armed(graph, **LONG)
+    drive_until(graph, lambda: driven(node), "a current")
+    real = node.system.driver.state
+    with graph.between_callbacks():
+        monkeypatch.setattr(node.system.driver, "state", lambda: replace(real(), timeout=0.2))
+        now, arrival = node._times()
+        monkeypatch.setattr(node, "_times", lambda: (now + 0.5, arrival + 0.5))
+        node.on_scene(read_scene("hernia_ring"))
+        assert "stood still for 0.5" in node.system.latch.fault
+        assert not node.system.output.allocation.currents.any()
+
+
+def test_a_barrier_is_imported_when_the_bridge_starts_or_not_at_all(
+    graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """An import takes any time, in which no emergency stop would be answered."""
+    for name in ("early_barriers", "late_barriers"):
+        source = "from magnetosuture_thread import Barrier\n\n\nclass KeepIn(Barrier):\n    pass\n"
+        (tmp_path / f"{name}.py").write_text(source)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    node = graph.add(CoilBridgeNode, autostart="unconfigured", barriers=["early_barriers:KeepIn"], **READY)
+    assert "early_barriers" in sys.modules
+    with graph.between_callbacks():
+        (result,) = node.set_parameters([Parameter("barriers", value=["late_barriers:KeepIn"])])
+    assert result.successful
+    assert not change(graph, Transition.TRANSITION_CONFIGURE)
+    assert "named when the node started" in str(node.problem)
+    assert "late_barriers" not in sys.modules
 
 
 def test_two_bridges_of_other_names_keep_their_own(graph, tmp_path: Path):

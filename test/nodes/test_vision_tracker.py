@@ -162,3 +162,21 @@ def test_without_a_scene_it_waits_for_the_topic(graph, camera, thread_arc):
     for index in range(3):
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5 + index)))
         graph.wait(lambda n=index: len(poses) > n, "a pose")
+
+
+def test_a_frame_with_an_impossible_stamp_is_refused(graph, camera, thread_arc):
+    """Nothing that is published could be stamped by it."""
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    image = frame(camera, thread_arc)
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=1_000_000_000)))
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=6, nanosec=0)))
+    graph.wait(lambda: bool(poses and tracking), "the second frame")
+    assert [pose.header.stamp for pose in poses] == [state.header.stamp for state in tracking] == [Time(sec=6)]
+
+    def is_reported() -> bool:
+        values = [value for array in diagnostics for value in array.status[0].values]
+        return any(value.key == "last refusal" and "nanosec" in value.value for value in values)
+
+    graph.wait(is_reported, "the refusal")

@@ -20,7 +20,9 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.report import JITTER_KEYS, SCHEDULING
-from magnetosuture_thread.nodes.node import GuardedNode
+from magnetosuture_thread.nodes.diagnostics import read_status
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode
+from magnetosuture_thread.texts import shortened
 
 TIMEOUT = 10.0  # s for the bridge to be found and to answer
 DISCOVERY_TIME = 0.5  # s after the first message of the bridge, for it to have discovered this client
@@ -87,9 +89,9 @@ class CoilClient:
             answer = self._call(Trigger, {"stop": EMERGENCY_STOP, "reset": RESET}[action], Trigger.Request())
             message = answer.message
         if not answer.success:
-            raise GraphError(message)
+            raise GraphError(shortened(message, MAX_REASON_CHARS))
         self._spin(lambda: False, SETTLE_TIME)
-        return "" if action in TRANSITIONS else str(message)
+        return "" if action in TRANSITIONS else shortened(message, MAX_REASON_CHARS)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the bridge as text for display.
@@ -103,15 +105,15 @@ class CoilClient:
             raise GraphError(f"no coil_bridge state received within {TIMEOUT:g} s on this ROS domain")
         return {
             "state": _STATE_NAMES[state.state] + (", armed" if state.armed else ""),
-            "currents are zero because": "; ".join(state.reasons) or "they are not: a command is followed",
+            "currents are zero because": _listed(state.reasons) or "they are not: a command is followed",
             "velocity commanded [mm/s]": _millimetres(state.commanded),
             "velocity filtered [mm/s]": _millimetres(state.filtered),
             "velocity applied [mm/s]": _millimetres(state.applied) + (", saturated" if state.saturated else ""),
             "currents [A]": _numbers(state.current),
             "measured currents [A]": _numbers(state.measured_current),
             "supplies [V]": _numbers(state.supply_voltage),
-            "driver": state.driver + (", ready" if state.driver_ready else ", not ready"),
-            "driver warnings": "; ".join(state.driver_warnings) or "none",
+            "driver": shortened(state.driver) + (", ready" if state.driver_ready else ", not ready"),
+            "driver warnings": _listed(state.driver_warnings) or "none",
             "messages refused": str(state.refused),
         }
 
@@ -158,7 +160,7 @@ class CoilClient:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.startswith("coil_bridge:"):
-                self._values = {value.key: value.value for value in status.values}
+                _, self._values = read_status(status)
 
     def _on_state(self, message: CoilBridgeState) -> None:
         self._state = message
@@ -170,3 +172,7 @@ def _millimetres(vector: Any) -> str:
 
 def _numbers(values: Any) -> str:
     return ", ".join(f"{value:.2f}" for value in values) or "none"
+
+
+def _listed(texts: Any) -> str:
+    return shortened("; ".join(texts), MAX_REASON_CHARS)

@@ -16,21 +16,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import InvalidInputError, read_scene
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.interface import (
-    ARM,
-    EMERGENCY_STOP,
-    NODES,
-    PAUSE_REPLAY,
-    PAUSE_RIG,
-    RESET,
-    RIG_NODES,
-    SCENE_SERVER,
-)
+from magnetosuture_thread.interface import ALL_NODES, ARM, EMERGENCY_STOP, PAUSE_REPLAY, PAUSE_RIG, RESET
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.vision.images import unpack_image
@@ -97,10 +89,10 @@ class ConsoleServices:
             for number in calls:
                 if number in answers:
                     answer = answers.pop(number)
-                    told = str(answer.message)
+                    text = shortened(str(answer.message), MAX_REASON_CHARS)
                     if answer.success:  # where time is paused, that is all the message says
-                        return "" if name in (PAUSE_REPLAY, PAUSE_RIG) else told
-                    return told or "refused"
+                        return "" if name in (PAUSE_REPLAY, PAUSE_RIG) else text
+                    return text or "refused"
         if not calls:
             return f"no service {name} within {TIMEOUT:g} s"
         return f"{name} did not answer within {TIMEOUT:g} s"
@@ -123,7 +115,6 @@ MAX_DIAGNOSTICS = 50  # queued messages of /diagnostics
 MAX_NODES = 32  # shown
 MAX_SHOWN_BYTES = 1 << 18  # of a message that becomes a part of the state
 DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
-OWN_NODES = (*NODES, *RIG_NODES, SCENE_SERVER)
 JPEG_QUALITY = 80
 READERS = {
     "tracker": (topics.TRACKER_STATE, messages.tracker, 0.0),
@@ -234,7 +225,7 @@ class ConsoleGraph:
             for status in report.status[:MAX_NODES]:
                 self._diagnostics[shortened(status.name.split(":")[0])] = (messages.node_state(status), arrived)
         space = self.node.get_namespace().strip("/")
-        own = {f"{space}/{name}".lstrip("/") for name in OWN_NODES}
+        own = {f"{space}/{name}".lstrip("/") for name in ALL_NODES}
         others = sorted(self._diagnostics.keys() - own, key=lambda name: self._diagnostics[name][1])
         oldest = time.time_ns() - round(DROP_TIMEOUT * 1e9)
         too_many = len(others) + len(own) - MAX_NODES

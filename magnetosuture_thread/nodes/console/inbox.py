@@ -70,7 +70,7 @@ class Latest:
     Args:
         node: that subscribes.
         topic: to subscribe.
-        read: converts a message; an `InvalidInputError` keeps the previous value.
+        read: converts a message; where it fails, the previous value stays.
         period: minimum between two messages that are read [s].
         max_bytes: of a message that is read; the topic's own bound if None.
 
@@ -108,7 +108,7 @@ class Latest:
             return False
         try:
             self.value = self._read(self._inbox.topic.decode(data))
-        except InvalidInputError:
+        except Exception:  # whatever is wrong with a message, the page goes on with the one before
             return False
         self._arrived, self._next_read = arrived, now + self._period
         return True

@@ -160,8 +160,7 @@ class RigSimulatorNode(PackageNode):
         level(text, **values, **{"lag [s]": round(self.time.lag, 3)})
 
     def _fail(self, error: MagnetosutureError) -> None:
-        """Switch the coils off where the simulation does not find its next state, and say so."""
-        self.rig.switch_off()
+        """Say that the simulation does not find its next state; the rig has switched its coils off."""
         self.health.error(str(error))
 
 

@@ -31,6 +31,13 @@ def test_currents_that_were_computed_long_ago_are_zero(bench):
     assert duties_during(bench, 0.3) == {(0, 0)}
 
 
+def test_currents_older_than_the_boards_own_timeout_are_zero_however_long_commands_last(bench):
+    """The boards have stopped by themselves meanwhile, and must not start again."""
+    driver = bench.open(command_timeout=1.0, driver_timeout=0.2)
+    driver.apply(CURRENTS, time.monotonic() - 0.45)
+    assert duties_during(bench, 0.3) == {(0, 0)}
+
+
 def test_currents_that_grow_old_before_their_packet_is_written_are_zero(bench, monkeypatch: pytest.MonkeyPatch):
     """As where the thread of the line is stopped between looking at their age and writing."""
     driver = bench.open(apply_timeout=0.1, roboclaw_answer_timeout=1.0, driver_timeout=1.0)
