@@ -13,7 +13,11 @@ from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
-INSIDE = 0.985  # part of the dish's radius that is looked at, to stay off the rim
+INSIDE = 0.985  # part of the dish's radius that is looked at first, to stay off the rim
+RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
+AT_WALL = "at the wall"
+AT_WALL_PX = 2.0  # from what is looked at first, within which a thing may go on
+FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
 WIDE_PX = 4.0  # a needle at least this wide is searched at half the size
 MIN_AREA = 0.33  # of the needle's own
 ON_AXIS = 0.85  # of a needle's dark pixels lie along one arc; more beside it belong to what touches it
@@ -48,9 +52,10 @@ def find_needles(
     """
     expected, thickness = length / view.metres_per_pixel, width / view.metres_per_pixel
     needles, refused = _measured(picture, view, dish_radius, expected, thickness, toward)
-    if picture.mask is not None and not needles and refused:
-        # What of a dark shape the tolerance leaves may have grown together with the needle.
-        needles, _ = _measured(picture, view, dish_radius, expected, thickness, toward, tight=True)
+    if not needles and refused:
+        # What of a dark shape the tolerance leaves may have grown together with the needle, or the wall is beside it.
+        needles, again = _measured(picture, view, dish_radius, expected, thickness, toward, tight=True)
+        refused = [reason for reason in refused if reason != AT_WALL] or again or refused
     return needles, refused
 
 
@@ -64,14 +69,19 @@ def _measured(
     *,
     tight: bool = False,
 ) -> tuple[list[MeasuredNeedle], list[str]]:
-    """Find the needles of a length and a width [px], shapes cut out up to their very outlines if `tight`."""
+    """Find the needles of a length and a width [px], shapes and wall cut out up to their very outlines if `tight`."""
+    radius = dish_radius / view.metres_per_pixel
+    radius = radius - RIM_PX if tight else INSIDE * radius
     needles: list[MeasuredNeedle] = []
     refused: list[str] = []
     mask = picture.mask
-    candidates = _dark_components(picture, view, dish_radius, expected * thickness, tight)
+    candidates = _dark_components(picture, view, radius, expected * thickness, tight)
     if len(candidates) > MAX_CANDIDATES:
         return [], [f"{len(candidates)} dark things"]
     for points in candidates:
+        if not tight and np.hypot(*(points - view.centre_px).T).max() > radius - AT_WALL_PX:
+            refused.append(AT_WALL)  # which may have cut off a part
+            continue
         guess = _rough_axis(points, thickness)
         if guess is None:
             refused.append("no arc")
@@ -84,11 +94,13 @@ def _measured(
             refused.append("bent beyond a half circle")
             continue
         gray, near = picture.gray, False
+        low, high = points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX
         if mask is not None:
-            low, high = points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX
             near = mask.deepest(low, high) > 0.0
             if near:  # A strip along the needle takes its ground from beside it, which a shape may be.
                 gray = mask.without_shapes(gray, picture.floor, low, high, 0.0 if tight else mask.tolerance_px)
+        if tight:
+            gray = _without_wall(gray, picture, view, radius, low, high)
         found = measure_body(gray, arc, first, last, expected, thickness, toward)
         if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, thickness):
             found = "inside of a shape of the scene"
@@ -99,14 +111,12 @@ def _measured(
     return needles, refused
 
 
-def _dark_components(
-    picture: Picture, view: DishView, dish_radius: float, area: float, tight: bool
-) -> list[np.ndarray]:
-    """Return the pixels of each dark component of at least a part `LEAST_AREA` of an area [px^2], shape (m, 2)."""
+def _dark_components(picture: Picture, view: DishView, radius_px: float, area: float, tight: bool) -> list[np.ndarray]:
+    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2)."""
     factor = picture.factor
     shift = 0.5 * (factor - 1)
     u, v = ((c - shift) / factor for c in view.centre_px)
-    radius = INSIDE * dish_radius / view.metres_per_pixel / factor
+    radius = radius_px / factor
     left, top = (max(0, int(c - radius)) for c in (u, v))
     window = slice(top, max(top, int(v + radius) + 2)), slice(left, max(left, int(u + radius) + 2))
     dark = cv2.compare(picture.small[window], cv2.convertScaleAbs(picture.floor[window], alpha=DARK), cv2.CMP_LT)
@@ -132,6 +142,34 @@ def _dark_components(
             continue
         at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
         result.append(at * factor + shift)
+    return result
+
+
+def _without_wall(
+    gray: np.ndarray, picture: Picture, view: DishView, radius_px: float, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Return a frame in which all beyond a radius has the floor's brightness within a box (u, v) to (u, v) [px].
+
+    A strip along a needle takes its ground from both sides, and an end of it must not go on into the rim.
+    """
+    rows, columns = gray.shape
+    left, top = (max(0, int(value)) for value in low)
+    right, bottom = min(columns, int(high[0]) + 1), min(rows, int(high[1]) + 1)
+    across, down = np.arange(left, right) - view.centre_px[0], np.arange(top, bottom) - view.centre_px[1]
+    distance = np.hypot(across[None, :], down[:, None]).astype(np.float32)
+    beyond = distance > radius_px
+    if not beyond.any():
+        return gray
+    # Along the ray from the centre, where there is floor.
+    shrink = np.minimum(1.0, (radius_px - FLOOR_DEPTH_PX) / np.maximum(distance, 1.0))
+    shift = 0.5 * (picture.factor - 1)
+    at_u, at_v = (
+        ((shrink * offset + centre - shift) / picture.factor).astype(np.float32)
+        for offset, centre in zip((across[None, :], down[:, None]), view.centre_px, strict=True)
+    )
+    floor = cv2.remap(picture.floor, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    result = gray.copy()
+    np.copyto(result[top:bottom, left:right], floor, where=beyond)
     return result
 
 
