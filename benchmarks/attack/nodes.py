@@ -16,6 +16,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 from benchmarks.attack.hostile import Attacker
+from benchmarks.attack.page import WatchingPage
 from benchmarks.attack.probe import READY, STOP, UNARMED
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, RIG_NODES, SCENE_SERVER
@@ -24,6 +25,8 @@ from magnetosuture_thread.setups import read_setup
 
 SETUP = "petri_35mm_polyamide"
 TARGETS = (SCENE_SERVER, *RIG_NODES, *NODES)
+CONSOLE, PAGE = "console", "page"
+WORDS = {STOP: "emergency stop: {} answers", PAGE: "operator's page: {} intervals between states"}
 MAX_DELAY, MAX_STOP_DELAY = 0.5, 0.2  # s
 RATE = 150.0  # attacks a second
 CLOCK_SHARE = 0.25  # of all attacks, on a graph with a simulated clock
@@ -75,10 +78,8 @@ def attack_nodes(
         + f": {events['ended']} nodes ended, {events['unanswered']} requests without an answer"
     ]
     for name, each in figures["answers"].items():
-        what = "emergency stop" if name == STOP else name
-        lines.append(
-            f"{what}: {each['count']} answers, median {each['median_ms']:.1f} ms, at most {each['max_ms']:.1f} ms"
-        )
+        what = WORDS.get(name, f"{name}: {{}} answers").format(each["count"])
+        lines.append(f"{what}, median {each['median_ms']:.1f} ms, at most {each['max_ms']:.1f} ms")
     return figures, [*lines, *broken[:20]], not broken
 
 
@@ -99,8 +100,13 @@ def _attack_graph(
         arguments += ["-p", "use_sim_time:=true", "-p", "rig_simulator:rate:=1.0"]
     with reserved_domain() as domain, TemporaryDirectory() as temporary:
         environment, logs = graph_environment(domain), Path(temporary)
-        with environment_of(environment), NodeProcesses(TARGETS, arguments, environment, logs) as nodes:
+        with (
+            environment_of(environment),
+            NodeProcesses(TARGETS, arguments, environment, logs) as nodes,
+            WatchingPage(logs / f"{CONSOLE}.log") as page,
+        ):
             targets = f"nodes:=[{', '.join(TARGETS)}]"
+            nodes.start(CONSOLE, arguments=["-p", "console:port:=0"])
             nodes.start("probe", module="benchmarks.attack.probe", arguments=["-p", targets])
             context = Context()
             rclpy.init(context=context, domain_id=domain, args=[])
@@ -110,15 +116,17 @@ def _attack_graph(
             executor.add_node(node)
             try:
                 _wait_until(lambda: READY in (logs / "probe.log").read_text().splitlines(), nodes)
-                _wait_until(lambda: set(TARGETS) <= set(node.get_node_names()), nodes)
+                _wait_until(lambda: {CONSOLE, *TARGETS} <= set(node.get_node_names()), nodes)
                 _spin(executor, DISCOVERY_TIME)
                 attacker = Attacker(node, listener, list(TARGETS), chance, clock=clock)
                 _spin(executor, DISCOVERY_TIME)
+                _wait_until(lambda: bool(page.gaps), nodes)
+                page.gaps.clear()
                 began = time.monotonic()
                 for index in range(count):
                     attacker.attack()
                     advance()
-                    for name in TARGETS:
+                    for name in (CONSOLE, *TARGETS):
                         if nodes.ended(name):
                             last = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()[-1:]
                             problems.append(f"{name} ended after {index + 1} attacks: {' '.join(last)}")
@@ -132,6 +140,9 @@ def _attack_graph(
                 for service, number in Counter(attacker.unanswered.values()).items():
                     problems.append(f"{service}: {number} requests were not answered")
                 sent.update(attacker.sent)
+                delays[PAGE] += page.gaps
+                if page.losses:
+                    problems.append(f"the page lost the console {page.losses} times")
             finally:
                 executor.shutdown()
                 listener.destroy_node()

@@ -25,8 +25,8 @@ READY, STOP, UNARMED = "ready", "stop", "unarmed"
 class ProbeNode(GuardedNode):
     """Prints a line for each answer: the node's name, or `STOP`, and the seconds until the answer came.
 
-    It prints `READY` once all nodes can be asked. The bridge is armed before each emergency stop; where that was not
-    possible, `UNARMED` is printed. Parameter: `nodes`, the names of those to ask.
+    It prints `READY` once all nodes have answered: while kernels compile, a node answers nobody. The bridge is armed
+    before each emergency stop; where that was not possible, `UNARMED` is printed. Parameter: `nodes`, the names of those to ask.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -38,7 +38,7 @@ class ProbeNode(GuardedNode):
         self._arm = self.create_client(SetBool, ARM)
         self._turns = itertools.cycle(names)
         self._asked = 0
-        self._is_ready = False
+        self._silent = set(names)  # who have not answered yet
         self._since: float | None = None
         self._then: Callable[[Any, float], None] = lambda answer, delay: None
         self._future: Any = None
@@ -46,14 +46,14 @@ class ProbeNode(GuardedNode):
 
     def _look(self) -> None:
         """Ask the next question, unless the last one waits for its answer."""
-        if not self._is_ready:
-            self._is_ready = all(c.service_is_ready() for c in (*self._nodes.values(), self._stop, self._arm))
-            if self._is_ready:
-                print(READY, flush=True)
-        elif self._since is not None:
+        if self._since is not None:
             if time.monotonic() - self._since > LIMIT:
                 self._future.cancel()
                 self._answered(None, LIMIT)
+        elif self._silent:
+            name = next(self._turns)
+            if self._nodes[name].service_is_ready() and self._stop.service_is_ready() and self._arm.service_is_ready():
+                self._ask(self._nodes[name], GetParameters.Request(), lambda answer, delay: self._greet(name, answer))
         elif self._asked % STOP_EVERY == 0:
             self._ask(self._reset, Trigger.Request(), lambda answer, delay: self._on_reset())
         else:
@@ -82,6 +82,12 @@ class ProbeNode(GuardedNode):
         if answer is None or not answer.success:
             print(UNARMED, flush=True)
         self._ask(self._stop, Trigger.Request(), lambda answer, delay: self._tell(STOP, delay))
+
+    def _greet(self, name: str, answer: Any) -> None:
+        if answer is not None:
+            self._silent.discard(name)
+        if not self._silent:
+            print(READY, flush=True)
 
     def _tell(self, name: str, delay: float) -> None:
         self._asked += 1
