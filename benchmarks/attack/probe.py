@@ -26,7 +26,7 @@ class ProbeNode(GuardedNode):
     """Prints a line for each answer: the node's name, or `STOP`, and the seconds until the answer came.
 
     It prints `READY` once all nodes have answered: while kernels compile, a node answers nobody. The bridge is armed
-    before each emergency stop; where that was not possible, `UNARMED` is printed. Parameter: `nodes`, the names of those to ask.
+    before each emergency stop; where that was not possible, `UNARMED` is printed. Parameter: `nodes`, their names.
     """
 
     def __init__(self, **options: Any) -> None:
