@@ -20,10 +20,10 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     Raises:
         OSError: it cannot be read, is a folder, pipe or device, or is larger; `strerror` says which.
     """
+    _require_regular(os.stat(path), path)  # before it is opened, which may do something to a device
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, "a folder, pipe or device", str(path))
+        _require_regular(os.fstat(descriptor), path)
         parts, left = [], max_bytes + 1
         while left and (part := os.read(descriptor, left)):
             parts.append(part)
@@ -33,3 +33,8 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     if not left:
         raise OSError(errno.EFBIG, "a larger file", str(path))
     return b"".join(parts)
+
+
+def _require_regular(status: os.stat_result, path: Path) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "a folder, pipe or device", str(path))

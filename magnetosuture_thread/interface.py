@@ -19,6 +19,7 @@ RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is si
 ALL_NODES = (*NODES, SCENE_SERVER, *RIG_NODES)
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"
+STORAGE_SUFFIXES = (".mcap", ".db3")  # of files of messages, which make a folder a bag
 
 
 @dataclass(frozen=True)

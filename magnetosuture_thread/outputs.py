@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-BAG_SUFFIXES = (".mcap", ".db3")  # of files that make a folder a bag
+from magnetosuture_thread.interface import STORAGE_SUFFIXES
 
 
 def output_problem(path: Path) -> str:
@@ -49,4 +49,4 @@ def input_problem(output: Path, inputs: Iterable[Path]) -> str:
 
 def _is_bag(folder: Path) -> bool:
     with os.scandir(folder) as entries:
-        return any(entry.name.endswith(BAG_SUFFIXES) or entry.name == "metadata.yaml" for entry in entries)
+        return any(entry.name.endswith(STORAGE_SUFFIXES) or entry.name == "metadata.yaml" for entry in entries)

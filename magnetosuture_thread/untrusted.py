@@ -24,7 +24,10 @@ MAX_NESTING = 32  # of message types in each other
 MAX_ELEMENTS = 10_000  # fields that a message has whatever its data, all nested ones counted
 MAX_DECODED = 1_000_000  # objects that the data of one message may become
 MAX_DEFINITION_CHARS = 200_000
-MAX_PARSER_STEPS = 40_000  # of a message definition's parser: a second
+MAX_PARSER_STEPS = 40_000  # of a message definition's parser: a second; a usual definition takes 200 to 5,000
+MAX_BAG_PARSER_STEPS = 100_000  # of all definitions of a bag
+MAX_DEFINITION_BYTES = 1 << 25  # of all different definitions in a file
+_DEFINITION_OVERHEAD = 500  # bytes that a definition takes whatever its length
 
 
 class BudgetError(Exception):
@@ -43,6 +46,7 @@ class UnpackBudget:
     def __init__(self, size: int) -> None:
         self._max_bytes = self._bytes = (1 << 29) + 200 * size
         self._max_records = self._records = 200_000 + size
+        self._definition_bytes = MAX_DEFINITION_BYTES
 
     def spend(self, count: int, records: int = 0) -> None:
         """Count unpacked bytes, and records in them.
@@ -56,6 +60,41 @@ class UnpackBudget:
             raise BudgetError(f"unpacks to more than {self._max_bytes} bytes, which no recording of its size does")
         if self._records < 0:
             raise BudgetError(f"holds more than {self._max_records} records, which no recording of its size does")
+
+    def define(self, count: int) -> None:
+        """Count the bytes of a definition that is kept.
+
+        Raises:
+            BudgetError: the file has more of them than it may.
+        """
+        self._definition_bytes -= count + _DEFINITION_OVERHEAD
+        if self._definition_bytes < 0:
+            raise BudgetError(f"holds definitions of topics and types of more than {MAX_DEFINITION_BYTES} bytes")
+
+
+class ParserBudget:
+    """Steps that the message definitions of one bag may take to parse, each and together."""
+
+    def __init__(self) -> None:
+        self._left = MAX_BAG_PARSER_STEPS
+        self._left_of_one = 0
+
+    def begin(self) -> None:
+        """Begin with another definition."""
+        self._left_of_one = MAX_PARSER_STEPS
+
+    def spend(self) -> None:
+        """Count a step.
+
+        Raises:
+            BudgetError: there are more than may be.
+        """
+        self._left -= 1
+        self._left_of_one -= 1
+        if self._left_of_one < 0:
+            raise BudgetError(f"a definition that takes more than {MAX_PARSER_STEPS} steps to parse")
+        if self._left < 0:
+            raise BudgetError(f"a definition past the {MAX_BAG_PARSER_STEPS} steps in which those of a bag are parsed")
 
 
 def check_yaml(text: str, *, max_aliases: int = 0) -> None:

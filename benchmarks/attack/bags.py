@@ -69,7 +69,7 @@ def attack_bags(
             chance = random.Random(f"{seed} {index}")
             target = folder / "damaged"
             kinds = _damaged_copy(bags[name], target, chance)
-            found, seconds, megabytes = judged(target, original)
+            found, seconds, megabytes = check_bag(target, original)
             found["too_slow"] += seconds > MAX_SECONDS
             found["too_large"] += megabytes > MAX_MEGABYTES
             totals[name] += found
@@ -168,7 +168,7 @@ def _damaged(data: bytearray, kind: str, chance: random.Random) -> bytearray:
     return data
 
 
-def judged(bag: Path, original: Counter[Message]) -> tuple[Counter[str], float, float]:
+def check_bag(bag: Path, original: Counter[Message]) -> tuple[Counter[str], float, float]:
     """Return what became of a bag, in a process of its own; and its time [s] and greatest memory [MB]."""
     reading, writing = os.pipe()
     began = time.monotonic()
@@ -177,7 +177,7 @@ def judged(bag: Path, original: Counter[Message]) -> tuple[Counter[str], float, 
         code = 1
         try:
             os.close(reading)
-            os.write(writing, json.dumps(_judge(bag, original)).encode())
+            os.write(writing, json.dumps(_check(bag, original)).encode())
             code = 0
         except BaseException:
             traceback.print_exc()
@@ -194,7 +194,7 @@ def judged(bag: Path, original: Counter[Message]) -> tuple[Counter[str], float, 
     return found, time.monotonic() - began, usage.ru_maxrss / 1024.0
 
 
-def _judge(bag: Path, original: Counter[Message]) -> dict[str, int]:
+def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
     """Return what reading, repairing and salvaging make of a bag."""
     found: Counter[str] = Counter()
     try:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import re
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from magnetosuture_thread.bags.mcap.writer import WriterState
 from magnetosuture_thread.bags.storage import Connection
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.interface import STORAGE_SUFFIXES
 from magnetosuture_thread.untrusted import MAX_METADATA_BYTES, MAX_TEXT_BYTES, BudgetError, check_yaml
 
-STORAGE_SUFFIXES = (".mcap", ".db3")
 COMPRESSED_SUFFIXES = tuple(f"{suffix}.zstd" for suffix in STORAGE_SUFFIXES)
 
 
@@ -34,6 +34,7 @@ class BagFiles:
         unlisted: names of those that are there and not listed in metadata.yaml, so that they are not read.
         packed: whether each message was packed by the recorder; None where no metadata.yaml says so.
         doubt: why metadata.yaml is not used, in one line; empty where it is, or there is none.
+        custom_data: entries of others in metadata.yaml.
     """
 
     files: list[Path]
@@ -42,6 +43,7 @@ class BagFiles:
     unlisted: list[str] = field(default_factory=list)
     packed: bool | None = None
     doubt: str = ""
+    custom_data: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,14 @@ class Metadata:
         notes: of our writer.
         packed: whether each message is packed; None where it does not say.
         doubt: why it is not used; empty where it is, or there is none.
+        custom_data: entries of others.
     """
 
     names: list[str] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
     packed: bool | None = None
     doubt: str = ""
+    custom_data: dict[str, str] = field(default_factory=dict)
 
 
 def find_bag_files(path: Path) -> BagFiles:
@@ -95,7 +99,7 @@ def find_bag_files(path: Path) -> BagFiles:
             for file in inside
             if file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) and file.name not in {*names, *packs}
         ]
-        return BagFiles(listed, missing, notes, unlisted, metadata.packed)
+        return BagFiles(listed, missing, notes, unlisted, metadata.packed, custom_data=metadata.custom_data)
     compressed = [file for file in inside if file.name.endswith(COMPRESSED_SUFFIXES)]
     if compressed and not files:
         raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {compressed[0].name}")
@@ -104,7 +108,8 @@ def find_bag_files(path: Path) -> BagFiles:
     if len(files) > 1 and not _is_split(files):
         kind = files[0].suffix if len({file.suffix for file in files}) == 1 else ".mcap and .db3"
         raise BagError(path, f"holds {len(files)} {kind} files; name one of them")
-    return BagFiles(files, [], notes, packed=metadata.packed, doubt=metadata.doubt)
+    custom = metadata.custom_data
+    return BagFiles(files, [], notes, packed=metadata.packed, doubt=metadata.doubt, custom_data=custom)
 
 
 def _by_number(path: Path) -> tuple[str, int, str]:
@@ -124,6 +129,8 @@ MAX_ALIASES = 16  # in it; some recorders write none, others a few
 NOTES = "magnetosuture"  # name of the mcap record that holds our notes
 QOS = "offered_qos_profiles"  # metadata key of a connection, in mcap and in sqlite3
 TYPE_HASH = "topic_type_hash"
+UNVERIFIED_NOTE = "unverified"  # note of a bag that was salvaged from one without checksums: why it may be wrong
+UNCHECKED_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
 _FORMAT_VERSION = 9  # of metadata.yaml
 _PREFIX = f"{NOTES}."  # of our entries in metadata.yaml
 _CHECKSUM = "crc32"  # of all other entries of the record
@@ -151,6 +158,18 @@ def _checksum(notes: Mapping[str, str]) -> str:
     return f"{zlib.crc32(json.dumps(sorted(notes.items())).encode()):08x}"
 
 
+def marked(connection: Connection, notes: Mapping[str, str]) -> Connection:
+    """Return a connection whose metadata repeats what of a bag's notes must never get lost."""
+    marks = {_PREFIX + key: notes[key] for key in (UNVERIFIED_NOTE, UNCHECKED_NOTE) if key in notes}
+    return replace(connection, metadata={**connection.metadata, **marks}) if marks else connection
+
+
+def marks_of(connections: Iterable[Connection]) -> dict[str, str]:
+    """Return the notes that connections repeat."""
+    keys = (UNVERIFIED_NOTE, UNCHECKED_NOTE)
+    return {key: each.metadata[_PREFIX + key] for each in connections for key in keys if _PREFIX + key in each.metadata}
+
+
 def parse_qos_profiles(text: str) -> list[dict[str, Any]]:
     """Return the profiles of a topic's publishers, their policies by name; none where they cannot be read.
 
@@ -168,9 +187,10 @@ def parse_qos_profiles(text: str) -> list[dict[str, Any]]:
         return []
 
 
-def dump_qos_profiles(profiles: Sequence[dict[str, Any]]) -> str:
-    """Return profiles as they are kept with a topic."""
-    return yaml.safe_dump(list(profiles), sort_keys=False) if profiles else ""
+def jazzy_qos_profiles(text: str) -> str:
+    """Return profiles as Jazzy keeps them with a topic, by name; as they were where they cannot be read."""
+    profiles = parse_qos_profiles(text)
+    return yaml.safe_dump(profiles, sort_keys=False) if profiles else text
 
 
 def read_metadata(folder: Path) -> Metadata:
@@ -188,7 +208,8 @@ def read_metadata(folder: Path) -> Metadata:
             return Metadata(names, {}, packed)
         entries = {str(key): str(value) for key, value in custom.items()}
         ours = {key.removeprefix(_PREFIX): value for key, value in entries.items() if key.startswith(_PREFIX)}
-        return Metadata(names, verified_notes(ours) or {}, packed)
+        others = {key: value for key, value in entries.items() if not key.startswith(_PREFIX)}
+        return Metadata(names, verified_notes(ours) or {}, packed, custom_data=others)
     except FileNotFoundError:
         return Metadata()
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
@@ -201,7 +222,11 @@ def read_metadata(folder: Path) -> Metadata:
 
 
 def bag_information(
-    file_name: str, state: WriterState, connections: Mapping[int, Connection], notes: Mapping[str, str]
+    file_name: str,
+    state: WriterState,
+    connections: Mapping[int, Connection],
+    notes: Mapping[str, str],
+    custom_data: Mapping[str, str],
 ) -> dict[str, Any]:
     """Return the content of metadata.yaml for a bag of one mcap file.
 
@@ -210,7 +235,9 @@ def bag_information(
         state: of its writer.
         connections: by channel id.
         notes: kept as custom data.
+        custom_data: besides these.
     """
+    ours = {_PREFIX + key: value for key, value in add_checksum(notes).items()} if notes else {}
     start = {"nanoseconds_since_epoch": state.start or 0}
     duration = {"nanoseconds": state.end - (state.start or 0)}
     count = state.counts.total()
@@ -240,6 +267,6 @@ def bag_information(
         "files": [
             {"path": file_name, "starting_time": {**start}, "duration": {**duration}, "message_count": count}
         ],  # copies, as YAML would write aliases
-        "custom_data": {_PREFIX + key: value for key, value in add_checksum(notes).items()} if notes else {},
+        "custom_data": {**custom_data, **ours},
         "ros_distro": "jazzy",
     }

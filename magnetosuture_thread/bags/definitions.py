@@ -15,8 +15,8 @@ from magnetosuture_thread.untrusted import (
     MAX_DEFINITION_CHARS,
     MAX_ELEMENTS,
     MAX_NESTING,
-    MAX_PARSER_STEPS,
     BudgetError,
+    ParserBudget,
 )
 
 Types = dict[str, Any]  # fields by type, as rosbags describes them
@@ -26,22 +26,17 @@ _MAX_EMPTY = 16  # parts of a message that take no bytes
 class _Bounded(Parser):
     """A parser that ends after a number of steps: some texts make it try every way to read them."""
 
-    steps = 0
+    budget: ParserBudget
 
     def literal(self, pos: int, text: str) -> Any:
         """Match a literal."""
-        self._count()
+        self.budget.spend()
         return super().literal(pos, text)
 
     def regex(self, pos: int, pattern: str, flags: int = 0) -> Any:
         """Match a pattern."""
-        self._count()
+        self.budget.spend()
         return super().regex(pos, pattern, flags)
-
-    def _count(self) -> None:
-        self.steps += 1
-        if self.steps > MAX_PARSER_STEPS:
-            raise BudgetError(f"a definition that takes more than {MAX_PARSER_STEPS} steps to parse")
 
 
 class _BoundedMsgParser(_Bounded, MSGParser):
@@ -55,8 +50,12 @@ class _BoundedIdlParser(_Bounded, IDLParser):
         return Failure(pos, "", {"a constant without an operator"})
 
 
-def parse_definition(definition: MessageDefinition) -> Types:
+def parse_definition(definition: MessageDefinition, budget: ParserBudget) -> Types:
     """Return the types of a definition by name; none where its encoding is another than ROS has.
+
+    Args:
+        definition: in a bag.
+        budget: of the bag.
 
     Raises:
         BudgetError: it asks for more than a message may be.
@@ -64,12 +63,16 @@ def parse_definition(definition: MessageDefinition) -> Types:
     """
     if len(definition.text) > MAX_DEFINITION_CHARS:
         raise BudgetError(f"a definition of {len(definition.text)} characters; at most {MAX_DEFINITION_CHARS} are read")
+    budget.begin()
+    parser: _Bounded
     if definition.encoding == "ros2msg":
-        messages = _BoundedMsgParser(f"MSG: {definition.type_name}\n{definition.text}").specification()
+        parser = _BoundedMsgParser(f"MSG: {definition.type_name}\n{definition.text}")
     elif definition.encoding == "ros2idl":
-        messages = _BoundedIdlParser(definition.text).specification()
+        parser = _BoundedIdlParser(definition.text)
     else:
         return {}
+    parser.budget = budget
+    messages = parser.specification()
     return dict(make_typesdict(messages))
 
 

@@ -15,7 +15,7 @@ from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.messages.building import MessageBuilder
 from magnetosuture_thread.resources import share_directory
-from magnetosuture_thread.untrusted import MAX_DECODED, BudgetError
+from magnetosuture_thread.untrusted import MAX_DECODED, BudgetError, ParserBudget
 
 HEADER = "std_msgs/msg/Header"
 
@@ -75,6 +75,7 @@ class MessageDecoder:
     Args:
         definition: of the type in the bag. Ours is used where the bag has none, an equivalent one, or one that
             cannot be parsed.
+        budget: of the bag; one of its own if None.
 
     Attributes:
         type_name: for example `nav_msgs/msg/Path`.
@@ -83,12 +84,12 @@ class MessageDecoder:
         problem: why the bag's definition is not used; empty where it is, or none is needed.
     """
 
-    def __init__(self, definition: MessageDefinition) -> None:
+    def __init__(self, definition: MessageDefinition, budget: ParserBudget | None = None) -> None:
         self.type_name = definition.type_name
         self.problem = ""
         own, extent = dict[str, Any](), Extent({})
         try:
-            own = _parsed(definition)
+            own = _parsed(definition, budget or ParserBudget())
             types = {**typestore().fielddefs, **own}
             extent = Extent(types)
             if self.type_name in types:
@@ -132,7 +133,7 @@ class MessageDecoder:
         return bool(fields) and fields[0][1][1] == HEADER
 
 
-def _parsed(definition: MessageDefinition) -> dict[str, Any]:
+def _parsed(definition: MessageDefinition, budget: ParserBudget) -> dict[str, Any]:
     """Return the types of a definition, by name; none where it cannot be parsed, or uses types without definition.
 
     An empty definition is ignored for a type that we know: some recorders leave it out.
@@ -144,7 +145,7 @@ def _parsed(definition: MessageDefinition) -> dict[str, Any]:
     if not definition.text.strip() and definition.type_name in typestore().fielddefs:
         return own
     try:
-        own = parse_definition(definition)
+        own = parse_definition(definition, budget)
     except BudgetError:
         raise
     except Exception:  # The parser raises whatever the text makes it stumble over.

@@ -5,20 +5,27 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import zstandard
 from mcap.records import Attachment, Metadata
 
-from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
+from magnetosuture_thread.bags.bag_folder import (
+    METADATA_FILE,
+    UNCHECKED_NOTE,
+    UNVERIFIED_NOTE,
+    find_bag_files,
+    marks_of,
+)
 from magnetosuture_thread.bags.mcap.file import McapFile
 from magnetosuture_thread.bags.message_types import MessageDecoder
 from magnetosuture_thread.bags.remap import apply_remap
 from magnetosuture_thread.bags.sqlite import SqliteFile
 from magnetosuture_thread.bags.storage import (
     CDR,
+    ROS2_PROFILE,
     BagStorage,
     Connection,
     CorruptRegion,
@@ -29,12 +36,10 @@ from magnetosuture_thread.bags.storage import (
     merge_reports,
 )
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, ParserBudget
 
 Progress = Callable[[float], None]
-UNVERIFIED_NOTE = "unverified"  # note of a bag that was salvaged from one without checksums: why it may be wrong
-UNCHECKED_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
-_decoder = cache(MessageDecoder)
+_decoders: dict[MessageDefinition, MessageDecoder] = {}
 
 
 @dataclass(slots=True)  # not frozen, which would make creating one four times as slow
@@ -47,6 +52,7 @@ class RecordedMessage:
         time: when it was recorded [ns].
         data: CDR bytes.
         definition: of its type in the bag; ours if None.
+        budget: of the bag, for parsing the definition.
     """
 
     topic: str
@@ -54,11 +60,15 @@ class RecordedMessage:
     time: int
     data: bytes
     definition: MessageDefinition | None = field(default=None, repr=False, compare=False)
+    budget: ParserBudget | None = field(default=None, repr=False, compare=False)
 
     @property
     def decoder(self) -> MessageDecoder:
         """Decoder of messages of this type."""
-        return _decoder(self.definition or MessageDefinition(self.type_name))
+        definition = self.definition or MessageDefinition(self.type_name)
+        if definition not in _decoders:
+            _decoders[definition] = MessageDecoder(definition, self.budget)
+        return _decoders[definition]
 
     def decode(self) -> Any:
         """Return the message as an object of a type store.
@@ -95,6 +105,10 @@ class Bag:
             against it. A bag keeps this for good: what `bag repair` makes of it says so in its notes.
         remarks: on files of the bag that are not read, a line each.
         facts: properties of each file, for a person.
+        parsing: the budget of its definitions.
+        profile: which conventions it follows, as mcap names them.
+        library: that wrote it; empty where nothing says.
+        custom_data: entries of others in its metadata.yaml.
 
     Raises:
         BagError: there is no such bag, it cannot be read, holds nothing intact, or lacks a topic to remap.
@@ -104,6 +118,7 @@ class Bag:
         self, path: Path, *, remap: Mapping[str, str] | None = None, progress: Progress = lambda fraction: None
     ) -> None:
         self.path = path
+        self.parsing = ParserBudget()
         found = find_bag_files(path)
         self._storages, problems = _open(found.files, progress)
         missing = [CorruptRegion(name, 0, 0, "it is missing") for name in found.missing]
@@ -115,9 +130,14 @@ class Bag:
         unlisted = [f"{name} is not read: {METADATA_FILE} does not list it" for name in found.unlisted]
         self.remarks = [*unlisted, *([found.doubt] if found.doubt else [])]
         self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
+        self.profile = next((storage.profile for storage in self._storages if storage.profile), ROS2_PROFILE)
+        self.library = next((storage.library for storage in self._storages if storage.library), "")
+        self.custom_data = found.custom_data
         self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
-        self.unverified = own or self.notes.get(UNVERIFIED_NOTE, "")
-        self.unchecked = self.unchecked or self.notes.get(UNCHECKED_NOTE, "")
+        # Of a damaged file the notes may be lost; each chunk has the marks once more.
+        marks = marks_of(self.connections()) | self.notes
+        self.unverified = own or marks.get(UNVERIFIED_NOTE, "")
+        self.unchecked = self.unchecked or marks.get(UNCHECKED_NOTE, "")
         if not any(storage.counts for storage in self._storages):
             raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
         filled = [storage for storage in self._storages if storage.counts]
@@ -228,7 +248,7 @@ class Bag:
                 raise
             refused[str(error)] += 1
             return None
-        return RecordedMessage(topic, connection.type_name, item.time, data, connection.definition)
+        return RecordedMessage(topic, connection.type_name, item.time, data, connection.definition, self.parsing)
 
     def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[StoredMessage]:
         first = self.start + round(start * 1e9)

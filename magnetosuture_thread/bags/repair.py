@@ -7,12 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from magnetosuture_thread.bags.bag_folder import QOS, UNCHECKED_NOTE, UNVERIFIED_NOTE, jazzy_qos_profiles
+from magnetosuture_thread.bags.mcap.writer import LIBRARY
 from magnetosuture_thread.bags.message_types import own_definition
-from magnetosuture_thread.bags.reader import UNCHECKED_NOTE, UNVERIFIED_NOTE, Bag
+from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.sanity import SanityCheck
 from magnetosuture_thread.bags.storage import CDR, Connection
 from magnetosuture_thread.bags.writer import MAX_TIME, BagWriter
 from magnetosuture_thread.errors import BagError
+
+RECORDER_NOTE = "recorder"  # note of a repaired bag: which library wrote the one before
 
 
 @dataclass
@@ -26,6 +30,7 @@ class RepairReport:
         unpacked: messages that the recorder had packed one by one, and that are not in the new bag.
         defined: types that had no definition, and have ours.
         kept: attachments and metadata records.
+        rewritten: topics whose quality of service is written by name, as Jazzy reads it.
     """
 
     messages: int = 0
@@ -34,11 +39,12 @@ class RepairReport:
     unpacked: int = 0
     defined: list[str] = field(default_factory=list)
     kept: int = 0
+    rewritten: list[str] = field(default_factory=list)
 
     @property
     def is_same(self) -> bool:
         """Return whether the new bag holds everything, as it was."""
-        return not (self.refused or self.dropped or self.unpacked or self.defined)
+        return not (self.refused or self.dropped or self.unpacked or self.defined or self.rewritten)
 
 
 def write_repaired_bag(
@@ -51,9 +57,10 @@ def write_repaired_bag(
 ) -> RepairReport:
     """Write every message of a bag that can be vouched for into a new one, with its notes, definitions and attachments.
 
-    Bytes stay as they are; so do times and numbers of messages. Messages that the recorder packed one by one, as the
+    The bytes of messages, definitions, attachments and metadata records stay as they are; so do times and numbers of
+    messages, the profile, and entries of others in metadata.yaml. Messages that the recorder packed one by one, as the
     storage says, are unpacked, and topics have their remapped names. Types keep the definitions of the bag; ours is
-    written where it has none and we know the type.
+    written where it has none and we know the type. Chunks, indices, statistics and metadata.yaml are made anew.
 
     Args:
         bag: the bag to repair.
@@ -74,10 +81,12 @@ def write_repaired_bag(
         notes[UNVERIFIED_NOTE] = bag.unverified
     elif bag.unchecked:
         notes.setdefault(UNCHECKED_NOTE, f"made by `bag repair` from a bag that {bag.unchecked}")
+    if bag.library and bag.library != LIBRARY:
+        notes.setdefault(RECORDER_NOTE, bag.library)
     check = SanityCheck(bag) if bag.unverified else None
     report = RepairReport()
     numbers: dict[Connection, int] = {}
-    with BagWriter(folder, notes, name=name) as writer:
+    with BagWriter(folder, notes, name=name, profile=bag.profile, custom_data=bag.custom_data) as writer:
         for extra in bag.extras(report.dropped):
             writer.add_extra(extra)
             report.kept += 1
@@ -110,4 +119,7 @@ def _defined(bag: Bag, connection: Connection, report: RepairReport) -> Connecti
         if own.text:
             definition = own
             report.defined.append(own.type_name)
+    profiles = connection.metadata.get(QOS, "")
+    if jazzy_qos_profiles(profiles) != profiles:
+        report.rewritten.append(bag.name_of(connection))
     return replace(connection, topic=bag.name_of(connection), definition=definition)

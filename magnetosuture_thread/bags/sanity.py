@@ -82,7 +82,9 @@ class SanityCheck:
         except BagError:
             return None
         connection = item.connection
-        return RecordedMessage(connection.topic, connection.type_name, item.time, data, connection.definition)
+        return RecordedMessage(
+            connection.topic, connection.type_name, item.time, data, connection.definition, self._bag.parsing
+        )
 
 
 def rising(values: array[int]) -> list[bool]:

@@ -19,6 +19,7 @@ from urllib.parse import quote
 from mcap.records import Attachment, Metadata
 
 from magnetosuture_thread.bags.storage import (
+    ROS2_PROFILE,
     Connection,
     CorruptRegion,
     DamageReport,
@@ -27,6 +28,7 @@ from magnetosuture_thread.bags.storage import (
     pluralize,
 )
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
 UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
@@ -42,6 +44,8 @@ _COLUMNS = {
     "topics": ("id", "name", "type", "serialization_format"),
     "messages": ("id", "topic_id", "timestamp", "data"),
 }
+# The last three are written anew: versions, and a copy of metadata.yaml.
+_OWN_TABLES = (*_COLUMNS, "message_definitions", "schema", "metadata", "sqlite_sequence")
 _MAX_ROW_ID = (1 << 63) - 1
 _MAX_GAPS = 2000  # unreadable places after which the rest of a database is given up
 _LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
@@ -78,6 +82,7 @@ class SqliteFile:
         self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size
         self.notes: dict[str, str] = {}
         self.unchecked = UNCHECKED
+        self.profile, self.library = ROS2_PROFILE, ""
         self.connections: dict[int, Connection] = {}
         self.counts: dict[int, int] = {}
         self._rows: list[tuple[int, int]] | None = None  # time and id of each readable row, if not all are readable
@@ -129,7 +134,12 @@ class SqliteFile:
             raise BagError(self.path, f"cannot be read any more: {_words(error)}") from None
 
     def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
-        """Yield nothing: the format has no attachments."""
+        """Yield nothing: the format has no attachments. Tables that rosbag2 does not write are counted."""
+        with closing(self._connect()) as database:
+            names = [row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        for name in names:
+            if name not in _OWN_TABLES:
+                dropped[f"table {shortened(str(name))} of the database"] += 1
         return iter(())
 
     def _connect(self) -> sqlite3.Connection:

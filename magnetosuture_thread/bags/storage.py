@@ -88,6 +88,7 @@ def merge_reports(reports: Iterable[DamageReport | None]) -> DamageReport | None
 
 
 CDR = "cdr"  # how ROS 2 writes messages
+ROS2_PROFILE = "ros2"  # of mcap files of ROS 2
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,8 @@ class BagStorage(Protocol):
         unverified: why even the messages that are read may be wrong, in one line; empty if checksums vouch for them,
             or nothing speaks against them.
         facts: properties of the file for a person, for example chunks and compression.
+        profile: which conventions the file follows, as mcap names them.
+        library: that wrote it; empty where the format does not say.
     """
 
     path: Path
@@ -173,6 +176,8 @@ class BagStorage(Protocol):
     unchecked: str
     unverified: str
     facts: dict[str, str]
+    profile: str
+    library: str
 
     def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
         """Yield attachments and foreign metadata records; what cannot be vouched for is counted by reason."""

@@ -20,12 +20,12 @@ from magnetosuture_thread.bags.bag_folder import (
     TYPE_HASH,
     add_checksum,
     bag_information,
-    dump_qos_profiles,
-    parse_qos_profiles,
+    jazzy_qos_profiles,
+    marked,
 )
 from magnetosuture_thread.bags.mcap.writer import MAX_INDEX_BYTES, McapWriter
 from magnetosuture_thread.bags.message_types import own_definition, typestore
-from magnetosuture_thread.bags.storage import Connection, MessageDefinition, pluralize
+from magnetosuture_thread.bags.storage import ROS2_PROFILE, Connection, MessageDefinition, pluralize
 from magnetosuture_thread.errors import BagError
 
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
@@ -58,13 +58,24 @@ class BagWriter:
         folder: made by the writer if there is none; must be empty.
         notes: entries kept in the bag, for example the setup it was recorded with.
         name: of the bag; the folder's if empty.
+        profile: which conventions it follows, as mcap names them.
+        custom_data: entries of others in metadata.yaml.
 
     Raises:
         BagError: the folder is not empty or cannot be written.
     """
 
-    def __init__(self, folder: Path, notes: Mapping[str, str] | None = None, *, name: str = "") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        notes: Mapping[str, str] | None = None,
+        *,
+        name: str = "",
+        profile: str = ROS2_PROFILE,
+        custom_data: Mapping[str, str] | None = None,
+    ) -> None:
         self.folder = folder
+        self._custom_data = dict(custom_data or {})
         self._file_name = f"{name or folder.name}_0.mcap"
         self._notes = dict(notes or {})
         self._topics: dict[str, int] = {}
@@ -78,7 +89,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(folder, f"cannot be written: {error.strerror}") from None
         try:
-            self._writer = McapWriter(self._stream, {NOTES: add_checksum(self._notes)} if self._notes else {})
+            self._writer = McapWriter(self._stream, {NOTES: add_checksum(self._notes)} if self._notes else {}, profile)
             self._reserve = _DiskReserve(folder / ".reserve")
             self._reserve.grow(_RESERVE_BYTES)
         except OSError as error:
@@ -118,9 +129,9 @@ class BagWriter:
     def add_connection(self, connection: Connection) -> int:
         """Add a connection, and return its number for `write_to`."""
         if QOS in connection.metadata:
-            given = connection.metadata[QOS]
-            profiles = dump_qos_profiles(parse_qos_profiles(given)) or given  # as it was, where it cannot be read
+            profiles = jazzy_qos_profiles(connection.metadata[QOS])
             connection = replace(connection, metadata={**connection.metadata, QOS: profiles})
+        connection = marked(connection, self._notes)
         number = self._writer.add_channel(connection)
         self._connections[number] = connection
         return number
@@ -209,7 +220,8 @@ class BagWriter:
         return RecordingEndedError(self.folder, f"the disk {what} after {kept}", self.folder / self._file_name)
 
     def _finish(self) -> None:
-        information = bag_information(self._file_name, self._writer.state, self._connections, self._notes)
+        state, custom = self._writer.state, self._custom_data
+        information = bag_information(self._file_name, state, self._connections, self._notes, custom)
         self._writer.finish({"rosbag2": {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)}})
         text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
         with (self.folder / METADATA_FILE).open("w", encoding="utf-8") as stream:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
+from magnetosuture_thread.barrier import import_barriers
 from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import CoilDriver, DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.stop_record import RecordedState, StopRecord
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.scene import Scene
 
 MAX_INTERVALS = 2000  # that the statistics of the loop are over
@@ -76,6 +79,7 @@ class CoilSystem:
         self._record = record
         self._driver_name = "none"
         self._auto_arm = False
+        self._imported: tuple[str, ...] = ()
 
     @property
     def driver_name(self) -> str:
@@ -124,15 +128,31 @@ class CoilSystem:
             field = f"{CoilBridgeSettings.GROUP}.stop_file"
             raise InvalidInputError(field, problem, "a file that can be written") from None
 
+    def import_barriers(self, names: Sequence[str]) -> None:
+        """Import the modules of barriers, at the start: while one is imported, no emergency stop is answered."""
+        import_barriers(names)
+        self._imported = tuple(names)
+
+    def check_barriers(self, names: Sequence[str]) -> None:
+        """Refuse barriers whose modules were neither named at the start nor imported by others.
+
+        Raises:
+            ConfigurationError: naming the barrier.
+        """
+        for name in names:
+            if name not in self._imported and name.partition(":")[0] not in sys.modules:
+                where = f"{CoilBridgeSettings.GROUP}.barriers"
+                raise ConfigurationError(where, name, "one that was named when the node started")
+
     def open(self, settings: CoilBridgeSettings, bridge: CoilBridge, driver: CoilDriver) -> None:
         """Open a driver; from now on each step applies currents, zero at first."""
         self.driver, self._driver_name = driver, settings.driver
         driver.open()
         self.bridge, self.timing = bridge, LoopTiming(1.0 / settings.rate)
 
-    def arm_when_ready(self) -> None:
+    def arm_when_ready(self, wanted: bool = True) -> None:
         """Arm automatically, once, as soon as the driver is ready; any switch or fault before cancels that."""
-        self._auto_arm = True
+        self._auto_arm = wanted
 
     def close(self, reason: str = UNCONFIGURED) -> BridgeOutput | None:
         """Set the coils to zero and close the driver.

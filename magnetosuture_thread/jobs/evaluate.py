@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.bags.bag_folder import STORAGE_SUFFIXES, find_bag_files
+from magnetosuture_thread.bags.bag_folder import find_bag_files
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
+from magnetosuture_thread.interface import STORAGE_SUFFIXES
 from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.bags.reader import UNVERIFIED_NOTE, Bag
+from magnetosuture_thread.bags.bag_folder import UNVERIFIED_NOTE
+from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from magnetosuture_thread import InvalidInputError, Scene
-from magnetosuture_thread.bags.bag_folder import COMPRESSED_SUFFIXES, STORAGE_SUFFIXES
+from magnetosuture_thread.bags.bag_folder import COMPRESSED_SUFFIXES
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.interface import CAMERA
+from magnetosuture_thread.interface import CAMERA, STORAGE_SUFFIXES
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.image_header import image_header
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -69,6 +69,7 @@ class FrameSource:
         is_sequence: whether the frames follow one another in time, as in a bag.
         notes: what a bag's writer says of it.
         doubts: on a bag, a line each: what is damaged, or why damage may not have been noticed.
+        unverified: why any frame of a bag may be wrong; empty if nothing speaks against them.
 
     Raises:
         BagError: a path does not exist, a folder holds no pictures, or a bag cannot be used.
@@ -81,6 +82,7 @@ class FrameSource:
         self._channel = CAMERA["raw"]
         self.notes: dict[str, str] = {}
         self.doubts: list[str] = []
+        self.unverified = ""
         for path in paths:
             self._add(path, remap, alone=len(paths) == 1)
         self.is_sequence = self._recording is not None
@@ -113,7 +115,7 @@ class FrameSource:
                 raise BagError(path, "is a bag; expected it alone, without other frames")
             bag = Bag(path, remap=remap)
             recording = self._recording = Recording(bag)
-            self.notes = bag.notes
+            self.notes, self.unverified = bag.notes, bag.unverified
             doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
             self.doubts = [line for line in (str(bag.damage or ""), doubt, *bag.remarks) if line]
             if recording.camera is None:
@@ -227,12 +229,14 @@ class TrackedFrame:
         duration: processor time that looking took, on one core, decoding not included; other work on the
             machine does not show in it [s].
         stamp: when the frame was taken [s]; None where nothing tells.
+        unverified: why a bag's frame may be wrong; empty if nothing speaks against it.
     """
 
     name: str
     track: Track
     duration: float
     stamp: float | None
+    unverified: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return what is written of it, in SI units; null for what has no value."""
@@ -250,6 +254,7 @@ class TrackedFrame:
             "confidence": _number(track.confidence),
             "time_s": self.duration,
             "stamp_s": self.stamp,
+            **({"unverified": self.unverified} if self.unverified else {}),
         }
 
 
@@ -303,7 +308,7 @@ def track(
     with OverlayWriter(overlay, source.rate()) if overlay is not None else nullcontext() as writer:
         for index, frame in enumerate(source):
             result = _look(tracker, frame, source.is_sequence)
-            results.append(result)
+            results.append(replace(result, unverified=source.unverified))
             if writer is not None and frame.image is not None:
                 name = f"frame_{index:06d}" if source.is_sequence else files[index]
                 writer.write(name, _drawn(frame.image, result, settings, scene))

@@ -69,6 +69,37 @@ def chunk_bomb(path: Path, size: int, count: int = 1, record: bytes = b"") -> Pa
     return path
 
 
+def many_definitions(path: Path, count: int, text: Callable[[int], str]) -> Path:
+    """Write an mcap file with many topics, each of a type of its own."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        for number in range(count):
+            schema = writer.register_schema(f"pkg/msg/T{number}", "ros2msg", text(number).encode())
+            channel = writer.register_channel(f"/topic{number}", "cdr", schema)
+            writer.add_message(channel, 1 + number, cdr(STRING, "a"), 1)
+        writer.finish()
+    return path
+
+
+def chunks_of_definitions(path: Path, chunks: int, each: int, size: int) -> Path:
+    """Write an mcap file of chunks full of definitions of types, all of them different."""
+    builder = RecordBuilder()
+    mcap_records.Header("ros2", "bomb").write(builder)
+    for number in range(chunks):
+        inner = RecordBuilder()
+        for index in range(each):
+            own = f"{number} {index}".encode() + bytes(size)
+            mcap_records.Schema(1 + index, own, "ros2msg", "pkg/msg/T").write(inner)
+        data = inner.end()
+        compressed = zstandard.ZstdCompressor().compress(data)
+        mcap_records.Chunk("zstd", compressed, 1, 1, zlib.crc32(data), len(data)).write(builder)
+    mcap_records.DataEnd(0).write(builder)
+    mcap_records.Footer(0, 0, 0).write(builder)
+    path.write_bytes(b"\x89MCAP0\r\n" + builder.end() + b"\x89MCAP0\r\n")
+    return path
+
+
 def metadata_bomb(folder: Path, text: str) -> Path:
     """Write a bag whose metadata.yaml is a bomb."""
     folder.mkdir()
@@ -144,6 +175,11 @@ BOMBS: dict[str, Callable[[Path], Path]] = {
         "ros2idl",
     ),
     "idl_brackets": lambda p: definition_bomb(p / "a.mcap", idl("(" * 300 + "1" + ")" * 300), "ros2idl"),
+    "many_definitions": lambda p: many_definitions(
+        p / "a.mcap", 40, lambda n: f"int8 own{n}\n" + "".join(f"int8 a{k}\n" for k in range(9000))
+    ),
+    "chunks_of_definitions": lambda p: chunks_of_definitions(p / "a.mcap", 40, 60_000, 0),
+    "chunks_of_large_definitions": lambda p: chunks_of_definitions(p / "a.mcap", 40, 100, 100_000),
     "chunk_of_zeros": lambda p: chunk_bomb(p / "a.mcap", 1 << 30),
     "many_chunks_of_zeros": lambda p: chunk_bomb(p / "a.mcap", 60 << 20, 100),
     "many_messages": lambda p: chunk_bomb(p / "a.mcap", 12 << 20, 50, MESSAGE),

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -192,3 +193,52 @@ def test_a_topic_of_which_no_message_can_be_used_is_not_marked_as_taken(
     assert "/thread/measured *" not in shown
     assert "none of the messages on /thread/measured can be used" in " ".join(shown.split())
     assert np.isfinite(Bag(folder).duration)
+
+
+def test_the_mark_of_an_unverified_bag_outlives_its_notes(tmp_path: Path):
+    """In metadata.yaml and in the record of notes it may be damaged or lost; each chunk has it once more."""
+    messages = [thread(index, [(0.001 * k, 0.0, 0.0) for k in range(5)]) for index in range(20)]
+    folder = malformed(tmp_path / "bag", messages, {"/thread/measured": PATH})
+    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new"), "--unverified"]) == 0
+    (tmp_path / "new" / "metadata.yaml").unlink()
+    file = tmp_path / "new" / "new_0.mcap"
+    data = bytearray(file.read_bytes())
+    data[data.index(b"unverified") + 40] ^= 1  # in the record of notes
+    file.write_bytes(data)
+    bag = Bag(file)
+    assert "unverified" not in bag.notes
+    assert bag.unverified == "damaged, and without checksums (sqlite3): any message that is read may be wrong"
+
+
+def test_what_others_wrote_of_a_bag_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The profile and entries of metadata.yaml; the library that wrote it goes into a note."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    with (folder / "a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("lab-7", library="recorder of a lab")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data\n")
+        profiles = "- history: 3\n  depth: 1\n  reliability: 1\n  durability: 2\n  deadline: {sec: 0, nsec: 0}\n"
+        profiles += "  lifespan: {sec: 0, nsec: 0}\n  liveliness: 1\n  liveliness_lease_duration: {sec: 0, nsec: 0}\n"
+        profiles += "  avoid_ros_namespace_conventions: false\n"
+        channel = writer.register_channel("/text", "cdr", schema, {"offered_qos_profiles": profiles})
+        writer.add_message(channel, 1, cdr(STRING, "a"), 1)
+        writer.finish()
+    about = {"relative_file_paths": ["a.mcap"], "custom_data": {"operator": "nobody"}}
+    (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": about}))
+    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 0
+    said = capsys.readouterr().out
+    assert "quality of service written by name, as Jazzy reads it: /text" in said
+    new = Bag(tmp_path / "new")
+    assert (new.profile, new.notes["recorder"]) == ("lab-7", "recorder of a lab")
+    assert new.custom_data == {"operator": "nobody"}
+    assert "reliable" in next(iter(new.connections())).metadata["offered_qos_profiles"]
+
+
+def test_a_table_of_another_program_is_counted_where_it_is_not_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(5), {"/text": STRING})
+    with closing(sqlite3.connect(folder / "bag.db3")) as database:
+        database.execute("CREATE TABLE lab_notes(text)")
+        database.commit()
+    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 0
+    assert "not kept: 1 of this: table lab_notes of the database" in capsys.readouterr().out

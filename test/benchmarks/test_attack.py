@@ -31,14 +31,14 @@ def test_an_altered_bag_with_valid_checksums_is_noticed(tmp_path: Path):
             bag.add_topic(topic, kind)
         for topic, at, data in bags.original_messages()[1:]:
             bag.write(topic, at, data + b"x" if at == bags.SECOND else data)
-    found, _, _ = bags.judged(tmp_path / "bag", Counter(bags.original_messages()))
+    found, _, _ = bags.check_bag(tmp_path / "bag", Counter(bags.original_messages()))
     assert found["altered_as_sound"] >= 1
 
 
 def test_a_reader_that_does_not_end_is_ended_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(bags, "GRACE", -4.5)
-    monkeypatch.setattr(bags, "_judge", lambda bag, original: time.sleep(600.0))
-    found, seconds, _ = bags.judged(tmp_path, Counter())
+    monkeypatch.setattr(bags, "_check", lambda bag, original: time.sleep(600.0))
+    found, seconds, _ = bags.check_bag(tmp_path, Counter())
     assert found["ended"] == 1
     assert seconds < 60.0
 

@@ -27,6 +27,7 @@ from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.bags.bags import copy_with_notes
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
 KEYS = {
@@ -266,3 +267,13 @@ def test_an_orientation_is_ignored_and_said(tmp_path: Path):
     (plain,) = track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene())
     np.testing.assert_allclose(seen.track.tail, plain.track.tail, atol=5e-5)
     assert said == ["1 frame with an EXIF orientation, read as stored: it is ignored"]
+
+
+def test_an_unverified_bag_says_so_in_the_files_made_from_it(short_bag: Path, tmp_path: Path):
+    copy_with_notes(short_bag, tmp_path / "bag", unverified="salvaged without checksums")
+    file, camera = tmp_path / "seen.json", tmp_path / "camera.yaml"
+    assert cli.main(["track", str(tmp_path / "bag"), "--json", str(file)]) == 0
+    assert {row["unverified"] for row in json.loads(file.read_text())} == {"salvaged without checksums"}
+    given = [str(tmp_path / "bag"), "--dish-diameter", "0.035", "--output", str(camera)]
+    assert cli.main(["calibrate-camera", *given]) == 0
+    assert camera.read_text().startswith("# UNVERIFIED: salvaged without checksums\n/**")

@@ -66,6 +66,7 @@ class McapFile:
         self.damage = salvaged.damage
         self.unchecked = salvaged.unchecked
         self.unverified = ""
+        self.profile, self.library = scan.profile, scan.library
         used = set(self.counts)
         self._blocks = [block for block in salvaged.blocks if block.channels & used]
         self.start = min((block.start for block in self._blocks), default=0)

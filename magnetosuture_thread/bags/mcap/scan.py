@@ -11,6 +11,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -85,6 +86,8 @@ class ScanResult:
         data_crc: checksum of the data section as stored; 0 if there is none.
         data_crc_matches: whether it is correct.
         private_records: number of records of private opcodes.
+        profile: of the file, as its header says.
+        library: that wrote it, as its header says.
     """
 
     blocks: list[Block] = field(default_factory=list)
@@ -102,6 +105,8 @@ class ScanResult:
     data_crc: int = 0
     data_crc_matches: bool = False
     private_records: int = 0
+    profile: str = ""
+    library: str = ""
 
 
 class Scanner:
@@ -129,7 +134,7 @@ class Scanner:
         self._progress = progress
         self._crc = 0
         self._channel_sets = {_NO_CHANNELS: _NO_CHANNELS}
-        self._definitions: set[tuple[int, bytes, bool]] = set()
+        self._definitions: set[bytes] = set()  # hashes of those that were added
         self._offsets: list[int] = []  # of records, by the summary
         if summary is not None and summary.trusted and not summary.shifted:
             offsets = [chunk.offset for chunk in summary.chunks]
@@ -177,7 +182,9 @@ class Scanner:
             return after
         record = parse_record(opcode, body)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self.result.unchecked_channels.add(record)
+            self._add_definition(opcode, body, checked=False)
+        elif opcode == Opcode.HEADER:
+            self.result.profile, self.result.library = record.profile, record.library
         elif opcode == Opcode.METADATA:
             self.result.metadata.append(record)
         elif opcode == Opcode.DATA_END:
@@ -262,19 +269,21 @@ class Scanner:
                 definitions.append((opcode, data[start:end]))
         self._budget.spend(0, records)
         for opcode, body in definitions:
-            self._add_definition(opcode, body, block.has_checksum)
+            self._add_definition(opcode, body, checked=block.has_checksum)
         channels = self._channel_sets.setdefault(frozenset(counts), frozenset(counts))
         self.result.blocks.append(block._replace(size=len(data), start=first, end=last, channels=channels))
         self.result.counts += counts
         if not block.has_checksum:
             self.result.unchecked_counts += counts
 
-    def _add_definition(self, opcode: int, body: bytes, checked: bool) -> None:
+    def _add_definition(self, opcode: int, body: bytes, *, checked: bool) -> None:
         """Add a channel or schema; our own writer repeats them in every chunk."""
-        if (opcode, body, checked) not in self._definitions:
+        key = blake2b(bytes([opcode, checked]) + body, digest_size=16).digest()
+        if key not in self._definitions:
+            self._budget.define(len(body))
             table = self.result.checked_channels if checked else self.result.unchecked_channels
             table.add(parse_record(opcode, body))
-            self._definitions.add((opcode, body, checked))
+            self._definitions.add(key)
 
     def _skip_corrupt(self, position: int, what: str) -> int:
         """Add a corrupt region, and return where the next intact data begins."""

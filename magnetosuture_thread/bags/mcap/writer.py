@@ -27,8 +27,9 @@ from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
 from magnetosuture_thread.bags.mcap.records import MAGIC, MESSAGE_HEADER, RECORD_HEADER, encode_records
-from magnetosuture_thread.bags.storage import Connection, MessageDefinition
+from magnetosuture_thread.bags.storage import ROS2_PROFILE, Connection, MessageDefinition
 
+LIBRARY = "magnetosuture_thread"  # in the header of the file
 _MESSAGE = struct.Struct("<BQHIQQ")  # the header of a message's record, and what is before the data
 _INDEX = struct.Struct("<BQHI")  # the header of a message index, its channel, and its size
 
@@ -161,6 +162,7 @@ class McapWriter:
     Args:
         stream: of the file, without a buffer.
         metadata: metadata records by name, written at the head of the file, where truncation leaves them.
+        profile: which conventions the file follows.
 
     Attributes:
         state: what is on the disk and what is pending.
@@ -169,7 +171,9 @@ class McapWriter:
         OSError: the disk is full, or fails.
     """
 
-    def __init__(self, stream: BinaryIO, metadata: Mapping[str, Mapping[str, str]]) -> None:
+    def __init__(
+        self, stream: BinaryIO, metadata: Mapping[str, Mapping[str, str]], profile: str = ROS2_PROFILE
+    ) -> None:
         self._stream = stream
         self._schemas: dict[int, mcap_records.Schema] = {}
         self._channels: dict[int, mcap_records.Channel] = {}
@@ -178,7 +182,7 @@ class McapWriter:
         self._index: list[bytes] = []  # entries of the chunk index
         self._compressor = zstandard.ZstdCompressor()
         self.state = WriterState(0, 0, 0, Counter(), None, 0, ChunkBuilder())
-        self.state = self._append(MAGIC + encode_records(mcap_records.Header("ros2", "magnetosuture_thread")))
+        self.state = self._append(MAGIC + encode_records(mcap_records.Header(profile, LIBRARY)))
         self._metadata_index: list[mcap_records.MetadataIndex] = []
         self._attachment_index: list[mcap_records.AttachmentIndex] = []
         self._write_metadata(metadata)

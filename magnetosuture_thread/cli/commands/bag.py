@@ -64,8 +64,9 @@ def run_bag_check(options: argparse.Namespace) -> int:
 def run_repair(options: argparse.Namespace) -> int:
     """Write every intact message of a bag into a new one.
 
-    The new bag has the old one's notes, definitions, attachments, times and numbers of messages, byte for byte. The
-    command reports how many messages there are and what is lost or changed, where and when.
+    Messages, their times and numbers, definitions, attachments, metadata records and notes stay as they are; chunks,
+    indices and metadata.yaml are made anew. The command reports how many messages there are and what is lost or
+    changed, where and when.
 
     A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others. With
     --unverified, those are written that decode, are finite, are within reach of the dish, and have their stamps in
@@ -93,7 +94,7 @@ def run_repair(options: argparse.Namespace) -> int:
     for line in (f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks):
         log(line) if line else None
     if report.is_same and not (bag.damage or bag.unverified or bag.unchecked or bag.remarks):
-        log("is not damaged: the new bag holds the same messages, definitions, attachments and notes")
+        log("is not damaged: the new bag holds the same messages, definitions, attachments, metadata records and notes")
     for reason, lost in report.refused.items():
         log(f"{reason}: {pluralize(lost, 'message')} lost")
     for reason, lost in report.dropped.items():
@@ -102,6 +103,9 @@ def run_repair(options: argparse.Namespace) -> int:
         log(f"{pluralize(report.unpacked, 'message')} packed by the recorder, and unpacked in the new bag")
     if report.defined:
         log(f"without a definition, now with ours: {', '.join(sorted(set(report.defined)))}")
+    if report.rewritten:
+        topics = ", ".join(one_line(topic) for topic in sorted(set(report.rewritten)))
+        log(f"quality of service written by name, as Jazzy reads it: {topics}")
     for place in bag.damage.regions if bag.damage is not None else ():
         log(f"  {place}{_times(place.first, place.last, bag.start)}")
     log(f"{report.messages} messages in {options.output}")

@@ -27,6 +27,7 @@ from magnetosuture_thread.cli.arguments import (
 )
 from magnetosuture_thread.cli.terminal import make_console, make_log, progress
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.texts import one_line
 
 if TYPE_CHECKING:
     from magnetosuture_thread.coils.calibration_fit import CalibrationFit
@@ -188,7 +189,8 @@ def calibrate_camera(
     else:
         calibration = calibrate_by_markers(images, dish_diameter, *markers)
     with whole_file(output) as partial:
-        partial.write_text(calibration.to_yaml(), encoding="utf-8")
+        head = f"# UNVERIFIED: {one_line(source.unverified)}\n" if source.unverified else ""
+        partial.write_text(head + calibration.to_yaml(), encoding="utf-8")
     return calibration
 
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.clock import Clock, ClockType
-from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.barrier import import_barriers
+from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, CoilBridge
 from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
 from magnetosuture_thread.coils.drivers import make_driver
@@ -54,16 +51,13 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source))
         BridgeServices(self, self.arm, self.stop, self.reset)
-        # Later no module is imported: that may take any time, in which nobody would answer an emergency stop.
-        self._importable = tuple(self.get_parameter_or("barriers", Parameter("barriers", value=[])).value)
-        import_barriers(self._importable)
+        self.system.import_barriers(self.get_parameter_or("barriers").value or ())
         self.start()
-        if self.settings is not None and self.settings.autostart == "armed":
-            self.system.arm_when_ready()
+        self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")
 
     def begin(self, settings: CoilBridgeSettings) -> None:
         """Open the driver; from now on it receives zeros periodically."""
-        self._check_barriers(settings.barriers)
+        self.system.check_barriers(settings.barriers)
         self.system.recall(stop_record(self))
         self.system.remember()
         bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
@@ -181,12 +175,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def refuse(self, problem: Exception) -> None:
         """Report a message that was refused."""
         self._report.report_refused(problem)
-
-    def _check_barriers(self, names: Sequence[str]) -> None:
-        """Refuse barriers whose modules were neither named when the node started nor imported by others."""
-        for name in names:
-            if name not in self._importable and name.partition(":")[0] not in sys.modules:
-                raise ConfigurationError("coil_bridge.barriers", name, "one that was named when the node started")
 
     def _rest(self, switch: Callable[[], None]) -> str:
         """Come to rest by a switch, and only then wait for the disk; return what is wrong with that."""
