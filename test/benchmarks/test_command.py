@@ -29,6 +29,7 @@ FIGURES = {
         ("page", ["--presses"]),
         ("keep-out", ["--seconds", "--seed"]),
         ("attack", ["--count", "--seed"]),
+        ("vision", ["--count", "--seed", "--classes", "--save"]),
     ],
 )
 def test_every_benchmark_has_help(name: str, options: list[str], capsys: pytest.CaptureFixture[str]):

@@ -1,0 +1,1 @@
+"""How the tracker fares on rendered frames of many kinds."""
