@@ -135,7 +135,8 @@ def test_both_say_how_they_are(graph, frames):
     )
 
 
-def test_a_stamp_that_is_none_is_refused_by_the_model_alone(graph, frames):
+def test_a_stamp_that_is_none_is_refused_by_the_tracker_and_by_the_model(graph, frames):
+    """Each for itself, whoever hands it over."""
     said, poses = graph.listen_later(topics.DIAGNOSTICS), graph.listen_later(topics.NEEDLE_POSE)
     given = [Parameter("confirm_frames", value=1), Parameter("scene", value=SCENE)]
     tracker = VisionTrackerNode(context=graph.context, parameter_overrides=given)
@@ -144,10 +145,17 @@ def test_a_stamp_that_is_none_is_refused_by_the_model_alone(graph, frames):
     for node in (tracker, model):
         graph.nodes.append(node)
         graph.executor.add_node(node)
-    graph.publish(topics.COMPRESSED_IMAGE, compressed(frames[0], Time(sec=5, nanosec=1_500_000_000)))
-    graph.wait(lambda: bool(poses), "the pose")
-    words = "needle/measured_cp.header.stamp.nanosec"
-    graph.wait(lambda: any(words in array.status[0].message for array in said), "the refusal")
+
+    def is_refused(field: str) -> bool:
+        return any(f"{field}.header.stamp.nanosec" in array.status[0].message for array in said)
+
+    stamp = Time(sec=5, nanosec=1_500_000_000)
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(frames[0], stamp))
+    graph.wait(lambda: is_refused("camera/image_raw/compressed"), "the tracker's refusal")
+    assert poses == []
+    with graph.between_callbacks():
+        model.on_tracked(stamp, np.zeros(2), np.array([1.0, 0.0]))
+    graph.wait(lambda: is_refused("needle/measured_cp"), "the model's refusal")
 
 
 def test_one_that_cannot_be_made_takes_the_other_along(graph):

@@ -160,7 +160,8 @@ class RigSimulatorNode(PackageNode):
         level(text, **values, **{"lag [s]": round(self.time.lag, 3)})
 
     def _fail(self, error: MagnetosutureError) -> None:
-        """Say that the simulation does not find its next state; the rig has switched its coils off."""
+        """Switch the coils off where the simulation does not find its next state, and say so."""
+        self.rig.switch_off()
         self.health.error(str(error))
 
 
