@@ -188,9 +188,11 @@ def parse_qos_profiles(text: str) -> list[dict[str, Any]]:
 
 
 def jazzy_qos_profiles(text: str) -> str:
-    """Return profiles as Jazzy keeps them with a topic, by name; as they were where they cannot be read."""
+    """Return profiles as Jazzy keeps them with a topic, by name; the text itself where it does so or cannot be read."""
     profiles = parse_qos_profiles(text)
-    return yaml.safe_dump(profiles, sort_keys=False) if profiles else text
+    if not profiles or yaml.load(text, yaml.CSafeLoader) == profiles:
+        return text
+    return yaml.safe_dump(profiles, sort_keys=False)
 
 
 def read_metadata(folder: Path) -> Metadata:

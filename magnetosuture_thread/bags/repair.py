@@ -15,6 +15,7 @@ from magnetosuture_thread.bags.sanity import SanityCheck
 from magnetosuture_thread.bags.storage import CDR, Connection
 from magnetosuture_thread.bags.writer import MAX_TIME, BagWriter
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.texts import shortened
 
 RECORDER_NOTE = "recorder"  # note of a repaired bag: which library wrote the one before
 
@@ -82,11 +83,11 @@ def write_repaired_bag(
     elif bag.unchecked:
         notes.setdefault(UNCHECKED_NOTE, f"made by `bag repair` from a bag that {bag.unchecked}")
     if bag.library and bag.library != LIBRARY:
-        notes.setdefault(RECORDER_NOTE, bag.library)
+        notes.setdefault(RECORDER_NOTE, shortened(bag.library))
     check = SanityCheck(bag) if bag.unverified else None
     report = RepairReport()
     numbers: dict[Connection, int] = {}
-    with BagWriter(folder, notes, name=name, profile=bag.profile, custom_data=bag.custom_data) as writer:
+    with BagWriter(folder, notes, name=name, profile=shortened(bag.profile), custom_data=bag.custom_data) as writer:
         for extra in bag.extras(report.dropped):
             writer.add_extra(extra)
             report.kept += 1

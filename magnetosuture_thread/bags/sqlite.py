@@ -12,7 +12,7 @@ import stat
 from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from urllib.parse import quote
 
@@ -135,11 +135,13 @@ class SqliteFile:
 
     def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
         """Yield nothing: the format has no attachments. Tables that rosbag2 does not write are counted."""
-        with closing(self._connect()) as database:
-            names = [row[0] for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        names = list[str]()
+        with suppress(*_ERRORS), closing(self._connect()) as database:  # of a damaged one as many as can be read
+            for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'"):
+                names.append(str(name))
         for name in names:
             if name not in _OWN_TABLES:
-                dropped[f"table {shortened(str(name))} of the database"] += 1
+                dropped[f"table {shortened(name)} of the database"] += 1
         return iter(())
 
     def _connect(self) -> sqlite3.Connection:

@@ -18,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.bags.bag_folder import jazzy_qos_profiles
 from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.sanity import SanityCheck, rising
@@ -242,3 +243,16 @@ def test_a_table_of_another_program_is_counted_where_it_is_not_kept(tmp_path: Pa
         database.commit()
     assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 0
     assert "not kept: 1 of this: table lab_notes of the database" in capsys.readouterr().out
+
+
+def test_quality_of_service_by_name_stays_as_it_was_written():
+    """Another recorder's way to write YAML is no reason to change it."""
+    by_number = "- history: 3\n  depth: 1\n  reliability: 1\n  durability: 2\n  deadline: {sec: 0, nsec: 0}\n"
+    by_number += "  lifespan: {sec: 0, nsec: 0}\n  liveliness: 1\n  liveliness_lease_duration: {sec: 0, nsec: 0}\n"
+    by_number += "  avoid_ros_namespace_conventions: false\n"
+    by_name = jazzy_qos_profiles(by_number)
+    assert by_name != by_number
+    flow = yaml.safe_dump(yaml.safe_load(by_name), default_flow_style=True)
+    assert flow != by_name
+    assert jazzy_qos_profiles(flow) == flow
+    assert jazzy_qos_profiles("no profiles: [") == "no profiles: ["
