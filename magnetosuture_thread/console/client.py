@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import Any
 
 from aiohttp import WSMsgType, web
@@ -205,7 +206,8 @@ class Client:
         if exceeded or (not self._can_command and self._message_count > MAX_WATCHER_RATE):
             self._abort()
         elif kind is WSMsgType.PING:
-            await self._socket.pong(data)
+            with suppress(ConnectionError):
+                await self._socket.pong(data)
 
     async def _on_message(self, kind: WSMsgType, data: Any) -> None:
         now = asyncio.get_running_loop().time()

@@ -27,7 +27,7 @@ from magnetosuture_thread.errors import ConfigurationError
 MAX_CLIENTS = 16  # with the token
 MAX_WATCHERS = 8  # without it, from one address, and twice as many in all; they take no place of the others
 MAX_NEW_WATCHERS = 20  # from one address in a second
-MAX_REQUESTS = 100  # from one address in a second; those beyond wait for the next second
+MAX_REQUESTS = 100  # without the token, from one address in a second; those beyond wait for the next second
 MAX_MESSAGE_BYTES = 65536  # beyond, the connection is closed before the whole message is read
 FRAME_POLL_PERIOD = 0.005  # of the check for a new camera frame [s]
 HEARTBEAT_PERIOD = 5.0  # a page that does not answer a ping within half of this is disconnected [s]
@@ -111,9 +111,10 @@ class ConsoleServer:
             task.result()
 
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
-        now = asyncio.get_running_loop().time()
-        if self._request_rate.count(request.remote or "", now) > MAX_REQUESTS:
-            await asyncio.sleep(1.0 - now % 1.0)
+        if not same_token(request.query.get("token"), self._token):
+            now = asyncio.get_running_loop().time()
+            if self._request_rate.count(request.remote or "", now) > MAX_REQUESTS:
+                await asyncio.sleep(1.0 - now % 1.0)
         refusal = host_refusal(request.headers.get("Host", ""), self._settings.address, self._port)
         if refusal:
             return _answer(403, refusal)

@@ -372,6 +372,9 @@ def test_who_asks_for_too_many_files_waits_for_the_next_second(monkeypatch: pyte
             async with here.session.get(here.url) as answer:
                 assert answer.status == 200
         assert asyncio.get_running_loop().time() - began > 2.0  # five in each second at the most
+        operator = await here.session.ws_connect(here.url + f"socket?token={TOKEN}")
+        assert not operator.closed
+        await operator.close()
 
     monkeypatch.setattr("magnetosuture_thread.console.server.MAX_REQUESTS", 5)
     run(test)
