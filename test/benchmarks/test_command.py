@@ -29,7 +29,6 @@ FIGURES = {
         ("page", ["--presses"]),
         ("keep-out", ["--seconds", "--seed"]),
         ("attack", ["--count", "--seed"]),
-        ("vision", ["--count", "--seed", "--classes", "--save"]),
     ],
 )
 def test_every_benchmark_has_help(name: str, options: list[str], capsys: pytest.CaptureFixture[str]):

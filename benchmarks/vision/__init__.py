@@ -1,1 +1,0 @@
-"""How the tracker fares on rendered frames of many kinds."""
