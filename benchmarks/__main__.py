@@ -16,12 +16,16 @@ from benchmarks.attack import command as attack
 from benchmarks.bridge import command as bridge
 from benchmarks.page import command as page
 from benchmarks.solver import command as solver
+from benchmarks.vision import command as vision
 from magnetosuture_thread.cli.arguments import EXIT_CODES, STANDARD_OUTPUT, check_outputs, output_file
 from magnetosuture_thread.cli.main import exit_code
 from magnetosuture_thread.cli.terminal import make_console, write_json
 
 # Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
-BENCHMARKS: dict[str, Any] = {"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out, "attack": attack}
+BENCHMARKS: dict[str, Any] = {
+    **{"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out},
+    **{"attack": attack, "vision": vision},
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

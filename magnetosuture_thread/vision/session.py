@@ -72,15 +72,18 @@ class TrackerSession:
         except InvalidInputError as error:
             return self.on_broken(error)
         self.frames += 1
-        centreline = np.empty((0, 2))
-        if track.state is State.TRACKED:
-            self.tracked += 1
-            if len(track.centreline) > 1:
-                at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
-                centreline = points_at(track.centreline, at)
-        return FrameMeasurement(track, centreline)
+        self.tracked += track.state is State.TRACKED
+        return FrameMeasurement(track, published_centreline(track))
 
     def on_broken(self, problem: InvalidInputError) -> FrameMeasurement:
         """Count a frame that cannot be looked at, and say why."""
         self.frames += 1
         return FrameMeasurement(no_pose(self.missing, str(problem), None), np.empty((0, 2)), problem)
+
+
+def published_centreline(track: Track) -> Points:
+    """Return what is told of a centreline: `CENTRELINE_POINTS` vertices equally spaced, or none, shape (m, 2) [m]."""
+    if len(track.centreline) < 2:
+        return np.empty((0, 2))
+    at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
+    return points_at(track.centreline, at)

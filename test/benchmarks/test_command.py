@@ -29,6 +29,7 @@ FIGURES = {
         ("page", ["--presses"]),
         ("keep-out", ["--seconds", "--seed"]),
         ("attack", ["--count", "--seed"]),
+        ("vision", ["--count", "--seed", "--classes", "--save"]),
     ],
 )
 def test_every_benchmark_has_help(name: str, options: list[str], capsys: pytest.CaptureFixture[str]):
@@ -53,6 +54,7 @@ def test_every_benchmark_has_help(name: str, options: list[str], capsys: pytest.
         ["attack"],
         ["attack", "moon"],
         ["attack", "bags", "--count", "0"],
+        ["vision", "--count", "0"],
         ["page", "--json", "/no/such/folder/x.json"],
     ],
 )

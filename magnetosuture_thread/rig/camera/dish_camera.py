@@ -27,7 +27,7 @@ LAMP = (-0.5, 0.86)  # direction towards the lamp, in the dish frame
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
 SHADOW_BEGIN_PX = (-10, -9)  # shifted by 2.5 and 3.5 px, less 12.5 of the blur
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
-NOISE_FIELDS = 12  # drawn once; a frame takes one of them
+NOISE_FIELDS = 12
 NOISE_LEVEL = 1.6  # of white light of level 90, before the sensor's interpolation spreads it
 REACH_PX = 24.0  # of shadows and blur around what moves
 
@@ -69,6 +69,7 @@ class DishCamera:
         size: width and height of the image [px].
         seed: of the dust, the smears and the sensor noise; the same seed gives the same frames.
         lighting: light, lens and sensor.
+        noise_fields: drawn once; a frame takes one of them.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class DishCamera:
         size: tuple[int, int] = (640, 480),
         seed: int = 0,
         lighting: Lighting | None = None,
+        noise_fields: int = NOISE_FIELDS,
     ) -> None:
         self._scene = scene
         self.view = view
@@ -86,7 +88,7 @@ class DishCamera:
         self._random = np.random.default_rng(seed)
         self._background = StillLife(scene, self._lighting, view, size, self._random).draw()
         self._still = self._through_lens(self._background)
-        self._noise = [self._noise_field() for _ in range(NOISE_FIELDS)]
+        self._noise = [self._noise_field() for _ in range(noise_fields)]
         self._exposed = [self._expose(self._still, noise, 1.0) for noise in self._noise]
 
     def render(
@@ -108,7 +110,7 @@ class DishCamera:
         line = self.view.to_pixels(thread)
         edges = [self.view.to_pixels(cover.outline) for cover in covers]
         box = box_around(np.vstack([outline, line, *edges]), self.size, REACH_PX)
-        chosen = int(self._random.integers(NOISE_FIELDS))
+        chosen = int(self._random.integers(len(self._noise)))
         noise = self._noise[chosen]
         image = self._exposed[chosen].copy() if gain == 1.0 else self._expose(self._still, noise, gain)
         if box is not None:

@@ -1,0 +1,1 @@
+"""Hold the tracker against rendered frames whose ground truth is known."""

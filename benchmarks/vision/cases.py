@@ -1,0 +1,334 @@
+"""The classes of frames: each draws a case at random."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import cv2
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from benchmarks.vision.frames import (
+    DISH_RADIUS,
+    ROWS,
+    SCALE,
+    Case,
+    Needle,
+    dark_field,
+    distorted,
+    drawn_path,
+    tilted,
+)
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.rig.camera.scene import Lighting
+
+Random = np.random.Generator
+MakeCase = Callable[[Random], Case]
+
+WITHIN, THREAD_WITHIN = 0.0150, 0.0163  # m; of the dish's centre, in which a needle and a thread lie
+CURVATURES = (-190.0, 0.0, 0.0, 0.0, 110.0, 190.0)  # 1/m
+TURN_STEP = 0.05e-3  # m; between vertices of a thread
+MAX_TRIES = 2000
+FOLDS = ((0, 4), (4, 15), (15, 26), (26, 50))  # degrees from the heading
+SIZES = {320: (320, 240), 640: (640, 480), 1280: (1280, 960), 1920: (1920, 1080)}
+COLOURS = {
+    "black": (38.0, 34.0, 34.0),
+    "violet": (132.0, 78.0, 100.0),
+    "white": (250.0, 250.0, 250.0),
+    "undyed": (196.0, 206.0, 210.0),
+}
+WIDTHS_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 4.0, 6.0, 12.0)
+COVERS = (1.5, 3.0, 6.0, 10.0)  # mm
+COVER_BGR = ((168.0, 176.0, 205.0), (60.0, 58.0, 55.0), (210.0, 205.0, 200.0))
+SKIN_BGR = (150.0, 170.0, 225.0)
+
+
+def _unit(angle: float) -> Points:
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def _lighting(random: Random) -> Lighting:
+    return Lighting(
+        gain=random.uniform(0.7, 1.05),
+        slope=random.uniform(0.0, 3.0),
+        glare=random.uniform(0.0, 1.0),
+        noise=random.uniform(0.5, 2.0),
+        blur_px=random.uniform(0.6, 1.0),
+    )
+
+
+def _needle(random: Random, length: float = 0.007, within: float = WITHIN) -> Needle:
+    while True:
+        needle = Needle(
+            random.uniform(-within, within, 2), random.uniform(-np.pi, np.pi), float(random.choice(CURVATURES)), length
+        )
+        if np.linalg.norm(needle.axis(np.linspace(0.0, 1.0, 9))[0], axis=1).max() < within:
+            return needle
+
+
+def _laid(random: Random, start: Points, angle: float, length: float, bends: float = 250.0) -> Points:
+    """Return a line that begins at an angle, nearly straight, and then winds at random, shape (m, 2) [m]."""
+    steps = max(4, round(length / TURN_STEP))
+    knots = np.concatenate([[0.0], random.uniform(-bends, bends, 6)])
+    turn = np.cumsum(np.interp(np.linspace(0.0, 1.0, steps), np.linspace(0.0, 1.0, 7), knots)) * length / steps
+    walked = np.cumsum(length / steps * np.column_stack([np.cos(angle + turn), np.sin(angle + turn)]), axis=0)
+    return np.vstack([start, start + walked])
+
+
+def _is_inside(thread: Points) -> bool:
+    return bool(np.linalg.norm(thread, axis=1).max() < THREAD_WITHIN)
+
+
+def _is_clear(needle: Needle, thread: Points, first: float = 2e-3, clearance: float = 1.2e-3) -> bool:
+    """Say whether a thread stays off its needle but for where it leaves."""
+    later = thread[arc_lengths(thread) > first]
+    return bool(needle.distances(later[::4]).min() > clearance)
+
+
+def _crosses_itself(thread: Points) -> bool:
+    """Say whether a thread crosses itself at a good angle, or comes near to itself."""
+    line = thread[::6]
+    apart = np.linalg.norm(line[:, None] - line[None], axis=2)
+    near = np.abs(np.subtract.outer(np.arange(len(line)), np.arange(len(line)))) * 6 * TURN_STEP > 2.5e-3
+    return bool((apart[near] < 0.7e-3).any())
+
+
+def _usual(random: Random, length: float = 0.007, thread: float = 0.019, within: float = WITHIN) -> Case:
+    """Return a needle with a thread that leaves backwards and crosses nothing."""
+    for _ in range(MAX_TRIES):
+        needle = _needle(random, length, within)
+        line = _laid(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), thread)
+        if _is_inside(line) and _is_clear(needle, line) and not _crosses_itself(line):
+            return Case(needle, line, lighting=_lighting(random), quality=int(random.integers(80, 97)))
+    raise RuntimeError("no thread fits into the dish")
+
+
+def _folded(low: float, high: float, length: float, random: Random) -> Case:
+    """Return a thread that lies beside, under or over its needle, at an angle from the heading [degrees]."""
+    for _ in range(MAX_TRIES):
+        needle = _needle(random, length)
+        fold = math.radians(random.uniform(low, high)) * random.choice((-1.0, 1.0))
+        how = str(random.choice(("under", "over", "beside")))
+        along = random.uniform(0.6, 1.6) * length
+        if how == "beside":  # It leaves backwards and turns around in a small bend.
+            radius, side = random.uniform(0.2e-3, 0.5e-3), math.copysign(1.0, fold)
+            turns = np.linspace(0.0, np.pi - abs(fold), 20)
+            first = needle.heading + np.pi
+            centre = needle.tail + radius * _unit(first - side * 0.5 * np.pi)
+            begun = centre + radius * np.array([_unit(first + side * (0.5 * np.pi - turn)) for turn in turns])
+            start, angle = begun[-1], needle.heading + fold
+        else:
+            begun, start, angle = needle.tail[None], needle.tail, needle.heading + fold
+        straight = _laid(random, start, angle, along, 60.0)
+        line = np.vstack([begun, straight[1:]])
+        leaving = math.atan2(*(line[-1] - line[-2])[::-1])
+        line = np.vstack([line, _laid(random, line[-1], leaving, 0.019 - arc_lengths(line)[-1])[1:]])
+        beyond = line[arc_lengths(line) > 1.4 * length + 1e-3]
+        if _is_inside(line) and needle.distances(beyond[::4]).min() > 0.8e-3 and not _crosses_itself(line[20:]):
+            labels = {"fold": math.degrees(fold), "how": how}
+            return Case(needle, line, lighting=_lighting(random), thread_over=how == "over", labels=labels)
+    raise RuntimeError("no thread fits into the dish")
+
+
+def _crossing_itself(random: Random) -> Case:
+    """Return a thread with a loop."""
+    for _ in range(MAX_TRIES):
+        needle = _needle(random)
+        first = _laid(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.3), random.uniform(4e-3, 7e-3))
+        angle = math.atan2(*(first[-1] - first[-2])[::-1])
+        turn, radius = random.choice((-1.0, 1.0)), random.uniform(1.2e-3, 2.2e-3)
+        turns = np.arange(0.0, random.uniform(1.7, 1.95) * np.pi, TURN_STEP / radius)
+        steps = angle + turn * turns
+        loop = first[-1] + np.cumsum(TURN_STEP * np.column_stack([np.cos(steps), np.sin(steps)]), axis=0)
+        line = np.vstack([first, loop])
+        line = np.vstack([line, _laid(random, line[-1], float(steps[-1]), 0.026 - arc_lengths(line)[-1], 100.0)[1:]])
+        own = line[::2]
+        apart = np.linalg.norm(own[:, None] - own[None], axis=2)
+        meets = np.triu(apart < 2.0 * TURN_STEP, 20).any()
+        if _is_inside(line) and _is_clear(needle, line) and meets:
+            return Case(needle, line, lighting=_lighting(random))
+    raise RuntimeError("no thread fits into the dish")
+
+
+def _crossing_needle(random: Random) -> Case:
+    """Return a thread that comes back and crosses its needle, under or over it."""
+    for _ in range(MAX_TRIES):
+        needle = _needle(random, within=0.011)
+        side, share = random.choice((-1.0, 1.0)), random.uniform(0.3, 0.75)
+        at, along = (values[0] for values in needle.axis(np.array([share])))
+        aside = side * np.array([-along[1], along[0]])
+        way = math.cos(lean := random.uniform(-0.7, 0.7)) * aside + math.sin(lean) * along
+        back = -_unit(needle.heading)
+        out = needle.tail + 2.2e-3 * back
+        knots = [
+            needle.tail,
+            needle.tail + 0.9e-3 * back,
+            out - 1.2e-3 * aside,
+            at - 2.6e-3 * way,
+            at,
+            at + 2.6e-3 * way,
+        ]
+        line = _spline(np.array(knots))
+        leaving = math.atan2(*(line[-1] - line[-2])[::-1])
+        line = np.vstack([line, _laid(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
+        after = line[(arc_lengths(line) > 1.5e-3)]
+        near = needle.distances(after[::4])
+        if _is_inside(line) and (near < 0.5 * needle.width).sum() < 15 and near[-30:].min() > 1e-3:
+            return Case(needle, line, lighting=_lighting(random), thread_over=bool(random.random() < 0.5))
+    raise RuntimeError("no thread fits into the dish")
+
+
+def _spline(knots: Points) -> Points:
+    """Return a smooth line through points, cubic in the chord length, with vertices of equal distance."""
+    at = arc_lengths(knots)
+    line = CubicSpline(at, knots)(np.linspace(0.0, at[-1], 400))
+    return points_at(line, np.arange(0.0, arc_lengths(line)[-1], TURN_STEP))
+
+
+def _image_width(columns: int, random: Random) -> Case:
+    """Return the usual needle and thread in an image of another size; lens and sensor go with the pixels."""
+    case = _usual(random)
+    width, height = SIZES[columns]
+    return replace(case, size=(width, height), thread_px=0.975 * height / ROWS)
+
+
+def _thread(colour: str, width_px: float, random: Random) -> Case:
+    """Return a thread of a colour and a width in the image."""
+    size = SIZES[int(random.choice((640, 640, 640, 1280, 1920)))]
+    return replace(_usual(random), size=size, thread_px=width_px, thread_bgr=COLOURS[colour])
+
+
+def _covered(width: float, random: Random) -> Case:
+    """Return a thread over which a post stands or an instrument lies, as wide as given [m]."""
+    for _ in range(MAX_TRIES):
+        case = _usual(random, thread=0.028)
+        lengths = arc_lengths(case.thread)
+        middle = random.uniform(3e-3 + 0.5 * width, 22e-3 - 0.5 * width)
+        index = int(np.searchsorted(lengths, middle))
+        at, along = case.thread[index], case.thread[index + 1] - case.thread[index - 1]
+        colour = COVER_BGR[int(random.integers(len(COVER_BGR)))]
+        turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+        round_one = at + 0.5 * width * np.column_stack([np.cos(turns), np.sin(turns)])
+        if random.random() < 0.5:
+            outline, how = round_one, "post"
+        else:
+            across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+            across *= math.copysign(1.0, float(across @ at))  # towards the nearer wall
+            outline, how = _strip(at - 2e-3 * across, across, 0.06, width), "instrument"
+        cover = Cover(outline, colour, 1.0)
+        axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
+        if _signed(outline, np.vstack([axis, case.thread[:20]])) < -1.2e-3:
+            return replace(case, hidden_by=(cover,), labels={"how": how})
+    raise RuntimeError("no cover stays off the needle")
+
+
+def _strip(end: Points, way: Points, length: float, width: float) -> Points:
+    across = 0.5 * width * np.array([-way[1], way[0]])
+    return np.vstack([end - across, end + across, end + length * way + across, end + length * way - across])
+
+
+def _signed(outline: Points, points: Points) -> float:
+    """Return how deep the deepest point lies in an outline, negative outside [m]."""
+    ring = (outline * 1e6).astype(np.float32)
+    return max(cv2.pointPolygonTest(ring, (float(x), float(y)), True) for x, y in points * 1e6) * 1e-6
+
+
+def _second_needle(random: Random, *, glare: bool = False) -> Case:
+    """Return a frame with a needle that has no thread; with glare, the lamp is reflected on the one with the thread."""
+    for _ in range(MAX_TRIES):
+        case = _usual(random)
+        other = _needle(random)
+        axis, _ = other.axis(np.linspace(0.0, 1.0, 20))
+        if case.needle.distances(axis).min() > 2e-3 and min(other.distances(case.thread[::4])) > 1.2e-3:
+            break
+    if not glare:
+        return replace(case, beside=(other,))
+    at, _ = case.needle.axis(np.array([random.uniform(0.0, 1.0)]))
+    turns = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+    axes = random.uniform(0.5e-3, 1.5e-3, 2)
+    spot = at + axes * np.column_stack([np.cos(turns), np.sin(turns)])
+    return replace(case, beside=(other,), hidden_by=(Cover(spot, (262.0, 262.0, 262.0), 2.0),))
+
+
+def _tilted(degrees: float, random: Random) -> Case:
+    return replace(_usual(random), finish=(tilted(math.radians(degrees), random.uniform(-np.pi, np.pi)),))
+
+
+def _saturated(random: Random) -> Case:
+    case = _usual(random)
+    return replace(case, lighting=replace(case.lighting, gain=random.uniform(1.1, 1.6)))
+
+
+def _dark_field(random: Random) -> Case:
+    return replace(_usual(random), finish=(dark_field,))
+
+
+def _blunt_rod(random: Random) -> Case:
+    return replace(_usual(random), rod=True)
+
+
+def _drawn_path(random: Random) -> Case:
+    """Return a frame into which a program has drawn the way that the needle shall go."""
+    bgr = ((60, 180, 60), (200, 90, 40), (40, 40, 200))[int(random.integers(3))]
+    start = random.uniform(-0.01, 0.01, 2)
+    line = _laid(random, start, random.uniform(-np.pi, np.pi), 0.012, 200.0)
+    return replace(_usual(random), finish=(drawn_path(line, bgr, int(random.integers(1, 4))),))
+
+
+def _distorted(random: Random) -> Case:
+    return replace(_usual(random), finish=(distorted(random.uniform(-0.06, 0.06)),))
+
+
+def _cut_dish(random: Random) -> Case:
+    """Return a dish of which the frame shows a part, with all of needle and thread."""
+    for _ in range(MAX_TRIES):
+        case = _usual(random)
+        shift = random.uniform(0.1, 0.55) * DISH_RADIUS / SCALE * _unit(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+        moved = replace(case, shift=(float(shift[0]), float(shift[1])))
+        ends = case.needle.axis(np.linspace(0.0, 1.0, 9))[0]
+        at = moved.view.to_pixels(np.vstack([ends, case.thread]))
+        if at.min() > 25.0 and (at < np.array(moved.size) - 25.0).all():
+            return moved
+    raise RuntimeError("no needle fits into the part of the dish")
+
+
+def _hand(random: Random) -> Case:
+    """Return a finger that comes in from the border and keeps off the needle."""
+    for _ in range(MAX_TRIES):
+        case = _usual(random)
+        angle, width = random.uniform(-np.pi, np.pi), random.uniform(8e-3, 16e-3)
+        turns = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 20)
+        inwards = -_unit(angle)
+        across = np.array([-inwards[1], inwards[0]])
+        end = -random.uniform(3e-3, 14e-3) * inwards
+        cap = end + 0.5 * width * (np.cos(turns)[:, None] * inwards + np.sin(turns)[:, None] * across)
+        back = end - 0.1 * inwards
+        outline = np.vstack([back - 0.5 * width * across, cap, back + 0.5 * width * across])
+        axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
+        if _signed(outline, axis) < -1.5e-3:
+            return replace(case, hidden_by=(Cover(outline, SKIN_BGR, 2.5),))
+    raise RuntimeError("no finger stays off the needle")
+
+
+def _classes() -> dict[str, MakeCase]:
+    classes: dict[str, MakeCase] = {"usual": _usual}
+    for length in (2.5, 7.0):
+        for low, high in FOLDS:
+            classes[f"fold_{low}_{high}_{length:g}mm"] = partial(_folded, low, high, 1e-3 * length)
+    classes |= {"crossing_itself": _crossing_itself, "crossing_needle": _crossing_needle}
+    classes |= {f"width_{columns}": partial(_image_width, columns) for columns in SIZES}
+    for colour in COLOURS:
+        classes |= {f"thread_{colour}_{width:g}px": partial(_thread, colour, width) for width in WIDTHS_PX}
+    classes |= {f"cover_{width:g}mm": partial(_covered, 1e-3 * width) for width in COVERS}
+    classes |= {"second_needle": _second_needle, "decoy_needle": partial(_second_needle, glare=True)}
+    classes |= {f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)}
+    classes |= {"saturated": _saturated, "dark_field": _dark_field, "blunt_rod": _blunt_rod}
+    classes |= {"drawn_path": _drawn_path, "distortion": _distorted, "cut_dish": _cut_dish, "hand": _hand}
+    return classes
+
+
+CLASSES = _classes()

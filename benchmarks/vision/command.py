@@ -1,0 +1,94 @@
+"""Hold the vision tracker against rendered frames of many classes, whose ground truth is known.
+
+A frame is drawn by the rig's camera, varied at random, and given to a tracker that has seen no other. Passed if no pose
+is reversed. 20 frames of each class take ten minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import cv2
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.vision.cases import CLASSES
+from benchmarks.vision.measurements import Row, frame_of, measure_vision
+from magnetosuture_thread.cli.arguments import count_argument, whole_number
+from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.errors import ConfigurationError
+
+FAMILIES = ", ".join(dict.fromkeys(name.partition("_")[0] for name in CLASSES))
+TOTALS = ("frames", "found", "unknown", "wrong", "reversed")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    count = count_argument("frames", 1, 100_000)
+    parser.add_argument("--count", type=count, default=20, metavar="N", help="frames of each class (default: 20)")
+    parser.add_argument("--seed", type=whole_number, default=1, metavar="S", help="of the variation (default: 1)")
+    parser.add_argument(
+        "--classes", nargs="+", default=[""], metavar="PREFIX", help="only classes whose names begin so (default: all)"
+    )
+    parser.add_argument(
+        "--save", nargs=3, metavar=("CLASS", "INDEX", "FILE"), help="only write one frame of a class as a PNG file"
+    )
+
+
+def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+    """Measure; return the figures and whether no pose was reversed."""
+    if options.save:
+        name, index, file = options.save
+        return _save(name, index, file, options.seed), True
+    names = [name for name in CLASSES if name.startswith(tuple(options.classes))]
+    if not names:
+        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}")
+    with progress(console, "vision") as advance:
+        rows, figures = measure_vision(names, options.count, options.seed, advance)
+    console.print(table(rows))
+    total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
+    make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
+    return {**figures, "total": total}, total["reversed"] == 0
+
+
+def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:
+    """Write a frame; return what is known of it."""
+    if name not in CLASSES:
+        raise ConfigurationError("--save", name, f"a whole name, which begin with {FAMILIES}")
+    case, image = frame_of(name, whole_number(index), seed)
+    if not cv2.imwrite(file, image):
+        raise ConfigurationError("--save", file, "a PNG file in a folder that exists")
+    needle = case.needle
+    return {"tail": needle.tail.tolist(), "heading": needle.heading, "thread": case.thread.tolist(), **case.labels}
+
+
+def table(rows: list[Row]) -> Table:
+    """Return the rows as a table."""
+    title = f"the tracker on rendered frames, {rows[0].frames} of each class"
+    result = Table(title=title, title_justify="left", title_style="bold", padding=(0, 0, 0, 1))
+    result.add_column("class", no_wrap=True)
+    for name in ("pose", "unkn", "wrong", "rev", ">cov", "px", "deg", "thread", "wrong", "ms"):
+        result.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        counts = (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)
+        result.add_row(
+            row.name,
+            *map(str, counts),
+            _number(row.tail_px, ".2f"),
+            _number(row.angle_deg, ".2f"),
+            f"{row.covered:.0%}",
+            _number(row.wrong_line, ".3f"),
+            f"{row.median_ms:.1f}",
+        )
+    result.caption = (
+        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or heading by 5 degrees;\n"
+        "rev: by 90 degrees; >cov: by more than the covariance says; px, deg: RMS of the others;\n"
+        "thread: of its visible length followed; wrong: of the centreline, where no thread is"
+    )
+    result.caption_justify = "left"
+    return result
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)
