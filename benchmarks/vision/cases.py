@@ -61,11 +61,10 @@ def _lighting(random: Random) -> Lighting:
     )
 
 
-def _needle(random: Random, length: float = 0.007, within: float = WITHIN) -> Needle:
+def _needle(random: Random, length: float = 0.007, within: float = WITHIN, width: float = 0.0004) -> Needle:
     while True:
-        needle = Needle(
-            random.uniform(-within, within, 2), random.uniform(-np.pi, np.pi), float(random.choice(CURVATURES)), length
-        )
+        tail, heading = random.uniform(-within, within, 2), random.uniform(-np.pi, np.pi)
+        needle = Needle(tail, heading, float(random.choice(CURVATURES)), length, width)
         if np.linalg.norm(needle.axis(np.linspace(0.0, 1.0, 9))[0], axis=1).max() < within:
             return needle
 
@@ -110,7 +109,7 @@ def _usual(random: Random, length: float = 0.007, thread: float = 0.019, within:
 def _folded(low: float, high: float, length: float, random: Random) -> Case:
     """Return a thread that lies beside, under or over its needle, at an angle from the heading [degrees]."""
     for _ in range(MAX_TRIES):
-        needle = _needle(random, length)
+        needle = _needle(random, length, width=random.uniform(0.28e-3, 0.42e-3))
         fold = math.radians(random.uniform(low, high)) * random.choice((-1.0, 1.0))
         how = str(random.choice(("under", "over", "beside")))
         along = random.uniform(0.6, 1.6) * length
@@ -130,7 +129,9 @@ def _folded(low: float, high: float, length: float, random: Random) -> Case:
         beyond = line[arc_lengths(line) > 1.4 * length + 1e-3]
         if _is_inside(line) and needle.distances(beyond[::4]).min() > 0.8e-3 and not _crosses_itself(line[20:]):
             labels = {"fold": math.degrees(fold), "how": how}
-            return Case(needle, line, lighting=_lighting(random), thread_over=how == "over", labels=labels)
+            width = random.uniform(0.8, 1.6)
+            light, over = _lighting(random), how == "over"
+            return Case(needle, line, thread_px=width, lighting=light, thread_over=over, labels=labels)
     raise RuntimeError("no thread fits into the dish")
 
 

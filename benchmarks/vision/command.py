@@ -10,6 +10,7 @@ import argparse
 from typing import Any
 
 import cv2
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -66,9 +67,9 @@ def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:
 def table(rows: list[Row]) -> Table:
     """Return the rows as a table."""
     title = f"the tracker on rendered frames, {rows[0].frames} of each class"
-    result = Table(title=title, title_justify="left", title_style="bold", padding=(0, 0, 0, 1))
+    result = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     result.add_column("class", no_wrap=True)
-    for name in ("pose", "unkn", "wrong", "rev", ">cov", "px", "deg", "thread", "wrong", "ms"):
+    for name in ("pose", "unkn", "wrong", "rev", ">cov", "px", "deg", "line", "off", "ms"):
         result.add_column(name, justify="right", no_wrap=True)
     for row in rows:
         counts = (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)
@@ -82,9 +83,10 @@ def table(rows: list[Row]) -> Table:
             f"{row.median_ms:.1f}",
         )
     result.caption = (
-        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or heading by 5 degrees;\n"
-        "rev: by 90 degrees; >cov: by more than the covariance says; px, deg: RMS of the others;\n"
-        "thread: of its visible length followed; wrong: of the centreline, where no thread is"
+        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or heading by\n"
+        "5 degrees; rev: by 90; >cov: by more than the covariance says; px, deg: RMS of\n"
+        "the others; line: share of the visible thread that is followed; off: share of the\n"
+        "centreline where no thread is"
     )
     result.caption_justify = "left"
     return result
