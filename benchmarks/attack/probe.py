@@ -59,7 +59,7 @@ class ProbeNode(GuardedNode):
         else:
             name = next(self._turns)
             request = GetParameters.Request(names=["use_sim_time"])
-            self._ask(self._nodes[name], request, lambda answer, delay: self._tell(name, delay))
+            self._ask(self._nodes[name], request, lambda answer, delay: self._print(name, delay))
 
     def _ask(self, client: Any, request: Any, then: Callable[[Any, float], None]) -> None:
         self._since, self._then = time.monotonic(), then
@@ -81,7 +81,7 @@ class ProbeNode(GuardedNode):
     def _on_armed(self, answer: Any) -> None:
         if answer is None or not answer.success:
             print(UNARMED, flush=True)
-        self._ask(self._stop, Trigger.Request(), lambda answer, delay: self._tell(STOP, delay))
+        self._ask(self._stop, Trigger.Request(), lambda answer, delay: self._print(STOP, delay))
 
     def _greet(self, name: str, answer: Any) -> None:
         if answer is not None:
@@ -89,7 +89,7 @@ class ProbeNode(GuardedNode):
         if not self._silent:
             print(READY, flush=True)
 
-    def _tell(self, name: str, delay: float) -> None:
+    def _print(self, name: str, delay: float) -> None:
         self._asked += 1
         print(name, f"{delay:.6f}", flush=True)
 

@@ -190,6 +190,30 @@ def _spline(knots: Points) -> Points:
     return points_at(line, np.arange(0.0, arc_lengths(line)[-1], TURN_STEP))
 
 
+def _at_wall(end: str, random: Random) -> Case:
+    """Return a straight needle whose tip, tail or side touches the wall, or nearly so."""
+    length, width = 0.007, 0.0004
+    for _ in range(MAX_TRIES):
+        angle, gap = random.uniform(-np.pi, np.pi), random.uniform(0.0, 0.4e-3)
+        outward = _unit(angle)
+        if end == "side":
+            heading = angle + random.choice((-0.5, 0.5)) * np.pi
+            distance = math.sqrt((DISH_RADIUS - gap - 0.5 * width) ** 2 - 0.25 * length**2)
+            tail = distance * outward - 0.5 * length * _unit(heading)
+        elif end == "tip":
+            heading = angle + random.uniform(-0.8, 0.8)
+            tail = (DISH_RADIUS - gap) * outward - length * _unit(heading)
+        else:
+            heading = angle + np.pi + random.uniform(-0.8, 0.8)
+            tail = (DISH_RADIUS - gap - 0.5 * width) * outward
+        needle = Needle(tail, heading, 0.0, length, width)
+        inward = math.atan2(*-tail[::-1]) + random.normal(0.0, 0.4)
+        line = _laid(random, tail, inward if end == "tail" else heading + np.pi + random.normal(0.0, 0.3), 0.012)
+        if _is_inside(line[arc_lengths(line) > 3e-3]) and _is_clear(needle, line) and not _crosses_itself(line):
+            return Case(needle, line, lighting=_lighting(random), labels={"gap": gap})
+    raise RuntimeError("no thread fits into the dish")
+
+
 def _image_width(columns: int, random: Random) -> Case:
     """Return the usual needle and thread in an image of another size; lens and sensor go with the pixels."""
     case = _usual(random)
@@ -321,6 +345,7 @@ def _classes() -> dict[str, MakeCase]:
         for low, high in FOLDS:
             classes[f"fold_{low}_{high}_{length:g}mm"] = partial(_folded, low, high, 1e-3 * length)
     classes |= {"crossing_itself": _crossing_itself, "crossing_needle": _crossing_needle}
+    classes |= {f"wall_{end}": partial(_at_wall, end) for end in ("tip", "tail", "side")}
     classes |= {f"width_{columns}": partial(_image_width, columns) for columns in SIZES}
     for colour in COLOURS:
         classes |= {f"thread_{colour}_{width:g}px": partial(_thread, colour, width) for width in WIDTHS_PX}

@@ -97,7 +97,7 @@ class SqliteFile:
                 else:
                     lost = self._count_messages(database)
         except _ERRORS as error:
-            raise BagError(path, f"cannot be read as a bag: {_words(error)}") from None
+            raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
         progress(size)
         if lost:
             problem = f"{pluralize(lost, 'row')} without a valid time, topic or data"
@@ -131,7 +131,7 @@ class SqliteFile:
                         if row is not None and row[0] == time and row[1] in wanted and isinstance(row[2], bytes):
                             yield StoredMessage(time, self.connections[row[1]], row[2])
         except _ERRORS as error:
-            raise BagError(self.path, f"cannot be read any more: {_words(error)}") from None
+            raise BagError(self.path, f"cannot be read any more: {_reason_of(error)}") from None
 
     def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
         """Yield nothing: the format has no attachments. Tables that rosbag2 does not write are counted."""
@@ -210,7 +210,7 @@ def _decode_text(data: bytes) -> str | None:
         return None
 
 
-def _words(error: Exception) -> str:
+def _reason_of(error: Exception) -> str:
     """Return an error of sqlite3 in words."""
     if "interrupted" in str(error):
         return "reading it takes more steps than a recording of its size does"
@@ -222,7 +222,7 @@ def _problem(database: sqlite3.Connection) -> str:
     try:
         found = str(database.execute("PRAGMA quick_check(1)").fetchone()[0])
     except _ERRORS as error:
-        return _words(error)
+        return _reason_of(error)
     return "" if found == "ok" else " ".join(found.split())
 
 

@@ -15,6 +15,8 @@ from magnetosuture_thread.vision.scene_mask import SceneMask
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
 FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
 FLOOR_CELLS = 9  # side of the median window on that grid: wider than a needle, a thread, a speck
+RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
+FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
 GLARE = 1.07  # of the floor's brightness: above, a pixel shows the lamp
 
 
@@ -55,6 +57,50 @@ def prepare(gray: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), mas
     rough = cv2.medianBlur(rough, FLOOR_CELLS)
     floor = cv2.resize(rough, small.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return Picture(gray, factor, small, floor, origin, mask)
+
+
+def without_wall(
+    gray: np.ndarray,
+    picture: Picture,
+    centre: tuple[float, float],
+    radius: float,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """Return a frame in which all beyond a circle has the floor's brightness within a box.
+
+    What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
+
+    Args:
+        gray: the frame, shape (rows, columns), uint8.
+        picture: with the floor of it.
+        centre: of the circle (u, v) [px].
+        radius: of the circle [px].
+        low: least u and v of the box [px].
+        high: greatest u and v [px].
+
+    Returns:
+        A copy, or the frame itself where nothing of the box is beyond.
+    """
+    rows, columns = gray.shape
+    left, top = (max(0, int(value)) for value in low)
+    right, bottom = min(columns, int(high[0]) + 1), min(rows, int(high[1]) + 1)
+    across, down = np.arange(left, right) - centre[0], np.arange(top, bottom) - centre[1]
+    distance = np.hypot(across[None, :], down[:, None]).astype(np.float32)
+    beyond = distance > radius
+    if not beyond.any():
+        return gray
+    # Along the ray from the centre, where there is floor.
+    shrink = np.minimum(1.0, (radius - FLOOR_DEPTH_PX) / np.maximum(distance, 1.0))
+    shift = 0.5 * (picture.factor - 1)
+    at_u, at_v = (
+        ((shrink * offset + middle - shift) / picture.factor).astype(np.float32)
+        for offset, middle in zip((across[None, :], down[:, None]), centre, strict=True)
+    )
+    floor = cv2.remap(picture.floor, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    result = gray.copy()
+    np.copyto(result[top:bottom, left:right], floor, where=beyond)
+    return result
 
 
 def glare_mask(picture: Picture) -> np.ndarray:

@@ -19,7 +19,6 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
-WALL_PX = 4.0  # before which the walk ends
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
 
@@ -128,9 +127,9 @@ def tracked(
 ) -> Track:
     """Return what a frame shows whose needle is known, in the picture's own pixels, with the thread's centreline."""
     local = _local(view, picture)
-    reach = 0.5 * diameter / view.metres_per_pixel - WALL_PX
+    wall = 0.5 * diameter / view.metres_per_pixel
     max_length = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
-    walk = find_centreline(picture, needle, max_length, local.centre_px, reach)
+    walk = find_centreline(picture, needle, max_length, local.centre_px, wall)
     heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
     covariance = _in_dish(needle, view)
     if not settings.metres_per_pixel:  # A wrong scale shifts what is far from the dish's centre.

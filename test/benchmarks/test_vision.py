@@ -18,7 +18,7 @@ from benchmarks.vision.measurements import compare, frame_of, row_of
 from magnetosuture_thread.vision.look import State, Track
 
 
-def told(case: Case, *, turned: float = 0.0, deviation: float = 0.01) -> Track:
+def track_of(case: Case, *, turned: float = 0.0, deviation: float = 0.01) -> Track:
     """Return the ground truth as if it had been tracked, with a heading turned by an angle."""
     heading = np.array([math.cos(case.needle.heading + turned), math.sin(case.needle.heading + turned)])
     covariance = np.diag([1e-5**2, 1e-5**2, deviation**2])
@@ -46,15 +46,15 @@ def test_a_frame_shows_the_needle_and_the_thread_where_the_ground_truth_has_them
         assert np.median([away[b - 1 : b + 2, a - 1 : a + 2].max() for a, b in zip(u, v, strict=True)]) > contrast
 
 
-def test_right_reversed_and_unknown_poses_are_told_apart():
+def test_right_reversed_and_unknown_poses_are_distinguished():
     case = CLASSES["usual"](np.random.default_rng(2))
-    right = compare(case, told(case), 0.0)
+    right = compare(case, track_of(case), 0.0)
     assert (right.is_wrong, right.is_reversed, right.honest) == (False, False, True)
     assert right.wrong == 0.0
     assert right.covered == pytest.approx(right.visible)
-    turned = compare(case, told(case, turned=math.pi), 0.0)
+    turned = compare(case, track_of(case, turned=math.pi), 0.0)
     assert (turned.is_wrong, turned.is_reversed, turned.honest) == (True, True, False)
-    unknown = compare(case, told(case, turned=math.pi, deviation=math.pi), 0.0)
+    unknown = compare(case, track_of(case, turned=math.pi, deviation=math.pi), 0.0)
     assert (unknown.is_wrong, unknown.is_reversed, unknown.honest) == (False, False, True)
     row = row_of("usual", [right, turned, unknown])
     assert (row.found, row.unknown, row.wrong, row.reversed, row.dishonest) == (3, 1, 1, 1, 1)
@@ -62,10 +62,10 @@ def test_right_reversed_and_unknown_poses_are_told_apart():
 
 def test_a_line_beside_the_thread_is_wrong_and_a_hidden_thread_need_not_be_followed():
     case = CLASSES["cover_6mm"](np.random.default_rng(2))
-    seen = compare(case, told(case), 0.0)
+    seen = compare(case, track_of(case), 0.0)
     assert seen.visible < 0.85 * 0.028
     assert seen.covered == pytest.approx(seen.visible)
-    aside = compare(case, replace(told(case), centreline=case.thread + np.array([0.0, 3e-3])), 0.0)
+    aside = compare(case, replace(track_of(case), centreline=case.thread + np.array([0.0, 3e-3])), 0.0)
     assert aside.wrong > 0.8 * aside.line
 
 

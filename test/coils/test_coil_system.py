@@ -38,7 +38,7 @@ def system() -> CoilSystem:
     return made
 
 
-def test_a_driver_is_told_for_when_currents_were_computed(system):
+def test_a_driver_gets_the_time_for_which_currents_were_computed(system):
     system.step(500.0, 100.0)
     assert system.driver.computed == [100.0]  # not when they came to the driver
     system.zero()

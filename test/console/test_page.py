@@ -597,7 +597,7 @@ CAUSES: list[tuple[str, dict[str, Any], str]] = [  # why nothing moves, in the o
     ("filter", {"slowdown": 0.001}, "At rest: slowed to 0 % by friction"),
     ("bridge", {"saturated": True}, "At rest: the coils are at their limit"),
 ]
-LOOK = "(view) => import('/status.js').then(({motionStatus}) => view.map(motionStatus))"
+MOTION_STATUS = "(view) => import('/status.js').then(({motionStatus}) => view.map(motionStatus))"
 
 
 def held_key(random: np.random.Generator) -> tuple[dict[str, Any], str]:
@@ -619,7 +619,7 @@ def held_key(random: np.random.Generator) -> tuple[dict[str, Any], str]:
 def test_a_held_key_without_motion_always_has_a_reason_the_most_helpful_first(operator: Operator):
     random = np.random.default_rng(5)
     looks = [held_key(random) for _ in range(2000)]
-    told = operator.page.evaluate(LOOK, [view for view, _ in looks])
+    told = operator.page.evaluate(MOTION_STATUS, [view for view, _ in looks])
     for (_, expected), found in zip(looks, told, strict=True):
         assert found["headline"].startswith(expected)
 

@@ -423,7 +423,7 @@ def test_every_answer_has_the_security_headers(path: str):
     ("is_browser", "automated", "operator"),
     [(True, False, "an operator"), (True, True, "a script"), (True, None, "a script"), (False, False, "a script")],
 )
-def test_the_host_is_told_whether_a_person_or_a_script_steers(is_browser: bool, automated: bool | None, operator: str):
+def test_the_host_gets_whether_an_operator_or_a_script_jogs(is_browser: bool, automated: bool | None, operator: str):
     async def test(here: Console) -> None:
         page = Page(await here.connect(**({"origin": here.url.rstrip("/")} if is_browser else {})))
         await page.send(type="hello", token=TOKEN, automated=automated)

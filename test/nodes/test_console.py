@@ -244,7 +244,7 @@ def test_texts_and_lists_of_states_are_cut(graph, console):
     tell(graph, topics.MEASURED_THREAD, path, lambda: len(console.state()["measured"]) == 100, "the path")
 
 
-def test_the_age_of_the_camera_image_is_told(graph, console):
+def test_the_age_of_the_camera_image_is_sent(graph, console):
     assert console.state()["camera"] is None
     graph.add(RigSimulatorNode, **SMALL)
     graph.wait(lambda: console.frame() is not None, "a frame")

@@ -43,7 +43,7 @@ from test.nodes.bridge import (
 )
 
 LAST = (topics.CURRENTS, topics.RIG_CURRENTS, topics.NEEDLE_SETPOINT, topics.BRIDGE_STATE)
-PATIENCE = 60.0  # s for a process on a busy machine
+TIMEOUT = 60.0  # s for a process on a busy machine
 
 
 @contextmanager
@@ -94,7 +94,7 @@ def moving(heard: dict[str, list[Any]]) -> bool:
 def armed_and_driving(graph, heard: dict[str, list[Any]], moves: Callable[[], bool] | None = None) -> None:
     """Arm a bridge in another process and command it until something moves, by default the currents on the wires."""
     states = heard[topics.BRIDGE_STATE.name]
-    graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", PATIENCE)
+    graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", TIMEOUT)
 
     def drives() -> bool:
         if not states[-1].armed:
@@ -102,7 +102,7 @@ def armed_and_driving(graph, heard: dict[str, list[Any]], moves: Callable[[], bo
         drive(graph)
         return moving(heard) if moves is None else moves()
 
-    graph.wait(drives, "a current", PATIENCE)
+    graph.wait(drives, "a current", TIMEOUT)
 
 
 @pytest.mark.parametrize("which", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
@@ -111,7 +111,7 @@ def test_the_last_messages_of_a_bridge_that_is_ended_are_zeros_and_why(graph, wh
     with process(graph) as bridge:
         armed_and_driving(graph, heard)
         bridge.send_signal(which)
-        assert bridge.wait(PATIENCE) == 0
+        assert bridge.wait(TIMEOUT) == 0
     graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
 
 
@@ -195,8 +195,8 @@ def test_a_bridge_that_was_killed_while_armed_waits_for_a_reset(graph):
     states.clear()
     with process(graph, autostart="armed") as bridge:
         # The last message of the one before may still be on its way.
-        graph.wait(lambda: bool(states) and UNCLEAN_END in reasons(states), "the fault", PATIENCE)
-        graph.wait(lambda: bool(states[-1].driver_ready), "the driver", PATIENCE)
+        graph.wait(lambda: bool(states) and UNCLEAN_END in reasons(states), "the fault", TIMEOUT)
+        graph.wait(lambda: bool(states[-1].driver_ready), "the driver", TIMEOUT)
         assert states[-1].state == CoilBridgeState.STATE_FAULT
         assert not arm(graph).success
         assert press(graph, EMERGENCY_STOP).success
@@ -204,7 +204,7 @@ def test_a_bridge_that_was_killed_while_armed_waits_for_a_reset(graph):
         bridge.wait()
     states.clear()
     with process(graph, autostart="armed") as bridge:
-        graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", PATIENCE)
+        graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", TIMEOUT)
         assert states[-1].emergency_stopped
         assert not any(state.armed for state in states)
         assert press(graph, RESET).success
@@ -228,7 +228,7 @@ def test_a_bridge_that_was_frozen_while_it_drove_is_in_fault(graph, tmp_path: Pa
             assert np.abs(rig.currents).max() < 1e-3  # from the first moment on
             return bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT
 
-        graph.wait(is_in_fault, "the fault", PATIENCE)
+        graph.wait(is_in_fault, "the fault", TIMEOUT)
 
 
 def test_a_scene_that_waited_while_the_bridge_was_frozen_hides_no_fault(graph, monkeypatch: pytest.MonkeyPatch):

@@ -232,16 +232,21 @@ def at_wall(end: str, gap: float, angle: float) -> tuple[np.ndarray, float]:
 def test_a_needle_at_the_wall_is_found(camera: DishCamera, thread_arc, end: str, gap: float):
     """At once with an end at the wall; along it, where both ends may look alike, if it was seen on its way there."""
     way = np.arange(5e-4, 0.0, -1e-4) if end == "side" else np.empty(0)
-    lost = 0
+    lost = followed = 0
     for angle in np.linspace(0.1, 6.2, 8):
         tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
         for index, apart in enumerate((*(gap + way), gap)):
             tail, heading = at_wall(end, apart, angle)
-            away = angle + np.pi + 0.6 if end == "tail" else heading + np.pi
-            seen = tracker.track(camera.render(tail, heading, thread_arc(tail, away, 0.0, 0.008)), 0.1 * index)
+            away = heading + {"tip": np.pi, "tail": 1.4, "side": np.pi - 0.6}[end]  # into the dish
+            thread = thread_arc(tail, away, 0.0, 0.008)
+            seen = tracker.track(camera.render(tail, heading, thread), 0.1 * index)
         lost += seen.state is not State.TRACKED
         if seen.state is State.TRACKED:
             off, turned = Pose(tail, heading).error(seen)
             assert off < 1.0  # px
             assert abs(turned) < np.radians(1.0)
-    assert lost <= (end == "side" and gap == 0.0)  # of 240 such frames of other seeds 3 were lost
+            if len(seen.centreline) > 1:  # where the thread leaves along the wall's normal it is not always seen
+                assert line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))[0] < 1.0
+            followed += end != "tail" and line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))[1] > 0.9
+    assert end == "tail" or followed + lost == 8
+    assert lost <= (end == "side" and gap == 0.0)  # as 1 of 240 others was

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.images import Picture
+from magnetosuture_thread.vision.images import RIM_PX, Picture, without_wall
 from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle, measure_body
 from magnetosuture_thread.vision.sampling import middle
@@ -14,10 +14,8 @@ from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
 INSIDE = 0.985  # part of the dish's radius that is looked at first, to stay off the rim
-RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
 AT_WALL = "at the wall"
 AT_WALL_PX = 2.0  # from what is looked at first, within which a thing may go on
-FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
 WIDE_PX = 4.0  # a needle at least this wide is searched at half the size
 MIN_AREA = 0.33  # of the needle's own
 ON_AXIS = 0.85  # of a needle's dark pixels lie along one arc; more beside it belong to what touches it
@@ -100,7 +98,7 @@ def _measured(
             if near:  # A strip along the needle takes its ground from beside it, which a shape may be.
                 gray = mask.without_shapes(gray, picture.floor, low, high, 0.0 if tight else mask.tolerance_px)
         if tight:
-            gray = _without_wall(gray, picture, view, radius, low, high)
+            gray = without_wall(gray, picture, view.centre_px, radius, low, high)
         found = measure_body(gray, arc, first, last, expected, thickness, toward)
         if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, thickness):
             found = "inside of a shape of the scene"
@@ -142,34 +140,6 @@ def _dark_components(picture: Picture, view: DishView, radius_px: float, area: f
             continue
         at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
         result.append(at * factor + shift)
-    return result
-
-
-def _without_wall(
-    gray: np.ndarray, picture: Picture, view: DishView, radius_px: float, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Return a frame in which all beyond a radius has the floor's brightness within a box (u, v) to (u, v) [px].
-
-    A strip along a needle takes its ground from both sides, and an end of it must not go on into the rim.
-    """
-    rows, columns = gray.shape
-    left, top = (max(0, int(value)) for value in low)
-    right, bottom = min(columns, int(high[0]) + 1), min(rows, int(high[1]) + 1)
-    across, down = np.arange(left, right) - view.centre_px[0], np.arange(top, bottom) - view.centre_px[1]
-    distance = np.hypot(across[None, :], down[:, None]).astype(np.float32)
-    beyond = distance > radius_px
-    if not beyond.any():
-        return gray
-    # Along the ray from the centre, where there is floor.
-    shrink = np.minimum(1.0, (radius_px - FLOOR_DEPTH_PX) / np.maximum(distance, 1.0))
-    shift = 0.5 * (picture.factor - 1)
-    at_u, at_v = (
-        ((shrink * offset + centre - shift) / picture.factor).astype(np.float32)
-        for offset, centre in zip((across[None, :], down[:, None]), view.centre_px, strict=True)
-    )
-    floor = cv2.remap(picture.floor, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    result = gray.copy()
-    np.copyto(result[top:bottom, left:right], floor, where=beyond)
     return result
 
 

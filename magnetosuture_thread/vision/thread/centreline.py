@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 
-from magnetosuture_thread.vision.images import Picture, glare_mask
+from magnetosuture_thread.vision.images import RIM_PX, Picture, glare_mask, without_wall
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.forks import follow
@@ -19,12 +19,14 @@ FAINTEST_NOISES = 3.0  # and so is one fainter than so many times the median of 
 BLUR_PX = 0.7  # before the ridge is looked for: as wide as the thinnest thread looks
 WINDOW_PX = 7  # wider than the thread looks
 COVERED_PX = 4.0  # beside and beyond the needle, where its own edge looks like a ridge
+WALL_PX = 4.0  # before which the walk ends
+AT_WALL_PX = 40.0  # from the wall, where its rim may look like the thread's beginning
 BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can leave
 _WINDOW = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WINDOW_PX, WINDOW_PX))
 
 
 def find_centreline(
-    picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], reach: float
+    picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
 ) -> np.ndarray:
     """Follow the thread from the needle's tail to its end.
 
@@ -39,11 +41,12 @@ def find_centreline(
         needle: the needle, in the picture's pixels.
         max_length: the walk stops at this length [px].
         centre: the dish's centre [px].
-        reach: the walk stops this far from the centre, before the wall [px].
+        wall: the dish's radius; the walk stops before it [px].
 
     Returns:
         Vertices from the tail on, shape (m, 2) [px], m = 1 if no thread is seen.
     """
+    reach = wall - WALL_PX
     rows, columns = picture.gray.shape
     left, top = (max(0, int(c - reach - WINDOW_PX)) for c in centre)
     right, bottom = (int(c + reach + WINDOW_PX) + 1 for c in centre)
@@ -55,7 +58,10 @@ def find_centreline(
     )
     factor = picture.factor
     left, top = left // factor * factor, top // factor * factor  # a whole pixel of the small image
-    window = picture.gray[top:bottom, left:right]
+    gray, tail = picture.gray, needle.tail_px
+    if np.hypot(*(tail - centre)) > reach - AT_WALL_PX:  # else the walk would leave along the rim
+        gray = without_wall(gray, picture, centre, wall - RIM_PX, tail - AT_WALL_PX, tail + AT_WALL_PX)
+    window = gray[top:bottom, left:right]
     smooth = cv2.GaussianBlur(window, (5, 5), BLUR_PX)
     ridge = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT, _WINDOW)
     hidden = glare_mask(picture)[top // factor : -(-bottom // factor), left // factor : -(-right // factor)]

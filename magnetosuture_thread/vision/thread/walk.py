@@ -186,7 +186,8 @@ def walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
             gap = 0.0
         else:
             gap += STEP_PX * (HIDDEN_GAP if is_hidden(hidden, factor, x, y) else 1.0)
-        if math.hypot(x - dish[0], y - dish[1]) > dish[2]:
+        away = math.hypot(x - dish[0], y - dish[1])
+        if away > dish[2] and away >= math.hypot(u - dish[0], v - dish[1]):  # a tail at the wall is beyond it
             break
         bend += 0.5 * (bend_ahead - bend)
         length += math.hypot(x - u, y - v)

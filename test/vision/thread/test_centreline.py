@@ -12,7 +12,7 @@ from magnetosuture_thread.vision.images import prepare
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.centreline import find_centreline
+from magnetosuture_thread.vision.thread.centreline import WALL_PX, find_centreline
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
 
@@ -31,7 +31,7 @@ def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 1
 
 def walk(image: np.ndarray, max_length: float = 400.0, reach: float = 230.0) -> np.ndarray:
     """Follow the thread."""
-    return find_centreline(prepare(image, 2), NEEDLE, max_length, (320.0, 240.0), reach)
+    return find_centreline(prepare(image, 2), NEEDLE, max_length, (320.0, 240.0), reach + WALL_PX)
 
 
 def wave(length: float = 150.0) -> np.ndarray:
