@@ -630,6 +630,7 @@ def test_a_key_that_was_held_through_a_stop_is_to_be_pressed_again(operator: Ope
     operator.last((0.003, 0.0))
     operator.page.click("#pause")  # the jog is stopped, and latched
     operator.last(REST)
+    expect(operator.page.locator("#pause")).to_have_text("Resume")  # shown with the next state, after the stop
     operator.page.click("#pause")
     expect(operator.page.locator("#pause")).to_have_text("Pause")
     operator.served.graph.shown["filter"]["commanded"] = [0.0, 0.0]
