@@ -26,8 +26,11 @@ MAX_DECODED = 1_000_000  # objects that the data of one message may become
 MAX_DEFINITION_CHARS = 200_000
 MAX_PARSER_STEPS = 40_000  # of a message definition's parser: a second; a usual definition takes 200 to 5,000
 MAX_BAG_PARSER_STEPS = 100_000  # of all definitions of a bag
-MAX_DEFINITION_BYTES = 1 << 25  # of all different definitions in a file
-_DEFINITION_OVERHEAD = 500  # bytes that a definition takes whatever its length
+MAX_RECORD_BYTES = 1 << 22  # of a definition of a topic or type, or of another record that is parsed as a whole
+MAX_KEPT_BYTES = 1 << 25  # of all different definitions and metadata records of a small bag, as they are in memory
+_RECORD_BYTES = 500  # that one of them takes in memory whatever its length
+_ENTRY_BYTES = 150  # that each of its entries takes besides
+LONE_RECORD = 20  # records in a chunk, which are read in the time of one outside of chunks
 
 
 class BudgetError(Exception):
@@ -35,24 +38,25 @@ class BudgetError(Exception):
 
 
 class UnpackBudget:
-    """What a file may become when it is unpacked and searched, by its size.
+    """What the files of a bag may become when they are unpacked and searched, by their size.
 
-    A recorder's compression saves a factor of 2 to 50; a bomb's, many thousands.
+    A recorder's compression saves a factor of 2 to 50; a bomb's, many thousands. Each of these bounds of a small bag,
+    and that of `ParserBudget`, takes a second or two: one that goes to all of them at once still ends within 5 s.
 
     Args:
-        size: of the file [bytes].
+        size: of all files [bytes].
     """
 
     def __init__(self, size: int) -> None:
         self._max_bytes = self._bytes = (1 << 29) + 200 * size
-        self._max_records = self._records = 200_000 + size
-        self._definition_bytes = MAX_DEFINITION_BYTES
+        self._max_records = self._records = 200_000 + size // 4  # a packed message takes 5 bytes or more
+        self._max_kept = self._kept = MAX_KEPT_BYTES + 2 * size  # the parts of a split bag repeat them
 
     def spend(self, count: int, records: int = 0) -> None:
         """Count unpacked bytes, and records in them.
 
         Raises:
-            BudgetError: there are more than the file may hold.
+            BudgetError: there are more than the files may hold.
         """
         self._bytes -= count
         self._records -= records
@@ -61,15 +65,15 @@ class UnpackBudget:
         if self._records < 0:
             raise BudgetError(f"holds more than {self._max_records} records, which no recording of its size does")
 
-    def define(self, count: int) -> None:
-        """Count the bytes of a definition that is kept.
+    def keep(self, count: int, entries: int = 0) -> None:
+        """Count the bytes of a definition or metadata record that stays in memory, and its entries.
 
         Raises:
-            BudgetError: the file has more of them than it may.
+            BudgetError: the files have more of them than they may.
         """
-        self._definition_bytes -= count + _DEFINITION_OVERHEAD
-        if self._definition_bytes < 0:
-            raise BudgetError(f"holds definitions of topics and types of more than {MAX_DEFINITION_BYTES} bytes")
+        self._kept -= count + _RECORD_BYTES + _ENTRY_BYTES * entries
+        if self._kept < 0:
+            raise BudgetError(f"holds definitions and metadata that take more than {self._max_kept} bytes of memory")
 
 
 class ParserBudget:

@@ -75,7 +75,7 @@ class MessageDecoder:
     Args:
         definition: of the type in the bag. Ours is used where the bag has none, an equivalent one, or one that
             cannot be parsed.
-        budget: of the bag; one of its own if None.
+        budget: of the bag.
 
     Attributes:
         type_name: for example `nav_msgs/msg/Path`.
@@ -84,12 +84,12 @@ class MessageDecoder:
         problem: why the bag's definition is not used; empty where it is, or none is needed.
     """
 
-    def __init__(self, definition: MessageDefinition, budget: ParserBudget | None = None) -> None:
+    def __init__(self, definition: MessageDefinition, budget: ParserBudget) -> None:
         self.type_name = definition.type_name
         self.problem = ""
         own, extent = dict[str, Any](), Extent({})
         try:
-            own = _parsed(definition, budget or ParserBudget())
+            own = _parsed(definition, budget)
             types = {**typestore().fielddefs, **own}
             extent = Extent(types)
             if self.type_name in types:
@@ -131,6 +131,23 @@ class MessageDecoder:
             return True
         fields = self._store.fielddefs[self.type_name][1] if self.is_known else []
         return bool(fields) and fields[0][1][1] == HEADER
+
+
+class DecoderCache:
+    """Decoders of the messages of one bag, whose definitions are parsed within one budget.
+
+    Those of another bag are not shared: whether a definition is still parsed depends on those before it.
+    """
+
+    def __init__(self) -> None:
+        self._budget = ParserBudget()
+        self._decoders: dict[MessageDefinition, MessageDecoder] = {}
+
+    def decoder_of(self, definition: MessageDefinition) -> MessageDecoder:
+        """Return the decoder of messages of a definition."""
+        if definition not in self._decoders:
+            self._decoders[definition] = MessageDecoder(definition, self._budget)
+        return self._decoders[definition]
 
 
 def _parsed(definition: MessageDefinition, budget: ParserBudget) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from magnetosuture_thread.bags.bag_folder import (
     marks_of,
 )
 from magnetosuture_thread.bags.mcap.file import McapFile
-from magnetosuture_thread.bags.message_types import MessageDecoder
+from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
 from magnetosuture_thread.bags.remap import apply_remap
 from magnetosuture_thread.bags.sqlite import SqliteFile
 from magnetosuture_thread.bags.storage import (
@@ -36,10 +36,10 @@ from magnetosuture_thread.bags.storage import (
     merge_reports,
 )
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, ParserBudget
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
 Progress = Callable[[float], None]
-_decoders: dict[MessageDefinition, MessageDecoder] = {}
+_OWN_DECODERS = DecoderCache()  # of messages of no bag
 
 
 @dataclass(slots=True)  # not frozen, which would make creating one four times as slow
@@ -52,7 +52,7 @@ class RecordedMessage:
         time: when it was recorded [ns].
         data: CDR bytes.
         definition: of its type in the bag; ours if None.
-        budget: of the bag, for parsing the definition.
+        decoders: of the bag; None for a message of no bag.
     """
 
     topic: str
@@ -60,15 +60,12 @@ class RecordedMessage:
     time: int
     data: bytes
     definition: MessageDefinition | None = field(default=None, repr=False, compare=False)
-    budget: ParserBudget | None = field(default=None, repr=False, compare=False)
+    decoders: DecoderCache | None = field(default=None, repr=False, compare=False)
 
     @property
     def decoder(self) -> MessageDecoder:
         """Decoder of messages of this type."""
-        definition = self.definition or MessageDefinition(self.type_name)
-        if definition not in _decoders:
-            _decoders[definition] = MessageDecoder(definition, self.budget)
-        return _decoders[definition]
+        return (self.decoders or _OWN_DECODERS).decoder_of(self.definition or MessageDefinition(self.type_name))
 
     def decode(self) -> Any:
         """Return the message as an object of a type store.
@@ -105,7 +102,7 @@ class Bag:
             against it. A bag keeps this for good: what `bag repair` makes of it says so in its notes.
         remarks: on files of the bag that are not read, a line each.
         facts: properties of each file, for a person.
-        parsing: the budget of its definitions.
+        decoders: of its messages; all its definitions are parsed within one budget.
         profile: which conventions it follows, as mcap names them.
         library: that wrote it; empty where nothing says.
         custom_data: entries of others in its metadata.yaml.
@@ -118,7 +115,7 @@ class Bag:
         self, path: Path, *, remap: Mapping[str, str] | None = None, progress: Progress = lambda fraction: None
     ) -> None:
         self.path = path
-        self.parsing = ParserBudget()
+        self.decoders = DecoderCache()
         found = find_bag_files(path)
         self._storages, problems = _open(found.files, progress)
         missing = [CorruptRegion(name, 0, 0, "it is missing") for name in found.missing]
@@ -248,7 +245,7 @@ class Bag:
                 raise
             refused[str(error)] += 1
             return None
-        return RecordedMessage(topic, connection.type_name, item.time, data, connection.definition, self.parsing)
+        return RecordedMessage(topic, connection.type_name, item.time, data, connection.definition, self.decoders)
 
     def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[StoredMessage]:
         first = self.start + round(start * 1e9)
@@ -266,6 +263,7 @@ def _open(files: list[Path], progress: Progress) -> tuple[list[BagStorage], list
     storages: list[BagStorage] = []
     problems: list[CorruptRegion] = []
     total, done = sum(_file_size(file) for file in files), 0
+    budget = UnpackBudget(total)
 
     def report(count: int) -> None:
         nonlocal done
@@ -274,7 +272,7 @@ def _open(files: list[Path], progress: Progress) -> tuple[list[BagStorage], list
 
     for file in files:
         try:
-            storages.append(SqliteFile(file, report) if file.suffix == ".db3" else McapFile(file, report))
+            storages.append(SqliteFile(file, report) if file.suffix == ".db3" else McapFile(file, budget, report))
         except BagError as error:
             if len(files) == 1:
                 raise

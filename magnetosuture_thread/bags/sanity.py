@@ -83,7 +83,7 @@ class SanityCheck:
             return None
         connection = item.connection
         return RecordedMessage(
-            connection.topic, connection.type_name, item.time, data, connection.definition, self._bag.parsing
+            connection.topic, connection.type_name, item.time, data, connection.definition, self._bag.decoders
         )
 
 

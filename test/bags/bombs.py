@@ -100,6 +100,63 @@ def chunks_of_definitions(path: Path, chunks: int, each: int, size: int) -> Path
     return path
 
 
+def lone_records(path: Path, *parts: bytes, tail: bytes = b"") -> Path:
+    """Write an mcap file with a message, after further records, and before what is no part of it."""
+    write_mcap(path, texts(1), {"/text": STRING})
+    data = path.read_bytes()
+    first = struct.unpack_from("<Q", data, 9)[0] + 17  # where the header ends
+    path.write_bytes(data[:first] + b"".join(parts) + data[first:] + tail)
+    return path
+
+
+def encoded(*records: mcap_records.McapRecord) -> bytes:
+    """Return records as they are in a file."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return builder.end()
+
+
+def chunk(*records: mcap_records.McapRecord) -> bytes:
+    """Return a chunk with its checksum."""
+    data = encoded(*records)
+    return encoded(
+        mcap_records.Chunk("zstd", zstandard.ZstdCompressor().compress(data), 1, 1, zlib.crc32(data), len(data))
+    )
+
+
+def many_entries(count: int) -> dict[str, str]:
+    """Return entries of metadata, ten times as large in memory as in a file."""
+    return {f"{index:x}": "" for index in range(count)}
+
+
+def long_definition(number: int) -> str:
+    """Return a definition that takes nearly all the steps that one may, and differs from others."""
+    return f"int8 own{number}\n" + "".join(f"int8 a{index}\n" for index in range(9000))
+
+
+def split_bomb(folder: Path, count: int) -> Path:
+    """Write a bag in many files, each of which goes to the limits that a bag has."""
+    folder.mkdir()
+    for number in range(count):
+        chunk_bomb(folder / f"a_{number}.mcap", 60 << 20, 8)
+    return folder
+
+
+def all_at_once(path: Path) -> Path:
+    """Write an mcap file that goes to every limit that a bag has."""
+    chunk_bomb(path, 60 << 20, 7)
+    size = 31 + len(cdr(STRING, "a"))
+    message = struct.pack("<BQHIQQ", 5, size - 9, 1, 0, 1, 1) + cdr(STRING, "a")
+    data = path.read_bytes()
+    own = chunk_bomb(path, 190_000 * size, 1, message).read_bytes()
+    definitions = many_definitions(path, 20, long_definition).read_bytes()
+    end = encoded(mcap_records.DataEnd(0), mcap_records.Footer(0, 0, 0)) + data[:8]
+    first = struct.unpack_from("<Q", own, 9)[0] + 17
+    path.write_bytes(data[: -len(end)] + own[first : -len(end)] + definitions[first:])
+    return path
+
+
 def metadata_bomb(folder: Path, text: str) -> Path:
     """Write a bag whose metadata.yaml is a bomb."""
     folder.mkdir()
@@ -175,9 +232,27 @@ BOMBS: dict[str, Callable[[Path], Path]] = {
         "ros2idl",
     ),
     "idl_brackets": lambda p: definition_bomb(p / "a.mcap", idl("(" * 300 + "1" + ")" * 300), "ros2idl"),
-    "many_definitions": lambda p: many_definitions(
-        p / "a.mcap", 40, lambda n: f"int8 own{n}\n" + "".join(f"int8 a{k}\n" for k in range(9000))
+    "many_definitions": lambda p: many_definitions(p / "a.mcap", 40, long_definition),
+    "entries_of_channels": lambda p: lone_records(
+        p / "a.mcap",
+        *(chunk(mcap_records.Channel(2 + n, f"/t{n}", "cdr", many_entries(180_000), 0)) for n in range(16)),
     ),
+    "entries_of_metadata": lambda p: lone_records(
+        p / "a.mcap", *(encoded(mcap_records.Metadata(f"m{n}", many_entries(180_000))) for n in range(10))
+    ),
+    "one_large_definition": lambda p: lone_records(
+        p / "a.mcap", chunk(mcap_records.Channel(2, "/t", "cdr", many_entries(4_000_000), 0))
+    ),
+    "lone_records": lambda p: lone_records(p / "a.mcap", struct.pack("<BQ", 0x80, 0) * 1_000_000),
+    "footers": lambda p: lone_records(
+        p / "a.mcap", tail=(encoded(mcap_records.Footer(8, 0, 1)) + b"\x89MCAP0\r\n") * 27_000 + b"x"
+    ),
+    "wide_chunks": lambda p: lone_records(
+        p / "a.mcap",
+        *(chunk(*(mcap_records.Message(c, 1, b"", 1, 0) for c in (*range(60_000), 61_000 + n))) for n in range(20)),
+    ),
+    "split": lambda p: split_bomb(p / "bag", 40),
+    "all_at_once": lambda p: all_at_once(p / "a.mcap"),
     "chunks_of_definitions": lambda p: chunks_of_definitions(p / "a.mcap", 40, 60_000, 0),
     "chunks_of_large_definitions": lambda p: chunks_of_definitions(p / "a.mcap", 40, 100, 100_000),
     "chunk_of_zeros": lambda p: chunk_bomb(p / "a.mcap", 1 << 30),

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.bags.message_types import MessageDecoder
+from magnetosuture_thread.bags.message_types import DecoderCache, own_definition
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.errors import BagError
-from test.bags.bags import read, texts
-from test.bags.bombs import ALIASES, BOMBS, cyclic_database, metadata_bomb
+from test.bags.bags import STRING, cdr, read, texts
+from test.bags.bombs import ALIASES, BOMBS, cyclic_database, long_definition, metadata_bomb
 
 MAX_MEGABYTES, MAX_SECONDS = 300, 5.0
 # Processor time, which other work on the machine does not change. VmHWM, as the greatest memory by getrusage begins
@@ -58,10 +58,19 @@ def test_no_bomb_takes_more_than_it_may(tmp_path: Path):
     ],
 )
 def test_a_definition_past_its_budget_says_so_when_a_message_is_decoded(text: str, encoding: str, problem: str):
-    decoder = MessageDecoder(MessageDefinition("nav_msgs/msg/Path", encoding, text))
+    decoder = DecoderCache().decoder_of(MessageDefinition("nav_msgs/msg/Path", encoding, text))
     assert not decoder.is_ours
     with pytest.raises(BagError, match=problem):
         decoder.decode("/path", b"\0\1\0\0")
+
+
+def test_the_definitions_of_one_bag_do_not_use_up_the_budget_of_another():
+    hostile, sound = DecoderCache(), DecoderCache()
+    for number in range(5):
+        hostile.decoder_of(MessageDefinition(f"pkg/msg/T{number}", "ros2msg", long_definition(number)))
+    string = own_definition(STRING)
+    assert "a definition past the 100000 steps" in hostile.decoder_of(string).problem
+    assert sound.decoder_of(string).decode("/text", cdr(STRING, "a")).data == "a"
 
 
 def test_metadata_past_its_budget_is_not_used_and_said(tmp_path: Path):

@@ -26,7 +26,7 @@ from magnetosuture_thread.bags.mcap.scan import Block, Scanner
 from magnetosuture_thread.bags.mcap.summary import read_summary
 from magnetosuture_thread.bags.storage import StoredMessage, merge_by_time, pluralize
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, BudgetError
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, BudgetError, UnpackBudget
 
 ROSBAG2 = "rosbag2"  # the metadata record in which rosbag2 keeps a copy of metadata.yaml
 
@@ -36,21 +36,22 @@ class McapFile:
 
     Args:
         path: the file.
+        budget: of the bag.
         progress: called with the number of bytes scanned since the last call.
 
     Raises:
         BagError: it cannot be read, is empty, or is no mcap file.
     """
 
-    def __init__(self, path: Path, progress: Callable[[int], None] = lambda count: None) -> None:
+    def __init__(self, path: Path, budget: UnpackBudget, progress: Callable[[int], None] = lambda count: None) -> None:
         self.path = path
         try:
             with path.open("rb") as stream:
                 size = stream.seek(0, 2)
                 if not size:
                     raise BagError(path, "is empty, expected an mcap file")
-                summary = read_summary(stream, size)
-                scan = Scanner(path, stream, size, summary, progress).scan()
+                summary = read_summary(stream, size, budget)
+                scan = Scanner(path, stream, size, summary, budget, progress).scan()
                 stream.seek(0)
                 if stream.read(len(MAGIC)) != MAGIC and not scan.blocks and summary is None:
                     raise BagError(path, "is no mcap file")
@@ -68,7 +69,7 @@ class McapFile:
         self.unverified = ""
         self.profile, self.library = scan.profile, scan.library
         used = set(self.counts)
-        self._blocks = [block for block in salvaged.blocks if block.channels & used]
+        self._blocks = [block for block in salvaged.blocks if block.holds(used)]
         self.start = min((block.start for block in self._blocks), default=0)
         self.end = max((block.end for block in self._blocks), default=0)
         self._blocks.sort(key=lambda block: block.start)
@@ -95,7 +96,7 @@ class McapFile:
                 yield from merge_by_time(
                     (block.start, partial(self._read_block, stream, block, wanted, start, end))
                     for block in self._blocks
-                    if block.start <= end and block.end >= start and block.channels & wanted
+                    if block.start <= end and block.end >= start and block.holds(wanted)
                 )
         except OSError as error:
             raise BagError(self.path, f"cannot be read: {error.strerror or error}") from None

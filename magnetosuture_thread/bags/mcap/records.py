@@ -22,7 +22,7 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, MAX_BLOCK_RECORDS, UnpackBudget
+from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, MAX_BLOCK_RECORDS, MAX_RECORD_BYTES, UnpackBudget
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
 RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of the content
@@ -67,13 +67,14 @@ def parse_record(opcode: int, body: bytes) -> Any:
     """Return a record of the package `mcap`, or None where its content is not needed.
 
     Raises:
-        CorruptRecordError: the bytes are no such record.
+        CorruptRecordError: the bytes are no such record, or more than one may have.
     """
     reader = _READERS.get(opcode)
     if reader is None:
         return None
+    name = _name(opcode)
+    _check_length(opcode, len(body))
     stream = ReadDataStream(BytesIO(body))
-    name = Opcode(opcode).name.lower().replace("_", " ")
     try:
         record = reader(stream)
     except (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError):
@@ -81,6 +82,16 @@ def parse_record(opcode: int, body: bytes) -> Any:
     if stream.count != len(body):
         raise CorruptRecordError(f"a {name} of a wrong length")
     return record
+
+
+def _name(opcode: int) -> str:
+    return Opcode(opcode).name.lower().replace("_", " ")
+
+
+def _check_length(opcode: int, length: int) -> None:
+    """Check the length of a record that is parsed as a whole, before it is copied."""
+    if opcode in _READERS and length > MAX_RECORD_BYTES:
+        raise CorruptRecordError(f"a {_name(opcode)} of {length} bytes, more than {MAX_RECORD_BYTES}")
 
 
 def parse_attachment(body: bytes) -> tuple[mcap_records.Attachment | None, bool]:
@@ -100,7 +111,7 @@ def iterate_records(content: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of the body of each record of a chunk.
 
     Raises:
-        CorruptRecordError: the records do not fill the chunk exactly.
+        CorruptRecordError: the records do not fill the chunk exactly, or one is longer than it may be.
     """
     position, size, count = 0, len(content), 0
     while position < size:
@@ -114,6 +125,7 @@ def iterate_records(content: bytes) -> Iterator[tuple[int, int, int]]:
         position = start + length
         if position > size or not opcode or (opcode == Opcode.MESSAGE and length < MESSAGE_HEADER.size):
             raise CorruptRecordError("a chunk with a corrupt record")
+        _check_length(opcode, length)
         yield opcode, start, position
 
 

@@ -8,6 +8,7 @@ that agrees with the messages. In a file with any other damage it is not used.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -60,9 +61,9 @@ def salvage(
     blocks, counts, unchecked = match.blocks, Counter(scan.counts), Counter(scan.unchecked_counts)
     for block in match.unindexed:
         unindexed = count_messages(block)
-        counts -= unindexed
+        counts.subtract(unindexed)
         if not block.has_checksum:
-            unchecked -= unindexed
+            unchecked.subtract(unindexed)
     trailing = []
     if summary is not None and summary.trailing_bytes:
         trailing = [CorruptRegion(name, size - summary.trailing_bytes, size, "bytes after its end")]
@@ -86,8 +87,13 @@ def salvage(
         what = f"{pluralize(known - sum(counts.values()), 'message')} without a checksum, which may be wrong"
         regions.append(CorruptRegion(name, loose[0].offset, loose[-1].offset + loose[-1].length, what))
     connections = _merge_channels(scan, trusted, verified).connections()
-    for channel in sorted(set(+counts) - set(connections)):
-        block = next(block for block in blocks if channel in block.channels)
+    undefined = set(+counts) - set(connections)
+    first_blocks = {
+        channel: block
+        for block in reversed(blocks if undefined else [])
+        for channel in undefined.intersection(block.channel_numbers())
+    }
+    for channel, block in sorted(first_blocks.items()):
         what = (
             f"{pluralize(counts.pop(channel), 'message')} of a channel without a definition, or with conflicting ones"
         )
@@ -189,22 +195,28 @@ def _match_chunks(blocks: list[Block], trusted: McapSummary) -> _IndexMatch:
 def _corrupt_regions(name: str, scan: ScanResult, match: _IndexMatch) -> list[CorruptRegion]:
     """Return the corrupt regions, with the times between which messages are missing."""
     regions = list(scan.corrupt)
-    missing = list(match.missing)
+    missing = sorted(match.missing, key=_offset)
     for index, region in enumerate(regions):
-        inside = [c for c in missing if match.in_place and region.start <= c.offset < region.end]
-        if inside:
-            missing = [c for c in missing if c not in inside]
-            first = min(chunk.start for chunk in inside)
-            regions[index] = replace(region, first=first, last=max(chunk.end for chunk in inside))
+        first, last = (bisect_left(missing, end, key=_offset) for end in (region.start, region.end))
+        if match.in_place and first < last:
+            inside = missing[first:last]
+            del missing[first:last]
+            start = min(chunk.start for chunk in inside)
+            regions[index] = replace(region, first=start, last=max(chunk.end for chunk in inside))
         else:
-            following = (block.start for block in match.blocks if block.offset >= region.end)
-            regions[index] = replace(region, last=next(following, None))
+            following = bisect_left(match.blocks, region.end, key=_offset)
+            after = match.blocks[following].start if following < len(match.blocks) else None
+            regions[index] = replace(region, last=after)
     if not match.in_place and regions:
         return regions  # the chunks are missing there; in which region is unknown
     return regions + [
         CorruptRegion(name, chunk.offset, chunk.offset + chunk.length, "a chunk is missing", chunk.start, chunk.end)
         for chunk in missing
     ]
+
+
+def _offset(part: Block | IndexedChunk) -> int:
+    return part.offset
 
 
 def _truncated(name: str, size: int, scan: ScanResult, regions: list[CorruptRegion]) -> list[CorruptRegion]:

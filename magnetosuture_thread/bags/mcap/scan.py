@@ -7,9 +7,11 @@ the checksum of the summary is correct, else where the next chunk with a correct
 from __future__ import annotations
 
 import zlib
+from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -33,11 +35,10 @@ from magnetosuture_thread.bags.mcap.records import (
 )
 from magnetosuture_thread.bags.mcap.summary import ChannelTable, McapSummary
 from magnetosuture_thread.bags.storage import CorruptRegion
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
+from magnetosuture_thread.untrusted import LONE_RECORD, MAX_BLOCK_BYTES, UnpackBudget
 
 _SKIP_BYTES = 1 << 20  # read at a time where a record is skipped
 _RUN_BYTES = 1 << 20  # of messages outside of chunks in one block
-_NO_CHANNELS = frozenset[int]()
 
 
 class Block(NamedTuple):
@@ -52,7 +53,7 @@ class Block(NamedTuple):
         size: bytes of its records.
         start: time of its first message [ns].
         end: time of its last message [ns].
-        channels: channels with messages in it.
+        channels: channels with messages in it, 2 bytes each: a set of them takes thirty times as much.
     """
 
     offset: int
@@ -63,7 +64,15 @@ class Block(NamedTuple):
     size: int
     start: int
     end: int
-    channels: frozenset[int]
+    channels: bytes
+
+    def holds(self, channels: AbstractSet[int]) -> bool:
+        """Return whether it has messages of one of these channels."""
+        return not channels.isdisjoint(self.channel_numbers())
+
+    def channel_numbers(self) -> array[int]:
+        """Return the channels with messages in it."""
+        return array("H", self.channels)
 
 
 @dataclass
@@ -117,6 +126,7 @@ class Scanner:
         stream: the file, open.
         size: its length.
         summary: its summary, if it has one.
+        budget: of the bag.
         progress: called with the number of bytes scanned since the last call.
 
     Attributes:
@@ -124,16 +134,22 @@ class Scanner:
     """
 
     def __init__(
-        self, path: Path, stream: BinaryIO, size: int, summary: McapSummary | None, progress: Callable[[int], None]
+        self,
+        path: Path,
+        stream: BinaryIO,
+        size: int,
+        summary: McapSummary | None,
+        budget: UnpackBudget,
+        progress: Callable[[int], None],
     ) -> None:
         self.result = ScanResult()
         self._name = path.name
         self._stream = stream
         self._limit = summary.start if summary is not None else size
-        self._budget = UnpackBudget(size)
+        self._budget = budget
         self._progress = progress
         self._crc = 0
-        self._channel_sets = {_NO_CHANNELS: _NO_CHANNELS}
+        self._channel_sets: dict[bytes, bytes] = {}
         self._definitions: set[bytes] = set()  # hashes of those that were added
         self._offsets: list[int] = []  # of records, by the summary
         if summary is not None and summary.trusted and not summary.shifted:
@@ -154,11 +170,14 @@ class Scanner:
             position = self._skip_corrupt(0, "the magic bytes are missing")
         while position < self._limit and not self.result.ended:
             before = position
-            self._budget.spend(0, 1)
+            self._budget.spend(0, LONE_RECORD)
+            problem = ""
             try:
                 position = self._step(position)
-            except CorruptRecordError as problem:
-                position = self._skip_corrupt(position, str(problem))
+            except CorruptRecordError as error:
+                problem = str(error)  # not the error itself, which holds what was read so far
+            if problem:
+                position = self._skip_corrupt(position, problem)
             self._progress(position - before)
         self.result.stopped = position
         return self.result
@@ -186,6 +205,7 @@ class Scanner:
         elif opcode == Opcode.HEADER:
             self.result.profile, self.result.library = record.profile, record.library
         elif opcode == Opcode.METADATA:
+            self._budget.keep(length, len(record.metadata))
             self.result.metadata.append(record)
         elif opcode == Opcode.DATA_END:
             self.result.ended = True
@@ -226,9 +246,7 @@ class Scanner:
     def _scan_chunk(self, start: int, length: int, body: bytes) -> None:
         """Add a chunk that is intact."""
         content = decompress_chunk(body, self._budget)
-        self._add_block(
-            content.data, Block(start, length, True, content.has_checksum, content.crc, 0, 0, 0, _NO_CHANNELS)
-        )
+        self._add_block(content.data, Block(start, length, True, content.has_checksum, content.crc, 0, 0, 0, b""))
         self.result.compressions.add(content.compression)
 
     def _scan_loose_messages(self, position: int) -> int:
@@ -250,7 +268,7 @@ class Scanner:
             after += RECORD_HEADER.size + length
         data = self._read(position, after - position)
         self._crc = zlib.crc32(data, self._crc)
-        self._add_block(data, Block(position, len(data), False, False, zlib.crc32(data), 0, 0, 0, _NO_CHANNELS))
+        self._add_block(data, Block(position, len(data), False, False, zlib.crc32(data), 0, 0, 0, b""))
         return after
 
     def _add_block(self, data: bytes, block: Block) -> None:
@@ -266,23 +284,25 @@ class Scanner:
                 first, last = (min(first, time), max(last, time)) if counts else (time, time)
                 counts[channel] += 1
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                definitions.append((opcode, data[start:end]))
+                definitions.append((opcode, start, end))
         self._budget.spend(0, records)
-        for opcode, body in definitions:
-            self._add_definition(opcode, body, checked=block.has_checksum)
-        channels = self._channel_sets.setdefault(frozenset(counts), frozenset(counts))
+        for opcode, start, end in definitions:
+            self._add_definition(opcode, data[start:end], checked=block.has_checksum)
+        channels = array("H", sorted(counts)).tobytes()
+        channels = self._channel_sets.setdefault(channels, channels)
         self.result.blocks.append(block._replace(size=len(data), start=first, end=last, channels=channels))
-        self.result.counts += counts
+        self.result.counts.update(counts)
         if not block.has_checksum:
-            self.result.unchecked_counts += counts
+            self.result.unchecked_counts.update(counts)
 
     def _add_definition(self, opcode: int, body: bytes, *, checked: bool) -> None:
         """Add a channel or schema; our own writer repeats them in every chunk."""
         key = blake2b(bytes([opcode, checked]) + body, digest_size=16).digest()
         if key not in self._definitions:
-            self._budget.define(len(body))
+            record = parse_record(opcode, body)
+            self._budget.keep(len(body), len(getattr(record, "metadata", ())))
             table = self.result.checked_channels if checked else self.result.unchecked_channels
-            table.add(parse_record(opcode, body))
+            table.add(record)
             self._definitions.add(key)
 
     def _skip_corrupt(self, position: int, what: str) -> int:

@@ -23,7 +23,7 @@ from magnetosuture_thread.bags.mcap.records import (
     parse_record,
 )
 from magnetosuture_thread.bags.storage import Connection, MessageDefinition
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
+from magnetosuture_thread.untrusted import LONE_RECORD, MAX_BLOCK_BYTES, UnpackBudget
 
 
 @dataclass
@@ -120,7 +120,7 @@ class McapSummary:
     statistics: Statistics | None = None
 
 
-def read_summary(stream: BinaryIO, size: int) -> McapSummary | None:
+def read_summary(stream: BinaryIO, size: int, budget: UnpackBudget) -> McapSummary | None:
     """Return the summary of a file; None where there is none with a correct checksum.
 
     One without a checksum is accepted if it is at the offset in the footer and consists of valid records.
@@ -128,6 +128,10 @@ def read_summary(stream: BinaryIO, size: int) -> McapSummary | None:
     Args:
         stream: the file.
         size: its length.
+        budget: of the bag: what looks like a footer may be there a thousand times.
+
+    Raises:
+        BudgetError: there is too much to search, or too much in it.
     """
     begin = max(0, size - _TAIL_BYTES)
     stream.seek(max(begin, size - _FOOTER_BYTES))
@@ -136,7 +140,7 @@ def read_summary(stream: BinaryIO, size: int) -> McapSummary | None:
         start = _FOOTER.unpack_from(end, RECORD_HEADER.size)[0] or size - _FOOTER_BYTES
         if max(len(MAGIC), size - MAX_BLOCK_BYTES) <= start <= size - _FOOTER_BYTES:
             stream.seek(start)
-            found = _parse_summary(stream.read(size - len(MAGIC) - start), start, shifted=False)
+            found = _parse_summary(stream.read(size - len(MAGIC) - start), start, budget, shifted=False)
             if found is not None:
                 return found
     # Not there: bytes before it were removed or inserted, or bytes follow it.
@@ -146,7 +150,7 @@ def read_summary(stream: BinaryIO, size: int) -> McapSummary | None:
         stop = footer.end() - len(MAGIC)
         claimed = _FOOTER.unpack_from(tail, footer.start() + RECORD_HEADER.size)[0] or begin + footer.start()
         for start in _candidate_starts(tail, begin, footer.start(), claimed):
-            found = _parse_summary(tail[start - begin : stop], start, shifted=start != claimed)
+            found = _parse_summary(tail[start - begin : stop], start, budget, shifted=start != claimed)
             if found is not None and found.trusted:
                 found.trailing_bytes = size - begin - footer.end()
                 return found
@@ -161,16 +165,19 @@ def _candidate_starts(tail: bytes, begin: int, footer: int, claimed: int) -> Ite
     yield from (begin + end for end in reversed(ends[-16:]) if end <= footer)
 
 
-def _parse_summary(data: bytes, start: int, *, shifted: bool) -> McapSummary | None:
+def _parse_summary(data: bytes, start: int, budget: UnpackBudget, *, shifted: bool) -> McapSummary | None:
     """Return a summary, parsed together with its footer; None if it is invalid."""
+    budget.spend(len(data), LONE_RECORD)
     crc = _FOOTER.unpack_from(data, len(data) - _FOOTER.size)[2]
     if crc and zlib.crc32(data[:-4]) != crc:
         return None
     summary = McapSummary(start, start + len(data) - RECORD_HEADER.size - _FOOTER.size, bool(crc), shifted)
     try:
         for opcode, first, last in iterate_records(data):
+            budget.spend(0, 1)
             record = parse_record(opcode, data[first:last])
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                budget.keep(last - first, len(getattr(record, "metadata", ())))
                 summary.channels.add(record)
             elif opcode == Opcode.CHUNK_INDEX:
                 summary.chunks.append(

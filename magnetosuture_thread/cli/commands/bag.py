@@ -16,6 +16,7 @@ from magnetosuture_thread.cli.terminal import make_console, make_log, progress, 
 from magnetosuture_thread.texts import one_line
 
 MAX_NOTE_CHARS = 200  # of a note that are shown; one may hold a whole setup
+MAX_PLACES = 100  # of damage that are shown; `--json` writes all
 
 DESCRIPTION = """\
 Check a recorded bag, or repair it.
@@ -106,8 +107,11 @@ def run_repair(options: argparse.Namespace) -> int:
     if report.rewritten:
         topics = ", ".join(one_line(topic) for topic in sorted(set(report.rewritten)))
         log(f"quality of service written by name, as Jazzy reads it: {topics}")
-    for place in bag.damage.regions if bag.damage is not None else ():
+    places = bag.damage.regions if bag.damage is not None else ()
+    for place in places[:MAX_PLACES]:
         log(f"  {place}{_times(place.first, place.last, bag.start)}")
+    for line in _others(len(places)):
+        log(line)
     log(f"{report.messages} messages in {options.output}")
     return DONE
 
@@ -170,6 +174,14 @@ def _lines(found: dict[str, Any]) -> list[str]:
         is_sure = not (found["refused"] or found["unchecked"] or found["unverified"])
         return [*lines, "nothing is damaged"] if is_sure else lines
     lines.append(found["damage"]["text"])
-    for place in found["damage"]["places"]:
-        lines.append(f"  {place['file']}, bytes {place['start_byte']} to {place['end_byte']}: {place['what']}")
-    return lines
+    places = found["damage"]["places"]
+    lines += [
+        f"  {place['file']}, bytes {place['start_byte']} to {place['end_byte']}: {place['what']}"
+        for place in places[:MAX_PLACES]
+    ]
+    return [*lines, *_others(len(places))]
+
+
+def _others(count: int) -> list[str]:
+    """Return a line on the damaged places that are not shown, if there are any."""
+    return [f"  and {count - MAX_PLACES} other places"] if count > MAX_PLACES else []
