@@ -30,7 +30,7 @@ MAX_RECORD_BYTES = 1 << 22  # of a definition of a topic or type, or of another 
 MAX_KEPT_BYTES = 1 << 25  # of all different definitions and metadata records of a small bag, as they are in memory
 _RECORD_BYTES = 500  # that one of them takes in memory whatever its length
 _ENTRY_BYTES = 150  # that each of its entries takes besides
-LONE_RECORD = 20  # records in a chunk, which are read in the time of one outside of chunks
+LONE_RECORD = 10  # records in a chunk, which are read in the time of one outside of chunks
 
 
 class BudgetError(Exception):

@@ -7,12 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from mcap.writer import CompressionType
 
 from magnetosuture_thread.bags.message_types import DecoderCache, own_definition
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.errors import BagError
-from test.bags.bags import STRING, cdr, read, texts
+from test.bags.bags import STRING, cdr, read, texts, write_mcap
 from test.bags.bombs import ALIASES, BOMBS, cyclic_database, long_definition, metadata_bomb
 
 MAX_MEGABYTES, MAX_SECONDS = 300, 5.0
@@ -71,6 +72,16 @@ def test_the_definitions_of_one_bag_do_not_use_up_the_budget_of_another():
     string = own_definition(STRING)
     assert "a definition past the 100000 steps" in hostile.decoder_of(string).problem
     assert sound.decoder_of(string).decode("/text", cdr(STRING, "a")).data == "a"
+
+
+def test_small_chunks_of_many_topics_are_no_bomb(tmp_path: Path):
+    """Most of such a file are message indexes, a record for each topic of each chunk."""
+    topics = [f"/t{number}" for number in range(50)]
+    sent = [(topics[index % 50], 10**9 + index, cdr(STRING, "")) for index in range(40_000)]
+    options = {"chunk_size": 50 * 40, "compression": CompressionType.ZSTD}
+    bag = Bag(write_mcap(tmp_path / "a.mcap", sent, dict.fromkeys(topics, STRING), **options))
+    assert bag.damage is None
+    assert sum(bag.counts.values()) == len(sent)
 
 
 def test_metadata_past_its_budget_is_not_used_and_said(tmp_path: Path):

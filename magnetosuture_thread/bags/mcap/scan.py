@@ -38,6 +38,7 @@ from magnetosuture_thread.bags.storage import CorruptRegion
 from magnetosuture_thread.untrusted import LONE_RECORD, MAX_BLOCK_BYTES, UnpackBudget
 
 _SKIP_BYTES = 1 << 20  # read at a time where a record is skipped
+_EMPTY_INDEX = 6  # bytes of a message index without entries: channel and length
 _RUN_BYTES = 1 << 20  # of messages outside of chunks in one block
 
 
@@ -170,13 +171,13 @@ class Scanner:
             position = self._skip_corrupt(0, "the magic bytes are missing")
         while position < self._limit and not self.result.ended:
             before = position
-            self._budget.spend(0, LONE_RECORD)
             problem = ""
             try:
                 position = self._step(position)
             except CorruptRecordError as error:
                 problem = str(error)  # not the error itself, which holds what was read so far
             if problem:
+                self._budget.spend(0, LONE_RECORD)
                 position = self._skip_corrupt(position, problem)
             self._progress(position - before)
         self.result.stopped = position
@@ -187,6 +188,9 @@ class Scanner:
         opcode, length = self._read_header(position)
         start = position + RECORD_HEADER.size
         after = start + length
+        # An index comes with a message of its chunk: small chunks of many topics are mostly such indexes.
+        has_entries = opcode == Opcode.MESSAGE_INDEX and length > _EMPTY_INDEX
+        self._budget.spend(0, 1 if has_entries else LONE_RECORD)
         if opcode == Opcode.MESSAGE:
             return self._scan_loose_messages(position)
         if opcode in (Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX) or opcode >= MIN_PRIVATE_OPCODE:
@@ -231,7 +235,7 @@ class Scanner:
         if opcode == Opcode.MESSAGE_INDEX:
             # Its content is redundant, but the opcode of a chunk may have been corrupted to this one.
             entries = int.from_bytes(self._read(start + 2, 4), "little")
-            if entries + 6 != length or entries % 16:
+            if entries + _EMPTY_INDEX != length or entries % 16:
                 raise CorruptRecordError("a corrupt message index")
         if start + length < self._limit:
             self._read_header(start + length)
