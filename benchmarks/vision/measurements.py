@@ -18,7 +18,7 @@ from benchmarks.vision.frames import DISH_RADIUS, Case, Image, dense, render
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
-from magnetosuture_thread.vision.look import State, Track
+from magnetosuture_thread.vision.look import Track
 from magnetosuture_thread.vision.session import published_centreline
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -134,7 +134,7 @@ def compare(case: Case, track: Track, seconds: float) -> Result:
     """Compare what was tracked with the ground truth."""
     seen = case.visible_thread()
     visible = _step(seen, case) * len(seen)
-    if track.state is not State.TRACKED:
+    if not len(track.tail):
         return Result(False, False, 0.0, 0.0, True, visible, 0.0, 0.0, 0.0, seconds, track.reason)
     off = np.append(track.tail - case.needle.tail, 0.0)
     turned = math.atan2(track.heading[1], track.heading[0]) - case.needle.heading

@@ -5,6 +5,7 @@ Of bytes, what is not laid out as these readers expect is left to whoever decode
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import Any, Protocol
 
@@ -26,6 +27,7 @@ _MAX_NAME = 256  # bytes of the names of frames that are passed over in a path
 _POSE_AT, _COUNT_AT = aligned(DISH_END, 8), aligned(DISH_END, 4)
 _PATH_AT = _COUNT_AT + _COUNT.size
 _NAME_AT = _PATH_AT + 8  # the length of the frame's name in a path's first pose
+MAX_HEADING_DEVIATION = 1.0  # rad; beyond, it is unknown which end of the needle is the tail
 _STAMP = f"{NEEDLE_POSE.name}.header.stamp"
 _ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
 
@@ -64,13 +66,17 @@ def needle_pose(message: Any) -> NeedlePose:
     """Return the needle's pose in the plane, of a PoseWithCovarianceStamped.
 
     Raises:
-        InvalidInputError: wrong frame, no stamp, or no unit quaternion.
+        InvalidInputError: wrong frame, no stamp, no unit quaternion, or a heading that is unknown by its covariance.
     """
     require_dish_frame(message.header.frame_id, NEEDLE_POSE.name)
     stamp = message.header.stamp
     checked_nanoseconds(stamp, _STAMP)  # the prediction could not be stamped by another
     position, q = message.pose.pose.position, message.pose.pose.orientation
     heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
+    variance = float(message.pose.covariance[-1])
+    if variance > MAX_HEADING_DEVIATION**2:
+        expected = f"a standard deviation of at most {MAX_HEADING_DEVIATION:g} rad: the heading is unknown"
+        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected)
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
 
 

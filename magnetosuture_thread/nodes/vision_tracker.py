@@ -127,10 +127,11 @@ class VisionTrackerNode(PackageNode):
             seen = self._session.on_image(reading.seconds(stamp), image)
             taken = time.perf_counter() - began
         track = seen.track
-        if seen.tracked:
+        when = stamp.sec, stamp.nanosec
+        if len(track.tail):  # also with a heading that is unknown, which those who need it refuse
             # The pose first: the prediction waits for it, and all else can wait.
-            when = stamp.sec, stamp.nanosec
             self._poses.publish(packed_pose(when, track.tail, track.heading, track.covariance))
+        if seen.tracked:
             for follower in self._followers:
                 follower.on_tracked(stamp, track.tail, track.heading)
             if len(seen.centreline):

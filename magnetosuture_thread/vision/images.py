@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,92 +21,144 @@ GLARE = 1.07  # of the floor's brightness: above, a pixel shows the lamp
 
 
 @dataclass(frozen=True)
+class Layer:
+    """What is measured on.
+
+    Attributes:
+        pixels: shape (rows, columns), uint8.
+        small: the same, shrunk by area.
+        floor: how bright what is behind all slender things is, in the pixels of `small`.
+    """
+
+    pixels: np.ndarray
+    small: np.ndarray
+    floor: np.ndarray
+
+    def replaced(self, pixels: np.ndarray) -> Layer:
+        """Return the channel with other pixels."""
+        return replace(self, pixels=pixels)
+
+
+@dataclass(frozen=True)
 class Picture:
     """A frame or a part of it, made ready to measure on.
 
     Attributes:
-        gray: the measured channel, shape (rows, columns), uint8.
+        brightest: the greatest of the three colours of each pixel. Steel is dark in all of them, a coloured thread in
+            some only.
+        darkest: the least of them. A thread of any colour is dark in one.
         factor: how much smaller `small` is.
-        small: the same, shrunk by area.
-        floor: brightness of what is behind all slender things, in the pixels of `small`.
         origin: (u, v) of the first pixel in the whole frame.
         mask: where the scene's shapes are; None if it has none.
     """
 
-    gray: np.ndarray
+    brightest: Layer
+    darkest: Layer
     factor: int
-    small: np.ndarray
-    floor: np.ndarray
     origin: tuple[int, int] = (0, 0)
     mask: SceneMask | None = None
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        rows, columns = self.brightest.pixels.shape
+        return rows, columns
 
-def prepare(gray: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), mask: SceneMask | None = None) -> Picture:
-    """Shrink a grey image and estimate the floor behind what lies on it.
 
-    The floor is the median over a window that all slender things fill by less than half, so that light
-    that changes over the dish doesn't matter. What a shape of the scene covers shows no floor.
+def prepare(image: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), mask: SceneMask | None = None) -> Picture:
+    """Make an image ready to measure on, shape (rows, columns) or (rows, columns, 3) in BGR order, uint8."""
+    if image.ndim == 2:
+        # Copied where need be: compiled code is compiled once more for each other layout of memory.
+        both = _channel(np.ascontiguousarray(image), factor, mask)
+        return Picture(both, both, factor, origin, mask)
+    one, two, three = cv2.split(image)
+    brightest = _channel(np.asarray(cv2.max(cv2.max(one, two), three)), factor, mask)
+    darkest = _channel(np.asarray(cv2.min(cv2.min(one, two), three)), factor, mask)
+    return Picture(brightest, darkest, factor, origin, mask)
+
+
+def _channel(pixels: np.ndarray, factor: int, mask: SceneMask | None) -> Layer:
+    """Shrink an image and estimate the floor behind what lies on it.
+
+    The floor is the median over a window that all slender things fill by less than half, so that light that changes
+    over the dish doesn't matter. What a shape of the scene covers shows no floor.
     """
-    small = gray
+    small = pixels
     if factor > 1:
-        small = cv2.resize(gray, None, fx=1.0 / factor, fy=1.0 / factor, interpolation=cv2.INTER_AREA)
-    cells = (max(2, gray.shape[1] // FLOOR_FACTOR), max(2, gray.shape[0] // FLOOR_FACTOR))
+        small = cv2.resize(pixels, None, fx=1.0 / factor, fy=1.0 / factor, interpolation=cv2.INTER_AREA)
+    cells = (max(2, pixels.shape[1] // FLOOR_FACTOR), max(2, pixels.shape[0] // FLOOR_FACTOR))
     rough = cv2.resize(small, cells, interpolation=cv2.INTER_AREA)
     if mask is not None:
         rough = mask.show_floor(rough)
     rough = cv2.medianBlur(rough, FLOOR_CELLS)
-    floor = cv2.resize(rough, small.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return Picture(gray, factor, small, floor, origin, mask)
+    return Layer(pixels, small, cv2.resize(rough, small.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
-def without_wall(
-    gray: np.ndarray,
-    picture: Picture,
-    centre: tuple[float, float],
-    radius: float,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:
-    """Return a frame in which all beyond a circle has the floor's brightness within a box.
+@dataclass(frozen=True)
+class Wall:
+    """The dish's wall in a picture.
+
+    Attributes:
+        centre: of the dish (u, v) [px].
+        radius: of the dish [px].
+    """
+
+    centre: tuple[float, float]
+    radius: float
+
+    def distances(self, box: tuple[slice, slice]) -> np.ndarray:
+        """Return how far the pixels of some rows and columns are from the centre [px]."""
+        rows, columns = np.ogrid[box]
+        return np.asarray(np.hypot(columns - self.centre[0], rows - self.centre[1]), dtype=np.float32)
+
+    def floor(self, channel: Layer, factor: int, box: tuple[slice, slice]) -> np.ndarray:
+        """Return how bright the floor is in some rows and columns, `FLOOR_DEPTH_PX` inside of the wall and beyond.
+
+        There the floor of a channel is mixed with the rim. What is farther out has the brightness of the place on
+        the way to the centre that is so far inside.
+        """
+        rows, columns = np.ogrid[box]
+        shrink = np.minimum(1.0, (self.radius - FLOOR_DEPTH_PX) / np.maximum(self.distances(box), 1.0))
+        shift = 0.5 * (factor - 1)
+        at_u, at_v = (
+            ((shrink * (place - middle) + middle - shift) / factor).astype(np.float32)
+            for place, middle in zip((columns, rows), self.centre, strict=True)
+        )
+        floor = cv2.remap(channel.floor, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(floor)
+
+
+def without_wall(channel: Layer, factor: int, wall: Wall, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return a channel's pixels in which all beyond the wall has the floor's brightness within a box.
 
     What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
 
     Args:
-        gray: the frame, shape (rows, columns), uint8.
-        picture: with the floor of it.
-        centre: of the circle (u, v) [px].
-        radius: of the circle [px].
+        channel: of the frame.
+        factor: how much smaller its floor is.
+        wall: of the dish.
         low: least u and v of the box [px].
         high: greatest u and v [px].
 
     Returns:
-        A copy, or the frame itself where nothing of the box is beyond.
+        A copy, or the pixels themselves where nothing of the box is beyond.
     """
-    rows, columns = gray.shape
+    rows, columns = channel.pixels.shape
     left, top = (max(0, int(value)) for value in low)
     right, bottom = min(columns, int(high[0]) + 1), min(rows, int(high[1]) + 1)
-    across, down = np.arange(left, right) - centre[0], np.arange(top, bottom) - centre[1]
-    distance = np.hypot(across[None, :], down[:, None]).astype(np.float32)
-    beyond = distance > radius
+    box = slice(top, bottom), slice(left, right)
+    beyond = wall.distances(box) > wall.radius
     if not beyond.any():
-        return gray
-    # Along the ray from the centre, where there is floor.
-    shrink = np.minimum(1.0, (radius - FLOOR_DEPTH_PX) / np.maximum(distance, 1.0))
-    shift = 0.5 * (picture.factor - 1)
-    at_u, at_v = (
-        ((shrink * offset + middle - shift) / picture.factor).astype(np.float32)
-        for offset, middle in zip((across[None, :], down[:, None]), centre, strict=True)
-    )
-    floor = cv2.remap(picture.floor, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    result = gray.copy()
-    np.copyto(result[top:bottom, left:right], floor, where=beyond)
+        return channel.pixels
+    result = channel.pixels.copy()
+    np.copyto(result[box], wall.floor(channel, factor, box), where=beyond)
     return result
 
 
 def glare_mask(picture: Picture) -> np.ndarray:
     """Return where the lamp is reflected, in the pixels of `small`, uint8: 255 there."""
-    bound = cv2.convertScaleAbs(picture.floor, alpha=GLARE, beta=2.0)
-    return cv2.compare(cv2.medianBlur(picture.small, 3), bound, cv2.CMP_GT)
+    bound = cv2.convertScaleAbs(picture.brightest.floor, alpha=GLARE, beta=2.0)
+    return cv2.compare(cv2.medianBlur(picture.brightest.small, 3), bound, cv2.CMP_GT)
 
 
 def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:

@@ -9,15 +9,19 @@ from enum import Enum
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.find import find_dish
-from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, prepare
+from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
+from magnetosuture_thread.vision.thread.loose import has_loose_thread
 
+UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
+MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
@@ -38,13 +42,15 @@ class Track:
     Attributes:
         state: TRACKED when there is a pose; LOST when this frame gives none; SEARCHING while the needle is
             found anew, or seen but not yet often enough.
-        reason: why there is no pose; empty when tracked.
+        reason: why there is no pose, or why its heading is unknown; empty when tracked.
         confidence: of the pose, 0 to 1; 0 without one.
         tail: the needle's blunt end, shape (2,) [m]; empty without a pose.
         tip: its point, shape (2,) [m]; empty without a pose.
         heading: unit tangent at the tail, towards the tip, shape (2,); empty without a pose.
         curvature: of the needle's axis, positive to the left of the heading [1/m]; 0 without a pose.
-        covariance: of (x, y, heading angle), shape (3, 3) [m, m, rad]; empty without a pose.
+        covariance: of (x, y, heading angle), shape (3, 3) [m, m, rad]; empty without a pose. Where nothing tells which
+            end is the tail, the state is not TRACKED, the variance of the angle is pi^2, and that along the needle its
+            length squared.
         centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
         view: where the dish is in the image; None when it is not found.
     """
@@ -83,7 +89,7 @@ def find_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float
 
 
 def picture_of(
-    gray: np.ndarray,
+    image: np.ndarray,
     view: DishView,
     settings: VisionTrackerSettings,
     mask: SceneMask | None,
@@ -92,17 +98,16 @@ def picture_of(
     """Make a frame ready to measure on, or the part of it in a box (left, top, right, bottom) [px]."""
     factor = search_factor(settings.needle_width / view.metres_per_pixel)
     if box is None:
-        return prepare(gray, factor, mask=mask)
+        return prepare(image, factor, mask=mask)
     left, top, right, bottom = box
     part = mask.part(left, top, right, bottom) if mask is not None else None
-    # Copied: compiled code is compiled once more for each other layout of memory.
-    return prepare(np.ascontiguousarray(gray[top:bottom, left:right]), factor, (left, top), part)
+    return prepare(image[top:bottom, left:right], factor, (left, top), part)
 
 
-def mask_of(gray: np.ndarray, view: DishView, settings: VisionTrackerSettings, scene: Scene) -> SceneMask | None:
+def mask_of(image: np.ndarray, view: DishView, settings: VisionTrackerSettings, scene: Scene) -> SceneMask | None:
     """Return where the shapes of a scene are in a frame; None if it has none."""
     factor = search_factor(settings.needle_width / view.metres_per_pixel)
-    return scene_mask(scene, view, gray.shape, factor, settings.outline_tolerance, FLOOR_FACTOR)
+    return scene_mask(scene, view, image.shape[:2], factor, settings.outline_tolerance, FLOOR_FACTOR)
 
 
 def needles_in(
@@ -122,21 +127,67 @@ def why_none(refused: list[str]) -> str:
     return "no needle in the dish" + (f"; dark things: {', '.join(refused)}" if refused else "")
 
 
-def tracked(
+def with_thread(
+    picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needles: list[MeasuredNeedle]
+) -> tuple[MeasuredNeedle | None, np.ndarray, str]:
+    """Choose the needle that a thread leaves.
+
+    Args:
+        picture: the frame or a part of it.
+        view: of the dish.
+        settings: what to look for.
+        diameter: of the dish [m].
+        needles: that were found, at least one.
+
+    Returns:
+        The needle, the thread's centreline in the picture's pixels, and why there is none where there is none.
+    """
+    walks = [centreline_of(picture, view, settings, diameter, needle) for needle in needles]
+    lengths = [float(arc_lengths(walk)[-1]) for walk in walks]
+    best = int(np.argmax(lengths))
+    thread = settings.thread_length / view.metres_per_pixel
+    needed = MIN_FOLLOWED * thread
+    if lengths[best] >= needed and sum(length >= needed for length in lengths) == 1:
+        return needles[best], walks[best], ""
+    if len(needles) > 1:
+        return None, walks[best], f"{len(needles)} needles in the dish"
+    wall = Wall(_local(view, picture).centre_px, 0.5 * diameter / view.metres_per_pixel)
+    if needles[0].heading_known and has_loose_thread(picture, needles[0], wall, MIN_LOOSE * thread):
+        return None, walks[0], "a needle that no thread leaves, and a thread beside it"
+    return needles[0], walks[0], ""
+
+
+def centreline_of(
     picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needle: MeasuredNeedle
-) -> Track:
-    """Return what a frame shows whose needle is known, in the picture's own pixels, with the thread's centreline."""
-    local = _local(view, picture)
+) -> np.ndarray:
+    """Return the thread's centreline from a needle's tail on, in the picture's pixels; one point if none is seen."""
+    if not needle.heading_known:
+        return needle.tail_px[None]
     wall = 0.5 * diameter / view.metres_per_pixel
     max_length = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
-    walk = find_centreline(picture, needle, max_length, local.centre_px, wall)
+    return find_centreline(picture, needle, max_length, _local(view, picture).centre_px, wall)
+
+
+def tracked(
+    picture: Picture,
+    view: DishView,
+    settings: VisionTrackerSettings,
+    needle: MeasuredNeedle,
+    walk: np.ndarray,
+    otherwise: State = State.LOST,
+) -> Track:
+    """Return what a frame shows whose needle and centreline are known, in the picture's own pixels.
+
+    `otherwise` is the state if it is unknown which end is the tail.
+    """
+    local = _local(view, picture)
     heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
     covariance = _in_dish(needle, view)
     if not settings.metres_per_pixel:  # A wrong scale shifts what is far from the dish's centre.
         covariance[:2, :2] += SCALE_ERROR**2 * np.outer(tail, tail)
     return Track(
-        state=State.TRACKED,
-        reason="",
+        state=State.TRACKED if needle.heading_known else otherwise,
+        reason="" if needle.heading_known else UNKNOWN_HEADING,
         confidence=needle.confidence,
         tail=tail,
         tip=local.to_dish(needle.tip_px),
@@ -149,22 +200,24 @@ def tracked(
 
 
 def look_once(
-    gray: np.ndarray,
+    image: np.ndarray,
     settings: VisionTrackerSettings,
     scene: Scene,
     masked: Callable[[DishView], SceneMask | None] | None = None,
 ) -> Track:
     """Look at one frame alone; `masked` gives the scene's mask for a view, if somebody keeps it."""
     diameter = scene.dish.diameter
+    gray = measured_channel(image)
     view = find_view(gray, settings, diameter)
     if view is None:
         return no_pose(State.LOST, "no dish in the image", None)
     mask = masked(view) if masked is not None else mask_of(gray, view, settings, scene)
-    picture = picture_of(gray, view, settings, mask)
+    picture = picture_of(image, view, settings, mask)
     needles, refused = needles_in(picture, view, settings, diameter)
-    if len(needles) == 1:
-        return tracked(picture, view, settings, diameter, needles[0])
-    return no_pose(State.LOST, f"{len(needles)} needles in the dish" if needles else why_none(refused), view)
+    if not needles:
+        return no_pose(State.LOST, why_none(refused), view)
+    needle, walk, reason = with_thread(picture, view, settings, diameter, needles)
+    return tracked(picture, view, settings, needle, walk) if needle else no_pose(State.LOST, reason, view)
 
 
 def _local(view: DishView, picture: Picture) -> DishView:

@@ -15,6 +15,7 @@ from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_imag
 from magnetosuture_thread.vision.look import (
     State,
     Track,
+    centreline_of,
     look_once,
     mask_of,
     needles_in,
@@ -22,6 +23,7 @@ from magnetosuture_thread.vision.look import (
     picture_of,
     tracked,
     why_none,
+    with_thread,
 )
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.scene_mask import SceneMask
@@ -102,8 +104,7 @@ class VisionTracker:
             InvalidInputError: the image is not of this kind.
         """
         check_image(image)
-        gray = measured_channel(image)
-        return look_once(gray, self._settings, self._scene, lambda view: self._masked(gray, view))
+        return look_once(image, self._settings, self._scene, lambda view: self._masked(image, view))
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame.
@@ -135,19 +136,26 @@ class VisionTracker:
             return no_pose(self._missing(), reason, view)
         if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
             self._last, self._anew = None, []
-        mask, diameter = self._masked(gray, view), self._scene.dish.diameter
-        chosen, picture, reason = self._choose(gray, view, mask, time_s)
+        mask = self._masked(image, view)
+        chosen, picture, reason = self._choose(image, view, mask, time_s)
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
-        found = tracked(picture, view, self._settings, diameter, chosen)
-        if picture.gray.shape != gray.shape and self._is_cut(found, picture):
-            picture, chosen = _in_whole(picture, chosen, picture_of(gray, view, self._settings, mask))
-            found = tracked(picture, view, self._settings, diameter, chosen)
+        found = self._tracked(picture, view, chosen)
+        if picture.shape != gray.shape and self._is_cut(found, picture):
+            picture, chosen = _in_whole(picture, chosen, picture_of(image, view, self._settings, mask))
+            found = self._tracked(picture, view, chosen)
+        if not chosen.heading_known:
+            return found
         ends = np.array([found.tail, found.tip])
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
 
-    def _masked(self, gray: np.ndarray, view: DishView) -> SceneMask | None:
+    def _tracked(self, picture: Picture, view: DishView, needle: MeasuredNeedle) -> Track:
+        """Return what a frame shows whose needle is known."""
+        walk = centreline_of(picture, view, self._settings, self._scene.dish.diameter, needle)
+        return tracked(picture, view, self._settings, needle, walk, self._missing())
+
+    def _masked(self, image: np.ndarray, view: DishView) -> SceneMask | None:
         """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
 
         The view is rounded, so that the noise of a dish found in every frame anew makes no new mask.
@@ -155,11 +163,11 @@ class VisionTracker:
         u, v = (round(value / VIEW_STEP_PX) * VIEW_STEP_PX for value in view.centre_px)
         radius = round(self._scene.dish.radius / view.metres_per_pixel / VIEW_STEP_PX) * VIEW_STEP_PX
         rounded = DishView((u, v), self._scene.dish.radius / radius, view.rotation)
-        key = (rounded, gray.shape)
+        key = (rounded, image.shape[:2])
         if key not in self._masks:
             if len(self._masks) >= MASKS:
                 self._masks.clear()
-            self._masks[key] = mask_of(gray, rounded, self._settings, self._scene)
+            self._masks[key] = mask_of(image, rounded, self._settings, self._scene)
         return self._masks[key]
 
     def _advance(self, time_s: float) -> None:
@@ -179,47 +187,65 @@ class VisionTracker:
         if _length(line) < MIN_SHARE * _length(self._thread[2:]):
             return True
         u, v = line[-1] - picture.origin
-        rows, columns = picture.gray.shape
+        rows, columns = picture.shape
         return bool(min(u, v, columns - 1 - u, rows - 1 - v) < BORDER_PX)
 
     def _missing(self) -> State:
         return State.LOST if self._last is not None else State.SEARCHING
 
     def _choose(
-        self, gray: np.ndarray, view: DishView, mask: SceneMask | None, time: float
+        self, image: np.ndarray, view: DishView, mask: SceneMask | None, time: float
     ) -> tuple[MeasuredNeedle | None, Picture | None, str]:
         """Return the needle of this frame and the picture it is in, or why there is none."""
         diameter = self._scene.dish.diameter
         if self._last is not None:
             _, angle = self._last.at(time)
             toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
-            picture = picture_of(gray, view, self._settings, mask, self._region(gray, view, time))
+            picture = picture_of(image, view, self._settings, mask, self._region(image, view, time))
             needles, _ = needles_in(picture, view, self._settings, diameter, toward)
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             if len(within) == 1:
                 self._take(_pose(within[0], picture, view, time), self._last)
                 return within[0], picture, ""
-        picture = picture_of(gray, view, self._settings, mask)
+        picture = picture_of(image, view, self._settings, mask)
         needles, refused = needles_in(picture, view, self._settings, diameter)
         if self._last is not None and len(needles) > 1:
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             needles = within if len(within) == 1 else needles
-        if len(needles) != 1:
+        if not needles:
             self._anew = []
-            return None, None, f"{len(needles)} needles in the dish" if needles else why_none(refused)
-        pose = _pose(needles[0], picture, view, time)
+            return None, None, why_none(refused)
+        chosen: MeasuredNeedle | None = needles[0]
+        chosen, reason = self._one_of(needles, picture, view, time)
+        if chosen is None or not chosen.heading_known:
+            self._anew = []
+            return chosen, picture, reason
+        pose = _pose(chosen, picture, view, time)
         if self._last is not None and self._fits(pose, self._last):
             self._take(pose, self._last)
-            return needles[0], picture, ""
+            return chosen, picture, ""
         if self._anew and not self._fits(pose, self._anew[-1]):
             self._anew = []
         self._anew.append(pose)
         if len(self._anew) >= self._settings.confirm_frames:
             self._take(pose, self._anew[-2] if len(self._anew) > 1 else None)
-            return needles[0], picture, ""
+            return chosen, picture, ""
         if self._last is not None:
             return None, None, "a needle farther from the last one than it can move"
         return None, None, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
+
+    def _one_of(
+        self, needles: list[MeasuredNeedle], picture: Picture, view: DishView, time: float
+    ) -> tuple[MeasuredNeedle | None, str]:
+        """Return the needle that is where the last one was, or that a thread leaves; or why there is none."""
+        if (
+            self._last is not None
+            and len(needles) == 1
+            and self._fits(_pose(needles[0], picture, view, time), self._last)
+        ):
+            return needles[0], ""
+        chosen, _, reason = with_thread(picture, view, self._settings, self._scene.dish.diameter, needles)
+        return chosen, reason
 
     def _fits(self, pose: _Pose, last: _Pose) -> bool:
         """Say whether a needle can have come from where it was last."""
@@ -247,7 +273,7 @@ class VisionTracker:
         self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate)
         self._anew = []
 
-    def _region(self, gray: np.ndarray, view: DishView, time: float) -> tuple[int, int, int, int]:
+    def _region(self, image: np.ndarray, view: DishView, time: float) -> tuple[int, int, int, int]:
         """Return the box in which needle and thread should be: left, top, right, bottom [px]."""
         assert self._last is not None
         moved = self._last.at(time)[0] - self._last.tail
@@ -255,8 +281,8 @@ class VisionTracker:
         corners = np.vstack([self._thread, self._thread[:2] + view.directions_to_pixels(moved / view.metres_per_pixel)])
         low, high = corners.min(axis=0) - reach, corners.max(axis=0) + reach
         left, top = (max(0, int(value) // FLOOR_FACTOR * FLOOR_FACTOR) for value in low)
-        right = min(gray.shape[1], (int(high[0]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
-        bottom = min(gray.shape[0], (int(high[1]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
+        right = min(image.shape[1], (int(high[0]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
+        bottom = min(image.shape[0], (int(high[1]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
         return left, top, right, bottom
 
 

@@ -43,6 +43,15 @@ def test_a_pose_goes_there_and_back(angle: float, x: float, y: float):
     np.testing.assert_allclose(found.heading, heading, atol=1e-12)
 
 
+def test_a_pose_whose_heading_is_unknown_by_its_covariance_is_refused():
+    message = MESSAGES.pose_message(STAMP, np.zeros(2), np.array([1.0, 0.0]))
+    message.pose.covariance[-1] = 0.9**2
+    assert reading.needle_pose(message).stamp == 3.5
+    message.pose.covariance[-1] = math.pi**2
+    with pytest.raises(InvalidInputError, match="the heading is unknown"):
+        reading.needle_pose(message)
+
+
 def test_a_needle_that_stands_upright_has_no_heading():
     message = MESSAGES.pose_message(STAMP, np.zeros(2), np.array([1.0, 0.0]))
     message.pose.pose.orientation = Quaternion(y=math.sqrt(0.5), w=math.sqrt(0.5))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import TrackerState
@@ -14,7 +15,9 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import Dish, Scene
+from magnetosuture_thread.vision.look import UNKNOWN_HEADING
 from test.nodes.scenes import scene_told
+from test.vision.scenes import Pose, render
 
 TAIL = np.array([0.002, 0.001])
 
@@ -122,6 +125,21 @@ def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
     graph.wait(lambda: "tracking" in states(diagnostics), "tracking")
+
+
+def test_a_rod_without_a_thread_is_published_with_an_unknown_heading(graph):
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
+    threads = graph.listen(topics.MEASURED_THREAD)
+    image = render(Pose(np.array([0.5, 0.5]), 0.0))  # a dish without a needle
+    outline = np.array([(300.0, 237.5), (385.0, 237.5), (387.5, 240.0), (385.0, 242.5), (300.0, 242.5)])
+    cv2.fillPoly(image, [np.round(outline * 16).astype(np.int32)], (50, 50, 50), cv2.LINE_AA, 4)
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(cv2.GaussianBlur(image, (0, 0), 0.8), graph.now()))
+    graph.wait(lambda: bool(poses and tracking), "a pose and a state")
+    assert poses[0].pose.covariance[-1] > np.pi**2
+    assert tracking[0].state == TrackerState.STATE_SEARCHING
+    assert tracking[0].reason == UNKNOWN_HEADING
+    assert not threads
 
 
 def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_arc):

@@ -47,14 +47,15 @@ def test_glare_over_a_part_of_the_needle(share: float, opacity: float):
 @pytest.mark.parametrize("colour", COLOURS)
 def test_a_hand_or_a_tool_over_or_against_the_needle(colour: str):
     random = np.random.default_rng(7)
-    reasons = []
+    reasons = {}
     for width in (0.0004, 0.0012, 0.006):
         for share in (0.0, 0.25, 0.6, 0.97):
             pose = random_pose(random, curved=share > 0.5)
             end = pose.at(share) + random.normal(0.0, 3.0, 2) * PIXEL
             cover = finger(end, random.uniform(-np.pi, np.pi), width, COLOURS[colour])
-            reasons.append(check(pose, render(pose, random_thread(random, pose), covers=(cover,))))
-    assert sum(map(bool, reasons)) > len(reasons) // 2
+            reasons[width, share] = check(pose, render(pose, random_thread(random, pose), covers=(cover,)))
+    assert reasons[0.006, 0.25]  # half of the needle is hidden
+    assert reasons[0.006, 0.6]
 
 
 @pytest.mark.parametrize("behind", [True, False], ids=["tail", "tip"])
@@ -138,7 +139,14 @@ def test_empty_frames(level: int):
 
 
 class TestGuards:
-    """Each guard refuses what nothing else does: without it the frame would give a pose."""
+    """Each guard refuses what nothing else does: without it the frame would give a pose.
+
+    What is refused here is measured once more, by a drawn needle, where a thread may lie beside it: not in these tests.
+    """
+
+    @pytest.fixture(autouse=True)
+    def measured_once(self, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.setattr(needle, "measure_overlaid", lambda *_: "not tried")
 
     def expect(self, monkeypatch: pytest.MonkeyPatch, frame: np.ndarray, words: str, module, **without: object) -> None:
         assert words in TRACKER.look(frame).reason
@@ -192,8 +200,14 @@ class TestGuards:
 
     def test_glare_at_an_end_leaves_less_slack(self, monkeypatch: pytest.MonkeyPatch):
         pose = Pose(np.zeros(2), 0.5)
-        frames = [render(pose, covers=(blob(pose.at(-0.08), 6e-4, WHITE),)) for _ in range(12)]
-        # The noise of a frame may put the end within the smaller slack: of 60 such frames, in 6.
+        radii = np.linspace(5.6e-4, 7.0e-4, 29)
+        frames = [render(pose, covers=(blob(pose.at(-0.08), float(radius), WHITE),)) for radius in radii]
+        for seen in (TRACKER.look(frame) for frame in frames):  # The drawn needle is found in most of them.
+            if len(seen.tail):
+                off, turned = pose.error(seen)
+                assert off < 1.5  # px
+                assert abs(turned) < np.radians(1.0)
+        monkeypatch.setattr(needle, "measure_overlaid", lambda *_: "no arc")
         glaring = [frame for frame in frames if "with glare at an end" in TRACKER.look(frame).reason]
         assert len(glaring) > 5
         monkeypatch.setattr(body, "GLARING", 2.5)

@@ -61,10 +61,10 @@ def test_a_needle_among_many_dark_posts_is_found():
 def test_an_instrument_that_looks_like_a_needle_is_not_taken_for_one():
     scene = described(pointer={"polygon": {"outline": NEEDLE_LIKE}})
     pose = Pose(np.array([-0.002, -0.004]), 0.7)
-    frame = frame_of(scene, STEEL, pose, random_thread(np.random.default_rng(0), pose))
+    frame = frame_of(scene, STEEL, pose, np.array([[0.5, 0.5], [0.51, 0.5]]))
     masked, plain = seen_with_and_without(scene, frame)
     assert pose.is_right(masked)
-    assert plain.reason == "2 needles in the dish"
+    assert plain.reason == "2 needles in the dish"  # no thread tells which
 
 
 def test_without_a_needle_an_instrument_that_looks_like_one_gives_no_pose():

@@ -34,6 +34,7 @@ class MeasuredNeedle:
         contrast: darkness of the body as a share of the floor's brightness, 0 to 1.
         confidence: how well all fits, 0 to 1.
         covariance: of the tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3).
+        heading_known: whether it is told which end is the tail.
     """
 
     arc: Arc
@@ -42,6 +43,7 @@ class MeasuredNeedle:
     contrast: float = 1.0
     confidence: float = 1.0
     covariance: np.ndarray | None = None
+    heading_known: bool = True
 
     def shifted(self, offset: tuple[float, float]) -> MeasuredNeedle:
         """Return the needle in pixels that begin elsewhere."""

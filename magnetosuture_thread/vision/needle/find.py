@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.images import RIM_PX, Picture, without_wall
+from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall, without_wall
 from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle, measure_body
+from magnetosuture_thread.vision.needle.overlaid import ALIKE, measure_overlaid, points_forward
+from magnetosuture_thread.vision.needle.steel import SteelMap
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
@@ -21,6 +23,7 @@ MIN_AREA = 0.33  # of the needle's own
 ON_AXIS = 0.85  # of a needle's dark pixels lie along one arc; more beside it belong to what touches it
 AROUND_PX = 24.0  # around a dark thing, that is measured on
 AXIS_POINTS = 15
+MAX_WIDTH, MORE_WIDTH_PX = 1.2, 0.3  # of the width, and beyond, that a body alone looks wide
 MAX_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
 
@@ -70,9 +73,10 @@ def _measured(
     """Find the needles of a length and a width [px], shapes and wall cut out up to their very outlines if `tight`."""
     radius = dish_radius / view.metres_per_pixel
     radius = radius - RIM_PX if tight else INSIDE * radius
+    wall = Wall(view.centre_px, radius)
     needles: list[MeasuredNeedle] = []
     refused: list[str] = []
-    mask = picture.mask
+    mask, factor = picture.mask, picture.factor
     candidates = _dark_components(picture, view, radius, expected * thickness, tight)
     if len(candidates) > MAX_CANDIDATES:
         return [], [f"{len(candidates)} dark things"]
@@ -80,26 +84,23 @@ def _measured(
         if not tight and np.hypot(*(points - view.centre_px).T).max() > radius - AT_WALL_PX:
             refused.append(AT_WALL)  # which may have cut off a part
             continue
-        guess = _rough_axis(points, thickness)
-        if guess is None:
-            refused.append("no arc")
-            continue
-        arc, first, last = guess
-        if not 0.6 * expected < last - first < 1.4 * expected:
-            refused.append(f"{last - first:.0f} px long instead of {expected:.0f}")
-            continue
-        if abs(arc.curvature) * expected > 1.25 * np.pi:
-            refused.append("bent beyond a half circle")
-            continue
-        gray, near = picture.gray, False
         low, high = points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX
-        if mask is not None:
-            near = mask.deepest(low, high) > 0.0
-            if near:  # A strip along the needle takes its ground from beside it, which a shape may be.
-                gray = mask.without_shapes(gray, picture.floor, low, high, 0.0 if tight else mask.tolerance_px)
+        near = mask is not None and mask.deepest(low, high) > 0.0
+
+        alone, steel = picture.brightest, SteelMap.around(points, picture.brightest, picture.darkest, factor, wall)
+        if mask is not None and near:  # A strip along the needle takes its ground from beside it, which a shape may be.
+            deep = 0.0 if tight else mask.tolerance_px
+            alone = alone.replaced(mask.without_shapes(alone.pixels, alone.floor, low, high, deep))
+            steel = steel.hidden_where(mask.depth[steel.box] > deep)
         if tight:
-            gray = without_wall(gray, picture, view.centre_px, radius, low, high)
-        found = measure_body(gray, arc, first, last, expected, thickness, toward)
+            alone = alone.replaced(without_wall(alone, factor, wall, low, high))
+            steel = steel.hidden_where(wall.distances(steel.box) > radius)
+        found = _measured_alone(alone.pixels, points, expected, thickness, toward)
+        if isinstance(found, MeasuredNeedle) and toward is None and not _is_sure(steel, found, thickness):
+            found = ALIKE
+        if isinstance(found, str):
+            overlaid = measure_overlaid(steel, expected, thickness, toward)
+            found = overlaid if isinstance(overlaid, MeasuredNeedle) else found
         if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, thickness):
             found = "inside of a shape of the scene"
         if isinstance(found, MeasuredNeedle):
@@ -107,6 +108,29 @@ def _measured(
         else:
             refused.append(found)
     return needles, refused
+
+
+def _is_sure(steel: SteelMap, needle: MeasuredNeedle, width: float) -> bool:
+    """Say whether a needle that was measured alone points the way it seems to.
+
+    A thread beside the body widens it, and can make the tail look like the tip.
+    """
+    return needle.width_px < MORE_WIDTH_PX + MAX_WIDTH * width and points_forward(steel, needle)
+
+
+def _measured_alone(
+    gray: np.ndarray, points: np.ndarray, expected: float, thickness: float, toward: np.ndarray | None
+) -> MeasuredNeedle | str:
+    """Measure a component that is nothing but a needle; see `measure_body`."""
+    guess = _rough_axis(points, thickness)
+    if guess is None:
+        return "no arc"
+    arc, first, last = guess
+    if not 0.6 * expected < last - first < 1.4 * expected:
+        return f"{last - first:.0f} px long instead of {expected:.0f}"
+    if abs(arc.curvature) * expected > 1.25 * np.pi:
+        return "bent beyond a half circle"
+    return measure_body(gray, arc, first, last, expected, thickness, toward)
 
 
 def _dark_components(picture: Picture, view: DishView, radius_px: float, area: float, tight: bool) -> list[np.ndarray]:
@@ -117,7 +141,9 @@ def _dark_components(picture: Picture, view: DishView, radius_px: float, area: f
     radius = radius_px / factor
     left, top = (max(0, int(c - radius)) for c in (u, v))
     window = slice(top, max(top, int(v + radius) + 2)), slice(left, max(left, int(u + radius) + 2))
-    dark = cv2.compare(picture.small[window], cv2.convertScaleAbs(picture.floor[window], alpha=DARK), cv2.CMP_LT)
+    dark = cv2.compare(
+        picture.brightest.small[window], cv2.convertScaleAbs(picture.brightest.floor[window], alpha=DARK), cv2.CMP_LT
+    )
     if dark is None or dark.size == 0:
         return []
     mask = np.zeros(dark.shape, np.uint8)

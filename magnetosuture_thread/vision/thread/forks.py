@@ -1,16 +1,17 @@
-"""Which way a thread goes on where it crosses itself: the one that shows most of the thread."""
+"""Which way a thread leaves, and goes on where it crosses itself: the one that shows most of the thread."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.thread.walk import START_PX, leave, walk_on
+from magnetosuture_thread.vision.thread.leave import begin_path, ways_out
+from magnetosuture_thread.vision.thread.walk import walk_on
 
 MAX_FORKS = 200
 ROUNDS = 4
+MAX_WAYS = 5  # out of the needle, that are followed
+WAY_GAIN = 1.25  # of what a way with a stronger beginning shows, that another must show
 MIN_GAIN_PX = 8.0  # that another way must show more of the thread
 SUFFICIENT_SHARE = 0.9  # of the longest walk: so much thread seen needs no other way
 TWICE_PX, TWICE_STEPS = 1.6, 6  # a vertex this near to one that lies so many steps back sees the same thread
@@ -37,8 +38,8 @@ def worth(path, strong, count):
 
 
 @compiled
-def follow(ridge, hidden, factor, noise, faintest, start, dish, max_length, path, strong):
-    """Walk along the ridge from the tail to its end; where much less of the thread is seen than there is, try forks.
+def follow(ridge, hidden, factor, noise, faintest, start, dish, max_length, max_hidden, simple, path, strong):
+    """Walk along the ridge from the tail to its end, along the way out that shows most of the thread.
 
     Args:
         ridge: ridge strength in grey levels, uint8.
@@ -49,34 +50,53 @@ def follow(ridge, hidden, factor, noise, faintest, start, dish, max_length, path
         start: the tail (u, v) and the needle's direction there [px, px, rad].
         dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk, a little longer than the thread [px].
+        max_hidden: of the thread below the needle, at most [px].
+        simple: see `ways_out`.
         path: filled; see `walk_on`.
         strong: filled; see `walk_on`.
 
     Returns:
-        The number of vertices.
+        The number of vertices, and how much thread they show [px]; see `worth`.
     """
-    path[0, 0], path[0, 1], strong[0] = start[0], start[1], False
-    path[0, 2:] = 0.0
-    angle, bend, strength = leave(ridge, noise, faintest, start[0], start[1], start[2])
-    if strength < 1.2 * faintest:
-        return 1
-    middle = angle + 0.5 * bend * START_PX
-    path[1, 0], path[1, 1] = start[0] + START_PX * math.cos(middle), start[1] + START_PX * math.sin(middle)
-    path[1, 2], path[1, 3] = angle + bend * START_PX, bend
-    path[1, 4], path[1, 5] = max(strength, faintest), START_PX
-    strong[1] = True
+    ways = np.empty((MAX_WAYS, 6))
+    found = ways_out(ridge, hidden, factor, noise, faintest, start, max_hidden, simple, ways)
+    path[0, :2], strong[0] = start[:2], False
+    best, best_value, enough = 1, 0.0, SUFFICIENT_SHARE * max_length
+    other, other_strong = np.empty_like(path), np.empty_like(strong)
+    for index in range(found):
+        count = begin_path(ridge, noise, start, ways[index], faintest, other, other_strong)
+        count, value = _follow(
+            ridge, hidden, factor, noise, faintest, dish, max_length, other, other_strong, count, enough
+        )
+        if value > WAY_GAIN * best_value + (MIN_GAIN_PX if index > 0 else 0.0):
+            best, best_value = count, value
+            path[:count], strong[:count] = other[:count], other_strong[:count]
+        if best_value > enough:
+            break
+    return best, best_value
+
+
+@compiled
+def _follow(ridge, hidden, factor, noise, faintest, dish, max_length, path, strong, begun, enough):
+    """Walk on from a path's last vertex; where much less of the thread is seen than there is, try forks.
+
+    Returns:
+        The number of vertices, and their worth.
+    """
     forks = np.empty((MAX_FORKS, 3))
-    count, fork_count = walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, strong, 2, 9.0, forks)
-    value, enough = worth(path, strong, count), SUFFICIENT_SHARE * max_length
+    count, fork_count = walk_on(
+        ridge, hidden, factor, noise, faintest, dish, max_length, path, strong, begun, 9.0, forks
+    )
+    value = worth(path, strong, count)
     if value > enough or fork_count == 0:
-        return count
+        return count, value
     other, other_strong, other_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
     best, best_strong, best_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
     for _ in range(ROUNDS):
         best_value, best_count, best_fork_count = value + MIN_GAIN_PX, 0, 0
         for index in range(fork_count):
             at = int(forks[index, 0])
-            if at >= count or at < 2:
+            if at >= count or at < begun:
                 continue
             # Of forks in a row, towards one and the same other way, the best only.
             poorer = False
@@ -111,4 +131,4 @@ def follow(ridge, hidden, factor, noise, faintest, start, dish, max_length, path
         path[:count], strong[:count], forks[:fork_count] = best[:count], best_strong[:count], best_forks[:fork_count]
         if value > enough:
             break
-    return count
+    return count, value

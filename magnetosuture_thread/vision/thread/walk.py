@@ -22,11 +22,6 @@ BENDS = 31  # curvatures tried at each step ...
 SHARPEST = 0.21  # ... up to this [1/px], closer around the present one's
 BEND_COST = 1.1  # of the usual strength, for a change of curvature by 1 / px, along the way looked ahead
 SMOOTHING = 0.05  # weight of the newest strength in the usual one
-WAYS = 90  # directions tried at the tail
-START_BENDS = (-0.08, -0.04, 0.0, 0.04, 0.08)
-START_PX = 3.0  # the first sample's distance from the tail
-START_STEPS = 8
-FOLD = math.cos(math.radians(28.0))  # nearer to the needle's own direction the thread doesn't leave
 ASIDE_PX = 0.5
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
 FORK = 0.75  # of the usual strength, at least, along the other way
@@ -40,32 +35,6 @@ def is_hidden(hidden, factor, u, v):
     if c < 0 or r < 0 or c >= hidden.shape[1] or r >= hidden.shape[0]:
         return False
     return hidden[r, c] != 0
-
-
-@compiled
-def leave(ridge, noise, faintest, u, v, heading):
-    """Find the arc along which the thread leaves the tail.
-
-    Returns:
-        Its angle, its curvature, and its mean strength in grey levels; 0 if there is none.
-    """
-    best, best_angle, best_bend = 0.0, 0.0, 0.0
-    for way in range(WAYS):
-        angle = 2.0 * math.pi * way / WAYS
-        if math.cos(angle - heading) > FOLD:
-            continue
-        for bend in START_BENDS:
-            total, seen = 0.0, 0
-            for step in range(START_STEPS):
-                s = START_PX + STEP_PX * step
-                middle = angle + 0.5 * bend * s
-                value = sample(ridge, u + s * math.cos(middle), v + s * math.sin(middle)) - noise
-                total += min(value, 80.0)
-                if value > faintest:
-                    seen += 1
-            if seen >= START_STEPS - 3 and total / START_STEPS > best:
-                best, best_angle, best_bend = total / START_STEPS, angle, bend
-    return best_angle, best_bend, best
 
 
 @compiled

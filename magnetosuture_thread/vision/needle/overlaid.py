@@ -1,0 +1,374 @@
+"""Measures a needle in a dark component that holds its thread too: beside, under or over it, or as dark as it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
+from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.steel import SteelMap
+from magnetosuture_thread.vision.needle.template import (
+    BLOOM_PX,
+    THIN,
+    TemplateFit,
+    bluntness,
+    excess,
+    fit_template,
+    steel_rows,
+)
+from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.thread.leave import ways_out
+
+FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this
+LEVELS = (0.5, 0.7)  # share of steel that is dark: more of a thread over the needle is, less of one beside it
+CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no thin thread
+MAX_WIDTH = 2.6  # of the body's: what is wider is neither needle nor thread, nor both
+MIN_CORE = 0.25  # of the needle's area
+MAX_CORES, MAX_ENDS, MAX_FITS = 3, 5, 3
+LONG = 1.35  # of the needle's length: a longer core holds thread
+FIRST_ROUNDS = 4
+MAX_COST = 0.11  # of the length, in squared pixels
+MAX_MISSING, MISSING_ROWS = 0.13, 5  # of the steel of so many rows, that the image may lack
+MAX_MISSING_TAIL, TAIL_ROWS = 0.15, 3  # of these, next to the tail
+MAX_MISSING_TIP, TIP = 0.12, 0.2  # of the steel of this last part of the length
+SURE, SURE_ROWS = 0.75, 0.97  # share of steel that some place of a row has, and of the rows that have one
+MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
+MAX_BOTH = 0.2  # of it beyond both ends, which a thread leaves or passes at one only
+SHARP = 0.2  # bluntness of both sides of a tip if the thread is so thick
+AXIS_POINTS, MAX_HIDDEN = 100, 0.02  # along the axis, and the share of them that wall and shapes may hide
+MAX_BESIDE = 0.1  # of the rows with something as dark as steel off the body's side
+BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
+NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and of what is no tip at least
+CLEARLY = 1.25  # times the cost that the other way has if both could be
+ROD = 0.87  # bluntness of both ends of a rod
+ROD_COST = 0.9  # of the cost of a pointed needle, that a rod has at most
+LEAVES = 2.0  # how much stronger a thread leaves the tail than the tip
+THREAD = 0.8  # of the needle's length, that a thread leads away from it at least
+WINDOW_PX = 7  # wider than a thin thread looks
+ALIKE = "ends that look alike"
+TOWARD = 0.8  # cosine between a needle and where it must point
+
+
+def measure_overlaid(
+    steel: SteelMap, length: float, width: float, toward: np.ndarray | None = None
+) -> MeasuredNeedle | str:
+    """Measure the needle in a dark component that is more than a needle.
+
+    Axes are guessed by what is as deep in the dark as the body's middle, and by its ends; a drawn needle is fitted from
+    each. Of the best fits the first is taken that nothing covers and of which tail and tip can be told apart.
+
+    Args:
+        steel: the image around it.
+        length: of the needle [px].
+        width: of its body [px].
+        toward: where it must point, u right and v down; see `find_needles`.
+
+    Returns:
+        The needle, in the picture's pixels, or in words why there is none.
+    """
+    if steel.depth < FAINTEST:
+        return "too faint"
+    guesses = [guess for level in LEVELS for guess in _guesses(steel.surely > level, length, width)]
+    fits = [fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS) for guess in guesses]
+    fits.sort(key=lambda fit: fit.cost)
+    found: MeasuredNeedle | str = "no arc"
+    for rough in fits[:MAX_FITS]:
+        found = _judged(steel, rough, length, width, toward)
+        if isinstance(found, MeasuredNeedle):
+            found = found.shifted(steel.origin)
+            corners = found.arc.at(np.array([0.0, length]))
+            if corners.min() < 3.0 or (corners > np.array(steel.size) - 4.0).any():
+                return "cut by the image's border"
+            return found
+        if found == ALIKE:
+            return found  # A worse fit of the same needle must not tell what this one does not.
+    return found
+
+
+def points_forward(steel: SteelMap, needle: MeasuredNeedle) -> bool:
+    """Say whether a needle's tail is blunt and its tip is not, also where a thread lies beside one of them."""
+    arc = needle.shifted((-steel.origin[0], -steel.origin[1])).arc
+    tail, tip = _bluntness(steel, arc, needle.length_px, needle.width_px)
+    return tail > BLUNT and tip < POINTED
+
+
+def _guesses(dark: np.ndarray, length: float, width: float) -> list[Arc]:
+    """Return axes from the tail on that a needle may have, by what of a dark component is as wide as it."""
+    deep = cv2.distanceTransform(dark.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    if deep.max() > 0.5 * MAX_WIDTH * width + 1.0:
+        return []
+    inset = CORE * width
+    core = (deep > inset).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
+    result: list[Arc] = []
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    for label in 1 + np.argsort(-areas)[:MAX_CORES]:
+        if stats[label, cv2.CC_STAT_AREA] < MIN_CORE * (1.0 - 2.0 * CORE) * length * width:
+            continue
+        own = (labels == label).astype(np.uint8)
+        rows, columns = np.nonzero(own)
+        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
+        if guess is None:
+            continue
+        arc, first, last = guess
+        if last - first < 0.5 * length:
+            continue
+        if last - first < LONG * length:
+            result += _both(arc, first - inset, last + inset, length)
+        else:
+            result += _from_ends(own, length, width)
+    return result
+
+
+def _both(arc: Arc, first: float, last: float, length: float) -> list[Arc]:
+    """Return an axis in both directions, each with its tail where the dark begins."""
+    forward = arc.moved(first, 0.0, 0.0, 0.0)
+    return [forward, arc.reversed_at(last), forward.reversed_at(length), arc.reversed_at(last).reversed_at(length)]
+
+
+def _from_ends(own: np.ndarray, length: float, width: float) -> list[Arc]:
+    """Return axes that begin or end at the ends of a long, winding core."""
+    result: list[Arc] = []
+    rows, columns = np.nonzero(own)
+    steps = np.empty(own.shape, np.int32)
+    _walk(own, _pixel(own, rows[0], columns[0]), steps)
+    last = int(np.argmax(steps))
+    _walk(own, _pixel(own, last // own.shape[1], last % own.shape[1]), steps)
+    size = 2 * int(0.5 * width + 2.0) + 1
+    highest = cv2.dilate(steps.astype(np.float32), np.ones((size, size), np.uint8))
+    at = np.argwhere((steps == highest) & (own > 0))
+    ends = [np.array([last // own.shape[1], last % own.shape[1]])]
+    for place in at[np.argsort(-steps[at[:, 0], at[:, 1]])]:
+        if len(ends) < MAX_ENDS and min(np.abs(place - other).max() for other in ends) > size:
+            ends.append(place)
+    for row, column in ends:
+        _walk(own, _pixel(own, row, column), steps)
+        rows, columns = np.nonzero((steps >= 0) & (steps < 0.8 * length))
+        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
+        if guess is None:
+            continue
+        arc, first, final = guess
+        end = float(arc.coordinates(np.array([[column, row]], float))[0][0])
+        # From the end inwards; a point reaches farther than its core, by the part that is too thin for it.
+        inwards = arc.moved(first, 0.0, 0.0, 0.0) if end - first < final - end else arc.reversed_at(final)
+        for beyond in (0.1 * length, 0.03 * length):
+            result.append(inwards.moved(-beyond, 0.0, 0.0, 0.0).reversed_at(length))
+        result.append(inwards.moved(-CORE * width, 0.0, 0.0, 0.0))
+    return result
+
+
+def _pixel(own: np.ndarray, row: int, column: int) -> np.ndarray:
+    """Return an image of one pixel."""
+    result = np.zeros_like(own)
+    result[row, column] = 1
+    return result
+
+
+def _axis_of(points: np.ndarray, width: float) -> tuple[Arc, float, float] | None:
+    """Return an arc through most of the points, and the lengths along it between which these lie."""
+    kept = points
+    for _ in range(4):
+        if len(kept) < 8:
+            return None
+        arc = fit_arc(kept)
+        along, aside = arc.coordinates(points)
+        near = np.abs(aside) < max(0.5 * width, 1.5 * middle(np.abs(aside)))
+        kept = points[near]
+    return arc, float(along[near].min()), float(along[near].max())
+
+
+@compiled
+def _walk(own, start, steps):
+    """Fill in how many steps from the nearest pixel of a start each pixel of its components is, -1 elsewhere."""
+    steps[:] = -1
+    rows, columns = own.shape
+    queue = np.empty((rows * columns, 2), np.int32)
+    head, tail = 0, 0
+    for y in range(rows):
+        for x in range(columns):
+            if start[y, x] != 0:
+                steps[y, x] = 0
+                queue[tail, 0], queue[tail, 1] = y, x
+                tail += 1
+    while head < tail:
+        r, c = queue[head]
+        head += 1
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                y, x = r + i, c + j
+                if 0 <= y < rows and 0 <= x < columns and own[y, x] != 0 and steps[y, x] < 0:
+                    steps[y, x] = steps[r, c] + 1
+                    queue[tail, 0], queue[tail, 1] = y, x
+                    tail += 1
+
+
+def _judged(
+    steel: SteelMap,
+    rough: TemplateFit,
+    length: float,
+    width: float,
+    toward: np.ndarray | None,
+) -> MeasuredNeedle | str:
+    """Fit to the end, in both directions; return the needle if all looks like one, in one direction."""
+    one = fit_template(steel, rough.arc, length, width)
+    other = fit_template(steel, one.reversed(), length, width)
+    one = min((one, fit_template(steel, other.reversed(), length, width)), key=lambda each: each.cost)
+    rod = fit_template(steel, one.arc, length, width, rod=True)
+    best = min((one, other, rod), key=lambda each: each.cost)
+    reason = _what_covers(steel, best, width)
+    if reason:
+        return reason
+    if steel.share_hidden(best.arc.at(np.linspace(0.0, length, AXIS_POINTS))) > MAX_HIDDEN:
+        return "hidden"
+    if abs(best.arc.curvature) * length > 1.25 * math.pi:
+        return "bent beyond a half circle"
+    around = _excess(steel, best, width)
+    if max(around[4], around[5]) > MAX_BESIDE:
+        return "something dark against it"
+    fit = _pointed_way(steel, one, other)
+    is_known = True
+    if fit is None:
+        settled = _settled(steel, rod, min((one, other), key=lambda each: each.cost), toward)
+        if settled is None:
+            return ALIKE
+        fit, is_known = settled
+    reason = _what_prolongs(steel, fit, width, is_known)
+    if reason:
+        return reason
+    confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * length)) ** 0.5
+    confidence *= max(0.2, 1.0 - 2.0 * float(fit.covariance[1, 1]))
+    covariance = fit.covariance
+    if not is_known:
+        covariance = covariance + np.diag([length**2, 0.0, math.pi**2])
+        confidence *= 0.5
+    return MeasuredNeedle(fit.arc, length, fit.width, steel.depth, max(0.05, float(confidence)), covariance, is_known)
+
+
+def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> TemplateFit | None:
+    """Return which of two opposite needles has a blunt tail and a pointed tip; None unless the other clearly has not.
+
+    A thread may lie over the point, and another axis make it look blunt: each is judged by its own fit.
+    """
+    for fit, against in ((one, other), (other, one)):
+        tail, tip = _bluntness(steel, fit.arc, fit.length, fit.width)
+        if tail < BLUNT or tip > POINTED:
+            continue
+        tail, tip = _bluntness(steel, against.arc, against.length, against.width)
+        if tail < NOT_BLUNT or tip > NOT_POINTED or against.cost > CLEARLY * fit.cost:
+            return fit
+    return None
+
+
+def _bluntness(steel: SteelMap, arc: Arc, length: float, width: float) -> tuple[float, float]:
+    """Return how blunt tail and tip may be, steel below a coloured thread counted as steel; see `bluntness`."""
+    result = np.empty((2, 2))
+    bluntness(steel.perhaps, _state(arc, width), length, 0.5 * width, result)
+    return float(result[0].min()), float(result[1].min())
+
+
+def _what_covers(steel: SteelMap, fit: TemplateFit, width: float) -> str:
+    """Say what covers a drawn needle; empty if nothing does."""
+    if fit.cost > MAX_COST * fit.length:
+        return "no needle's shape"
+    rows = np.empty((int(fit.length), 3))
+    steel_rows(steel.surely, steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, THIN, rows)
+    share, due, greatest = rows.T
+    tip = int((1.0 - TIP) * len(rows))
+    even = np.convolve(share[:tip], np.full(MISSING_ROWS, 1.0 / MISSING_ROWS), "valid")
+    if even.max() > MAX_MISSING or share[:TAIL_ROWS].mean() > MAX_MISSING_TAIL:
+        return "something over it or against it"
+    if np.mean(greatest[:tip] > SURE) < SURE_ROWS:
+        return "no needle's darkness"
+    if share[tip:] @ due[tip:] > MAX_MISSING_TIP * due[tip:].sum():
+        return "something over it or against it"
+    return ""
+
+
+def _what_prolongs(steel: SteelMap, fit: TemplateFit, width: float, is_known: bool) -> str:
+    """Say at which end something goes on that is too wide for a thread; empty if nothing does."""
+    beyond_tip, beyond_tail = _excess(steel, fit, width)[2:4]
+    if min(beyond_tip, beyond_tail) > MAX_BOTH:
+        return "something at both ends"
+    if beyond_tip > MAX_BEYOND:
+        return "something at its tip"
+    if beyond_tail > MAX_BEYOND:
+        blunt = np.empty((2, 2))
+        bluntness(steel.surely, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, blunt)
+        if not is_known or blunt[1].max() > SHARP:
+            return "something at its tail"
+    return ""
+
+
+def _state(arc: Arc, width: float) -> np.ndarray:
+    """Return an axis and half of the drawn width as compiled code takes them."""
+    return np.array([arc.start[0], arc.start[1], arc.angle, arc.curvature, 0.5 * width + BLOOM_PX])
+
+
+def _excess(steel: SteelMap, fit: TemplateFit, width: float) -> np.ndarray:
+    """Return what is dark around a drawn needle; see `excess`."""
+    result = np.empty(6)
+    excess(steel.surely, _state(fit.arc, fit.width), fit.length, 0.5 * width, result)
+    return result
+
+
+def _settled(
+    steel: SteelMap, rod: TemplateFit, pointed: TemplateFit, toward: np.ndarray | None
+) -> tuple[TemplateFit, bool] | None:
+    """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
+
+    A thread leaves the tail of a rod. Of another needle it may lie over the point, which tells nothing. Where neither
+    is so, None: the length may be another's.
+    """
+    is_rod = rod.cost < ROD_COST * pointed.cost and _is_rod(steel, rod)
+    here, there = threads_at_ends(steel.pixels, rod.arc, rod.length, rod.width)
+    fit = rod if is_rod else pointed
+    back = replace(fit, arc=fit.reversed())
+    if is_rod and max(here, there) > LEAVES * min(here, there):
+        return (fit if here > there else back), True
+    if not is_rod and max(here, there) == 0.0:
+        return None
+    if toward is not None and abs(along := float(fit.arc.direction() @ toward)) > TOWARD:
+        return (fit if along > 0.0 else back), True
+    return fit, False
+
+
+def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether a needle is blunt at both ends, and ends there."""
+    blunt = np.empty((2, 2))
+    state = _state(fit.arc, fit.width)
+    bluntness(steel.surely, state, fit.length, 0.5 * fit.width, blunt)
+    if blunt.min() < ROD:
+        return False
+    around = _excess(steel, fit, fit.width)
+    rows = np.empty((int(fit.length), 3))
+    steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, 1.0, rows)
+    ends = max(rows[:TAIL_ROWS, 0].mean(), rows[-TAIL_ROWS:, 0].mean())
+    return bool(ends < MAX_MISSING_TAIL and max(around[2], around[3]) < MAX_BEYOND)
+
+
+def threads_at_ends(part: np.ndarray, arc: Arc, length: float, width: float) -> tuple[float, float]:
+    """Return how strong a thread leaves the beginning and the end of an axis, in grey levels; 0 for none."""
+    ridge, faintest = _ridge(part)
+    axis = np.round(arc.at(np.linspace(0.5, length - 0.5, 24)) * 16.0).astype(np.int32)
+    cv2.polylines(ridge, [axis], False, 0, round(width + 3.0), cv2.LINE_8, 4)
+    seen = np.zeros_like(ridge)
+    strengths = []
+    for own in (arc, arc.reversed_at(length)):
+        ways = np.empty((1, 6))
+        tail = np.array([own.start[0], own.start[1], own.angle])
+        found = ways_out(ridge, seen, 1, 0.0, faintest, tail, 0.0, True, ways)
+        strengths.append(float(ways[0, 3]) if found and ways[0, 3] > 1.2 * faintest else 0.0)
+    return strengths[0], strengths[1]
+
+
+def _ridge(part: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return how much darker each pixel is than the brightest near it, and what is no noise of that [grey levels]."""
+    window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WINDOW_PX, WINDOW_PX))
+    ridge = cv2.morphologyEx(cv2.GaussianBlur(part, (5, 5), 0.7), cv2.MORPH_BLACKHAT, window)
+    noise = middle(ridge[::3, ::3])
+    return ridge, noise + max(5.0, 3.0 * noise)

@@ -1,0 +1,101 @@
+"""Where steel is in the image around a dark thing: for sure, and perhaps, where a coloured thread may lie over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.vision.images import Layer, Wall
+
+AROUND_PX = 12.0  # around a dark thing, that is measured on
+DARKEST = 0.9  # quantile of its darkness that steel has
+SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
+
+
+@dataclass(frozen=True)
+class SteelMap:
+    """How much of each pixel is steel, by its darkness as a share of the floor's brightness.
+
+    Attributes:
+        surely: by the brightest of the three colours, in which steel alone is dark, shape (rows, columns), 0 to 1.
+        perhaps: by the darkest of them, in which a coloured thread is dark too; the same without colours.
+        depth: darkness of steel, 0 to 1.
+        pixels: the darkest colour, shape (rows, columns), uint8.
+        origin: (u, v) of the first pixel in the picture.
+        size: width and height of the picture [px].
+        hidden: where nothing is known; None: nowhere.
+    """
+
+    surely: NDArray[np.float32]
+    perhaps: NDArray[np.float32]
+    depth: float
+    pixels: NDArray[np.uint8]
+    origin: tuple[float, float]
+    size: tuple[int, int]
+    hidden: NDArray[np.bool_] | None = None
+
+    def hidden_where(self, hidden: NDArray[np.bool_]) -> SteelMap:
+        """Return the map with nothing known where something hides the needle, shape (rows, columns)."""
+        if not hidden.any():
+            return self
+        surely, perhaps = self.surely.copy(), self.perhaps.copy()
+        surely[hidden], perhaps[hidden] = 0.0, 1.0
+        return replace(
+            self, surely=surely, perhaps=perhaps, hidden=hidden if self.hidden is None else self.hidden | hidden
+        )
+
+    def share_hidden(self, points: np.ndarray) -> float:
+        """Return which share of some points, in the map's own pixels, is hidden."""
+        if self.hidden is None:
+            return 0.0
+        rows, columns = self.hidden.shape
+        u, v = np.round(points).astype(int).T
+        return float(self.hidden[v.clip(0, rows - 1), u.clip(0, columns - 1)].mean())
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the picture."""
+        (left, top), (rows, columns) = (round(value) for value in self.origin), self.surely.shape
+        return slice(top, top + rows), slice(left, left + columns)
+
+    @staticmethod
+    def around(
+        points: np.ndarray,
+        brightest: Layer,
+        darkest: Layer,
+        factor: int,
+        wall: Wall,
+    ) -> SteelMap:
+        """Return the map around some points.
+
+        Args:
+            points: of the dark thing, shape (m, 2) [px].
+            brightest: see `Picture`.
+            darkest: see there.
+            factor: see there.
+            wall: of the dish.
+        """
+        rows, columns = brightest.pixels.shape
+        left, top = np.maximum(points.min(axis=0) - AROUND_PX, 0.0).astype(int)
+        right, bottom = np.minimum(points.max(axis=0) + AROUND_PX, (columns, rows)).astype(int)
+        box = slice(top, bottom), slice(left, right)
+        dark = _darkness(brightest, box, factor, wall)
+        u, v = np.round(points - (left, top)).astype(int).T
+        depth = float(np.quantile(dark[v.clip(0, len(dark) - 1), u.clip(0, dark.shape[1] - 1)], DARKEST))
+        surely = _share(dark, depth)
+        perhaps = surely if darkest is brightest else _share(_darkness(darkest, box, factor, wall), depth)
+        pixels = np.ascontiguousarray(darkest.pixels[box])
+        return SteelMap(surely, perhaps, depth, pixels, (float(left), float(top)), (columns, rows))
+
+
+def _darkness(channel: Layer, box: tuple[slice, slice], factor: int, wall: Wall) -> NDArray[np.float32]:
+    """Return 1 - I / F of some rows and columns."""
+    floor = np.maximum(wall.floor(channel, factor, box), 1).astype(np.float32)
+    return np.asarray(1.0 - channel.pixels[box] / floor)
+
+
+def _share(dark: NDArray[np.float32], depth: float) -> NDArray[np.float32]:
+    share = (dark / max(depth, 1e-3) - SHADOW) / (STEEL - SHADOW)
+    return np.asarray(np.clip(share, 0.0, 1.0), dtype=np.float32)

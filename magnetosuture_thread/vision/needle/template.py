@@ -1,0 +1,340 @@
+"""Fits a drawn needle of known length to the image, where a thread beside, under or over it hides its edges.
+
+The drawn needle is a body of one width whose last fifth tapers, or a rod, seen through the lens. Steel that it has and
+the image lacks counts in full, as nothing makes steel bright; dark that the image has and it lacks may be a thread, and
+counts up to a bound. A thread over the needle that is dark in one colour counts for neither.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.needle.steel import SHADOW, STEEL, SteelMap
+from magnetosuture_thread.vision.needle.strip import (
+    ANGLE_ERROR,
+    ASIDE_ERROR_PX,
+    CORRELATED_ROWS,
+    TAIL_ERROR_PX,
+    TAPER,
+)
+from magnetosuture_thread.vision.sampling import sample
+
+BLUR_PX = 1.03  # of an edge, lens and sensor together
+THIN = 0.12  # of the body's width, that a point is ground to
+BESIDE_PX = 4.0  # beside and beyond the body, that is compared too
+STEP_PX = 0.75  # between samples across; along it is 1 px
+OTHER = 0.2  # of steel, at which dark beyond the drawn needle counts a quarter of steel that is missing
+BLOOM_PX = 0.22  # that shadow and lens let an edge seem to lie outside of where it is
+WIDTH_SLACK_PX, WIDTH_SLACK = 0.2, 0.03  # standard deviation of the body's width, and share of it
+MAX_STEP_PX, LAST_STEP_PX = 1.5, 0.02  # of a round; after a smaller one the fit is done
+PULL = 3.5  # times the variance by noise alone, as a thread beside the needle pulls all rows to one side
+DAMPING = 0.05  # of places along and aside, that of all others accordingly
+PARAMETERS = 5
+
+
+@dataclass(frozen=True)
+class TemplateFit:
+    """A drawn needle where the image fits it best.
+
+    Attributes:
+        arc: axis, from the tail on.
+        length: of it [px].
+        width: of the body [px].
+        cost: what the image differs by, robustly [px^2].
+        missing: steel that the image lacks [px^2].
+        covariance: of tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3).
+    """
+
+    arc: Arc
+    length: float
+    width: float
+    cost: float
+    missing: float
+    covariance: np.ndarray
+
+    def reversed(self) -> Arc:
+        """Return the axis from the tip on."""
+        return self.arc.reversed_at(self.length)
+
+
+def fit_template(
+    steel: SteelMap, guess: Arc, length: float, width: float, *, rod: bool = False, rounds: int = 12
+) -> TemplateFit:
+    """Fit a drawn needle to an image of steel.
+
+        minimise  sum w(r) r^2,    r = min(perhaps(x(s, d)) - drawn(s, d), 0) + max(surely(x(s, d)) - drawn(s, d), 0),
+        w = 1 where r < 0,  (1 + (r / `OTHER`)^2)^-2 elsewhere
+
+    by Gauss-Newton steps, over the place along and aside of the axis, its angle, its curvature and the width.
+
+    Args:
+        steel: the image.
+        guess: axis from the tail on, at most some 2 px off.
+        length: of the needle [px].
+        width: of its body [px].
+        rod: whether both ends are blunt.
+        rounds: steps at most.
+    """
+    half = 0.5 * width
+    state = np.array([guess.start[0], guess.start[1], guess.angle, guess.curvature, half + BLOOM_PX])
+    normal = np.zeros((PARAMETERS, PARAMETERS))
+    deviation = 0.5 * (WIDTH_SLACK_PX + WIDTH_SLACK * width)
+    thin = 1.0 if rod else THIN
+    cost, missing, count = _fit(steel.surely, steel.perhaps, state, length, half, deviation, thin, rounds, normal)
+    arc = Arc(state[:2].copy(), float(state[2]), float(state[3]))
+    covariance = _at_tail(np.linalg.inv(normal), 0.5 * length) * PULL * CORRELATED_ROWS * cost / count
+    lengthwise = np.array([1.0, 0.0, arc.curvature])
+    covariance += np.diag([0.0, ASIDE_ERROR_PX**2, ANGLE_ERROR**2])
+    covariance += TAIL_ERROR_PX**2 * np.outer(lengthwise, lengthwise)
+    return TemplateFit(arc, length, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, covariance)
+
+
+def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:
+    """Return the covariance of tail and angle there, by that of place, angle and curvature in the middle."""
+    turn = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, -middle, middle**2 / 3.0], [0.0, 0.0, 1.0, -middle]])
+    return np.asarray(turn @ inverse[:4, :4] @ turn.T)
+
+
+@compiled
+def edge(x):
+    """Return how much of a blurred edge is covered at a distance inside of it, about a normal distribution."""
+    return 0.5 + 0.5 * math.tanh(0.8 * x / BLUR_PX)
+
+
+@compiled
+def _draw(along, aside, length, half, bloom, thin, drawn):
+    """Fill in the share of steel of a drawn needle at places along and aside of its axis."""
+    across = np.empty(len(aside))
+    before = -1.0
+    for row in range(len(along)):
+        s = along[row]
+        part = (s - (1.0 - TAPER) * length) / (TAPER * length)
+        own = half * (1.0 - (1.0 - thin) * min(max(part, 0.0), 1.0)) + bloom
+        if own != before:
+            for column in range(len(aside)):
+                across[column] = edge(own - aside[column]) - edge(-own - aside[column])
+            before = own
+        ends = edge(s + bloom) * edge(length - s + bloom)
+        for column in range(len(aside)):
+            drawn[row, column] = min(max((across[column] * ends - SHADOW) / (STEEL - SHADOW), 0.0), 1.0)
+
+
+@compiled
+def _sample(steel, state, along, aside, seen):
+    """Fill in the image along and aside of an arc."""
+    u, v, angle, curvature = state[0], state[1], state[2], state[3]
+    for row in range(len(along)):
+        s = along[row]
+        turned = 0.5 * curvature * s
+        chord = s if abs(turned) < 1e-9 else s * math.sin(turned) / turned
+        x, y = u + chord * math.cos(angle + turned), v + chord * math.sin(angle + turned)
+        across, down = -math.sin(angle + 2.0 * turned), math.cos(angle + 2.0 * turned)
+        for column in range(len(aside)):
+            seen[row, column] = sample(steel, x + aside[column] * across, y + aside[column] * down)
+
+
+@compiled
+def _fit(surely, perhaps, state, length, half, deviation, thin, rounds, normal):
+    """Fit; `state` (u, v, angle, curvature, half width) is changed, `normal` filled.
+
+    The latter is that of (along, aside, angle, bend, half width).
+
+    Place, angle and bend are those of the arc's middle, where they depend least on each other.
+
+    Returns:
+        Cost [px^2], missing steel [px^2], and the number of samples.
+    """
+    rows, columns = int(length + 2.0 * BESIDE_PX) + 1, 2 * int((half + BESIDE_PX) / STEP_PX) + 1
+    along, aside = np.arange(rows) - BESIDE_PX, (np.arange(columns) - columns // 2) * STEP_PX
+    least, most = np.empty((rows, columns)), np.empty((rows, columns))
+    drawn, wider = np.empty((rows, columns)), np.empty((rows, columns))
+    right, slope, own = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
+    best, best_missing, best_state = np.inf, 0.0, state.copy()
+    middle, widened = 0.5 * length, 0.1
+    prior = OTHER * OTHER / (deviation * deviation)
+    for _ in range(rounds):
+        bloom = state[4] - half
+        _sample(surely, state, along, aside, least)
+        _sample(perhaps, state, along, aside, most)
+        _draw(along, aside, length, half, bloom, thin, drawn)
+        _draw(along, aside, length, half, bloom + widened, thin, wider)
+        own[:], right[:] = 0.0, 0.0
+        cost, missing = 0.0, 0.0
+        for row in range(1, rows - 1):
+            t = along[row] - middle
+            for column in range(1, columns - 1):
+                seen, weight = least, 1.0
+                apart = least[row, column] - drawn[row, column]
+                if apart <= 0.0:
+                    seen = most
+                    apart = min(most[row, column] - drawn[row, column], 0.0)
+                if apart > 0.0:
+                    share = 1.0 / (1.0 + (apart / OTHER) ** 2)
+                    weight = share * share
+                    cost += share * apart * apart
+                else:
+                    cost += apart * apart
+                    missing -= apart
+                side = 0.5 * (seen[row, column + 1] - seen[row, column - 1]) / STEP_PX
+                slope[0] = 0.5 * (seen[row + 1, column] - seen[row - 1, column])
+                slope[1] = side
+                slope[2] = t * side
+                slope[3] = 0.5 * (t * t - middle * middle / 3.0) * side
+                slope[4] = (drawn[row, column] - wider[row, column]) / widened
+                for i in range(PARAMETERS):
+                    right[i] -= weight * slope[i] * apart
+                    for j in range(i + 1):
+                        own[i, j] += weight * slope[i] * slope[j]
+        for i in range(PARAMETERS):
+            right[i] *= STEP_PX
+            for j in range(i + 1):
+                own[i, j] *= STEP_PX
+                own[j, i] = own[i, j]
+        own[4, 4] += prior
+        right[4] -= prior * (bloom - BLOOM_PX)
+        own[0, 0] += DAMPING
+        own[1, 1] += DAMPING
+        own[2, 2] += DAMPING * middle**2 / 3.0
+        own[3, 3] += DAMPING * middle**4 / 45.0
+        cost = cost * STEP_PX + prior * (bloom - BLOOM_PX) ** 2
+        if cost < best:
+            best, best_missing = cost, missing * STEP_PX
+            best_state[:] = state
+            normal[:] = own
+        change = np.linalg.solve(own, right)
+        largest = max(abs(change[0]), abs(change[1]), abs(change[2]) * middle, abs(change[3]) * 0.5 * middle * middle)
+        if largest > MAX_STEP_PX:
+            change *= MAX_STEP_PX / largest
+        # What the middle is turned and bent by moves the tail, where the arc begins.
+        shift = change[1] - change[2] * middle + change[3] * middle * middle / 3.0
+        angle = state[2]
+        state[0] += change[0] * math.cos(angle) - shift * math.sin(angle)
+        state[1] += change[0] * math.sin(angle) + shift * math.cos(angle)
+        state[2] += change[2] - change[3] * middle + change[0] * state[3]
+        state[3] += change[3]
+        state[4] = min(max(state[4] + change[4], 0.6 * half), 1.6 * half + BLOOM_PX)
+        if largest < LAST_STEP_PX:
+            break
+    state[:] = best_state
+    return best, best_missing, rows * columns
+
+
+@compiled
+def excess(surely, start, length, half, result):
+    """Fill in how much darker than a drawn needle the image is around it, as shares of what it could be.
+
+    Args:
+        surely: see `SteelMap`.
+        start: u, v, angle, curvature of the axis and half of the drawn width.
+        length: of the needle [px].
+        half: of its body's width [px].
+        result: filled, shape (6,): left and right of the taper, within the body's width; beyond the tip and beyond the
+            tail; rows that are dark from the body on, left and right: what is as wide is no thread.
+    """
+    rows, columns = int(length + 2.0 * BESIDE_PX) + 1, 2 * int((half + BESIDE_PX) / STEP_PX) + 1
+    along, aside = np.arange(rows) - BESIDE_PX, (np.arange(columns) - columns // 2) * STEP_PX
+    seen, drawn = np.empty((rows, columns)), np.empty((rows, columns))
+    _sample(surely, start, along, aside, seen)
+    _draw(along, aside, length, half, start[4] - half, THIN, drawn)
+    total = np.zeros(6)
+    result[:] = 0.0
+    for row in range(rows):
+        s = along[row]
+        least = np.ones(2)
+        for column in range(columns):
+            d = aside[column]
+            side = 0 if d < 0.0 else 1
+            more = max(seen[row, column] - drawn[row, column], 0.0)
+            zone = -1
+            if abs(d) < half + 0.5:
+                if s > length + 1.0:
+                    zone = 2
+                elif s < -1.5:
+                    zone = 3
+                elif s > (1.0 - 0.8 * TAPER) * length and drawn[row, column] < 0.5:
+                    zone = side
+            elif abs(d) > half + 1.5:
+                least[side] = min(least[side], more)
+            if zone >= 0:
+                result[zone] += more
+                total[zone] += 1.0 - drawn[row, column]
+        if 0.0 < s < length:
+            for side in range(2):
+                result[4 + side] += least[side] > 0.5
+                total[4 + side] += 1.0
+    result /= np.maximum(total, 1e-9)
+
+
+@compiled
+def steel_rows(surely, perhaps, start, length, half, thin, result):
+    """Fill in what of its steel each row of a drawn needle has in the image, from tail to tip.
+
+    Args:
+        surely: see `SteelMap`.
+        perhaps: see there.
+        start: u, v, angle, curvature of the axis and half of the drawn width.
+        length: of the needle [px].
+        half: of its body's width [px].
+        thin: of it, to which its end tapers; 1 for a rod.
+        result: filled, shape (rows, 3): which share is missing, how much there should be [px], and the greatest share
+            of any place of the row, for sure.
+    """
+    rows, columns = len(result), 2 * int((half + BESIDE_PX) / STEP_PX) + 1
+    along, aside = np.arange(rows) + 0.5, (np.arange(columns) - columns // 2) * STEP_PX
+    least, most = np.empty((rows, columns)), np.empty((rows, columns))
+    drawn = np.empty((rows, columns))
+    _sample(surely, start, along, aside, least)
+    _sample(perhaps, start, along, aside, most)
+    _draw(along, aside, length, half, start[4] - half, thin, drawn)
+    for row in range(rows):
+        missing, total, greatest = 0.0, 0.0, 0.0
+        for column in range(columns):
+            missing += max(drawn[row, column] - most[row, column], 0.0)
+            total += drawn[row, column]
+            if abs(aside[column]) < half:
+                greatest = max(greatest, least[row, column])
+        result[row, 0], result[row, 1], result[row, 2] = missing / max(total, 1e-9), total * STEP_PX, greatest
+
+
+@compiled
+def bluntness(surely, start, length, half, result):
+    """Fill in how blunt both ends of a needle look, on either side of its axis.
+
+        b = sum w (surely - tapered) / sum w (blunt - tapered),    w = blunt - tapered
+
+    over the corners that a blunt end has and a tapered one lacks: 0 for a point, 1 for a blunt end. A thread that
+    leaves an end, or lies over it, makes one side look blunter than it is; so the lesser one tells.
+
+    Args:
+        surely: see `SteelMap`.
+        start: u, v, angle, curvature of the axis and half of the drawn width.
+        length: of the needle [px].
+        half: of its body's width [px].
+        result: filled, shape (2, 2): at the axis' start and its end, left and right.
+    """
+    rows, columns = int(length + 2.0 * BESIDE_PX) + 1, 2 * int((half + BESIDE_PX) / STEP_PX) + 1
+    along, aside = np.arange(rows) - BESIDE_PX, (np.arange(columns) - columns // 2) * STEP_PX
+    seen, blunt = np.empty((rows, columns)), np.empty((rows, columns))
+    forward, backward = np.empty((rows, columns)), np.empty((rows, columns))
+    bloom = start[4] - half
+    _sample(surely, start, along, aside, seen)
+    _draw(along, aside, length, half, bloom, 1.0, blunt)
+    _draw(along, aside, length, half, bloom, THIN, forward)
+    _draw(length - along, aside, length, half, bloom, THIN, backward)
+    more, total = np.zeros((2, 2)), np.zeros((2, 2))
+    for row in range(rows):
+        end = 0 if along[row] < 0.5 * length else 1
+        for column in range(columns):
+            if column == columns // 2:
+                continue
+            tapered = backward[row, column] if end == 0 else forward[row, column]
+            weight = blunt[row, column] - tapered
+            side = 0 if column < columns // 2 else 1
+            more[end, side] += weight * (seen[row, column] - tapered)
+            total[end, side] += weight * weight
+    result[:] = more / np.maximum(total, 1e-9)
