@@ -31,6 +31,12 @@ class DishView:
     metres_per_pixel: float
     rotation: float = 0.0
 
+    def shrunk(self, factor: float) -> DishView:
+        """Return the view in an image shrunk by a factor, below 1 in one enlarged."""
+        shift = 0.5 * (factor - 1.0)
+        u, v = ((value - shift) / factor for value in self.centre_px)
+        return DishView((u, v), self.metres_per_pixel * factor, self.rotation)
+
     def to_dish(self, pixels: Points) -> Points:
         """Return points of shape (..., 2) in the dish frame [m]."""
         offsets = np.asarray(pixels, dtype=float) - self.centre_px

@@ -246,6 +246,7 @@ class TrackedFrame:
             "file": self.name,
             "status": track.state.value,
             "reason": track.reason or None,
+            "warning": track.warning or None,
             "tail_m": _numbers(track.tail) if seen else None,
             "heading_rad": _number(math.atan2(track.heading[1], track.heading[0])) if seen else None,
             "tip_m": _numbers(track.tip) if seen else None,

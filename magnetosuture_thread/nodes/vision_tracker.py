@@ -139,12 +139,13 @@ class VisionTrackerNode(PackageNode):
                 for follower in self._followers:
                     follower.on_measured_thread(stamp, seen.centreline)
         self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))
-        values = {"frames": self._session.frames, "tracked": self._session.tracked}
+        values: dict[str, Any] = {"frames": self._session.frames, "tracked": self._session.tracked}
         if seen.problem is not None:
             self.health.refuse(seen.problem, **values)
         elif seen.tracked:
-            self._words = "tracking"
-            self.health.ok(self._words, confidence=round(track.confidence, 3), **values)
+            values["confidence"] = round(track.confidence, 3)
+            self._words = f"tracking; {track.warning}" if track.warning else "tracking"
+            (self.health.warn if track.warning else self.health.ok)(self._words, **values)
         else:
             self._words = f"{track.state.value}: {track.reason}"
             self.health.warn(self._words, **values)

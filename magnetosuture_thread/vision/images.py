@@ -65,6 +65,15 @@ class Picture:
         return rows, columns
 
 
+def shrunk(image: np.ndarray, factor: int) -> np.ndarray:
+    """Return a frame shrunk by area, whose last rows and columns may be lost."""
+    if factor == 1:
+        return image
+    rows, columns = (size // factor for size in image.shape[:2])
+    whole = image[: rows * factor, : columns * factor]
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA))
+
+
 def prepare(image: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), mask: SceneMask | None = None) -> Picture:
     """Make an image ready to measure on, shape (rows, columns) or (rows, columns, 3) in BGR order, uint8."""
     if image.ndim == 2:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -12,9 +12,11 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.find import find_dish
+from magnetosuture_thread.vision.dish.tilt import Tilt, find_tilt
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
+from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
@@ -23,6 +25,7 @@ from magnetosuture_thread.vision.thread.loose import has_loose_thread
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
+DARK_FLOOR = 90.0  # grey levels; with a given view, a frame whose median is below has a dark floor
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
 
@@ -53,6 +56,7 @@ class Track:
             length squared.
         centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
         view: where the dish is in the image; None when it is not found.
+        warning: what makes the measurement worse than it could be; empty if nothing does.
     """
 
     state: State
@@ -65,6 +69,7 @@ class Track:
     covariance: np.ndarray
     centreline: np.ndarray
     view: DishView | None
+    warning: str = ""
 
 
 def no_pose(state: State, reason: str, view: DishView | None) -> Track:
@@ -73,11 +78,54 @@ def no_pose(state: State, reason: str, view: DishView | None) -> Track:
     return Track(state, reason, 0.0, nothing, nothing, nothing, 0.0, np.empty((0, 0)), np.empty((0, 2)), view)
 
 
-def find_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> DishView | None:
-    """Return the view: what of it is given, and the rest by the dish; None if no dish is seen."""
+@dataclass(frozen=True)
+class FoundDish:
+    """The dish in a frame.
+
+    Attributes:
+        view: where it is, once the frame is prepared.
+        dark_field: whether the floor is dark, and needle, thread and rim are bright.
+        tilt: of the camera; None if there is none to be sure of.
+    """
+
+    view: DishView
+    dark_field: bool = False
+    tilt: Tilt | None = None
+
+    def prepared(self, image: np.ndarray) -> np.ndarray:
+        """Return a frame with a bright floor and a round dish."""
+        if self.dark_field:
+            image = 255 - image
+        return image if self.tilt is None else self.tilt.corrected(image, self.view)
+
+
+def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> FoundDish | None:
+    """Find the view: what of it is given, and the rest by the dish; None if none is seen.
+
+    Args:
+        image: frame, shape (rows, columns) or (rows, columns, 3), uint8.
+        settings: what to look for.
+        diameter: of the dish [m].
+    """
+    gray = measured_channel(image)
     fixed = settings.fixed_view()
     if fixed is not None:
-        return fixed
+        return FoundDish(fixed, middle(gray[::8, ::8]) < DARK_FLOOR)
+    for dark_field in (False, True):
+        if dark_field:
+            gray = 255 - gray
+        found = _found_view(gray, settings, diameter)
+        if found is None:
+            continue
+        if settings.dish_centre_px or settings.metres_per_pixel:  # measured by a calibration
+            return FoundDish(found, dark_field)
+        tilt, view = find_tilt(gray, found, diameter)
+        return FoundDish(view, dark_field, tilt)
+    return None
+
+
+def _found_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> DishView | None:
+    """Return the view by a dish with a bright floor; None if none is seen."""
     found = find_dish(gray, diameter)
     if found is None:
         return None
@@ -207,17 +255,28 @@ def look_once(
 ) -> Track:
     """Look at one frame alone; `masked` gives the scene's mask for a view, if somebody keeps it."""
     diameter = scene.dish.diameter
-    gray = measured_channel(image)
-    view = find_view(gray, settings, diameter)
-    if view is None:
+    dish = see_dish(image, settings, diameter)
+    if dish is None:
         return no_pose(State.LOST, "no dish in the image", None)
-    mask = masked(view) if masked is not None else mask_of(gray, view, settings, scene)
+    image, view = dish.prepared(image), dish.view
+    mask = masked(view) if masked is not None else mask_of(image, view, settings, scene)
     picture = picture_of(image, view, settings, mask)
     needles, refused = needles_in(picture, view, settings, diameter)
     if not needles:
         return no_pose(State.LOST, why_none(refused), view)
     needle, walk, reason = with_thread(picture, view, settings, diameter, needles)
-    return tracked(picture, view, settings, needle, walk) if needle else no_pose(State.LOST, reason, view)
+    return (
+        tilted(tracked(picture, view, settings, needle, walk), dish, 0.5 * diameter)
+        if needle
+        else no_pose(State.LOST, reason, view)
+    )
+
+
+def tilted(track: Track, dish: FoundDish, radius: float) -> Track:
+    """Return a track with what a tilt of the camera leaves unknown, and a warning of it."""
+    if dish.tilt is None:
+        return track
+    return replace(track, covariance=track.covariance + dish.tilt.covariance(radius), warning=dish.tilt.warning)
 
 
 def _local(view: DishView, picture: Picture) -> DishView:

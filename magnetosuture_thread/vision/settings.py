@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.shared_parameters import shared_parameter
+
+WORKING_NEEDLE_PX = 5.0  # width of the needle in a frame that is measured on; more pixels take time and tell little
 
 
 @dataclass(frozen=True)
@@ -68,3 +70,20 @@ class VisionTrackerSettings(Configuration):
             u, v = self.dish_centre_px
             return DishView((u, v), self.metres_per_pixel, self.camera_rotation)
         return None
+
+    def working_factor(self, shape: tuple[int, ...], diameter: float) -> int:
+        """Return by how much frames of a shape (rows, columns) of a dish are shrunk before they are measured on.
+
+        The needle stays at least `WORKING_NEEDLE_PX` wide. Where the scale is not given, the dish is taken to fill the
+        frame.
+        """
+        scale = self.metres_per_pixel or diameter / min(shape[:2])
+        return max(1, int(self.needle_width / scale / WORKING_NEEDLE_PX))
+
+    def shrunk(self, factor: int) -> VisionTrackerSettings:
+        """Return the settings for frames shrunk by a factor."""
+        if factor == 1:
+            return self
+        shift = 0.5 * (factor - 1.0)
+        centre = tuple((value - shift) / factor for value in self.dish_centre_px)
+        return replace(self, dish_centre_px=centre, metres_per_pixel=self.metres_per_pixel * factor)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,12 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.watch import DishWatch
-from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_image, measured_channel
+from magnetosuture_thread.vision.images import (
+    FLOOR_FACTOR,
+    Picture,
+    check_image,
+    shrunk,
+)
 from magnetosuture_thread.vision.look import (
     State,
     Track,
@@ -21,6 +26,7 @@ from magnetosuture_thread.vision.look import (
     needles_in,
     no_pose,
     picture_of,
+    tilted,
     tracked,
     why_none,
     with_thread,
@@ -66,7 +72,9 @@ class VisionTracker:
     """
 
     def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
-        self._settings = settings
+        self._given = settings
+        self._factor = 1  # by which frames are shrunk
+        self._settings = settings  # in shrunk frames
         self._scene = scene
         self._dish = DishWatch(settings, scene.dish.diameter)
         self._masks: dict[tuple[DishView, tuple[int, ...]], SceneMask | None] = {}
@@ -79,8 +87,15 @@ class VisionTracker:
         self._scene = scene
         self._masks.clear()
         if other_dish:
-            self._dish = DishWatch(self._settings, scene.dish.diameter)
-            self._forget()
+            self._rescale()
+
+    def _rescale(self) -> None:
+        """Choose the size that frames are looked at in, and begin anew."""
+        diameter = self._scene.dish.diameter
+        self._factor = self._given.working_factor(self._shape, diameter) if self._shape else 1
+        self._settings = self._given.shrunk(self._factor)
+        self._dish = DishWatch(self._settings, diameter)
+        self._forget()
 
     def reset(self) -> None:
         """Forget the needle and the dish."""
@@ -104,7 +119,9 @@ class VisionTracker:
             InvalidInputError: the image is not of this kind.
         """
         check_image(image)
-        return look_once(image, self._settings, self._scene, lambda view: self._masked(image, view))
+        factor = self._given.working_factor(image.shape, self._scene.dish.diameter)
+        small, settings = shrunk(image, factor), self._given.shrunk(factor)
+        return _enlarged(look_once(small, settings, self._scene, lambda view: self._masked(small, view)), factor)
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame.
@@ -122,14 +139,17 @@ class VisionTracker:
         """
         check_image(image)
         self._advance(time_s)
-        gray = measured_channel(image)
-        if gray.shape != self._shape:
-            self.reset()
-            self._shape, self._time = gray.shape, time_s
+        if image.shape[:2] != self._shape:
+            self._shape = image.shape[:2]
+            self._rescale()
+        return _enlarged(self._track(shrunk(image, self._factor), time_s), self._factor)
+
+    def _track(self, image: np.ndarray, time_s: float) -> Track:
+        """Look at the next frame, shrunk."""
         if self._last is not None and time_s - self._last.time > self._settings.forget_after:
             self._last = None
         before = self._dish.view
-        reason = self._dish.look(gray)
+        reason, image = self._dish.look(image)
         view = self._dish.view
         if reason or view is None:
             self._anew = []
@@ -141,7 +161,7 @@ class VisionTracker:
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
         found = self._tracked(picture, view, chosen)
-        if picture.shape != gray.shape and self._is_cut(found, picture):
+        if picture.shape != image.shape[:2] and self._is_cut(found, picture):
             picture, chosen = _in_whole(picture, chosen, picture_of(image, view, self._settings, mask))
             found = self._tracked(picture, view, chosen)
         if not chosen.heading_known:
@@ -153,7 +173,9 @@ class VisionTracker:
     def _tracked(self, picture: Picture, view: DishView, needle: MeasuredNeedle) -> Track:
         """Return what a frame shows whose needle is known."""
         walk = centreline_of(picture, view, self._settings, self._scene.dish.diameter, needle)
-        return tracked(picture, view, self._settings, needle, walk, self._missing())
+        assert self._dish.seen is not None
+        found = tracked(picture, view, self._settings, needle, walk, self._missing())
+        return tilted(found, self._dish.seen, self._scene.dish.radius)
 
     def _masked(self, image: np.ndarray, view: DishView) -> SceneMask | None:
         """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
@@ -284,6 +306,13 @@ class VisionTracker:
         right = min(image.shape[1], (int(high[0]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
         bottom = min(image.shape[0], (int(high[1]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
         return left, top, right, bottom
+
+
+def _enlarged(track: Track, factor: int) -> Track:
+    """Return a track whose view is that of the frame before it was shrunk."""
+    if track.view is None or factor == 1:
+        return track
+    return replace(track, view=track.view.shrunk(1.0 / factor))
 
 
 def _pose(needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> _Pose:

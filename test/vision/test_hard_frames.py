@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
+import numpy as np
 import pytest
 
+from benchmarks.vision.frames import DISH_RADIUS
 from benchmarks.vision.measurements import Row, frame_of, measure, row_of
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.vision.look import State
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import VisionTracker
 
+SCENE = Scene(dish=Dish(2.0 * DISH_RADIUS))
 SEED = 4711
 FRAMES = 6
 FOLDS = ("0_4", "4_15", "15_26", "26_50")
@@ -55,3 +64,48 @@ def test_a_rod_never_points_the_wrong_way():
 def test_of_two_needles_the_one_that_a_thread_leaves_is_taken():
     assert row("second_needle").found >= FRAMES - 1
     assert row("second_needle").wrong == 0
+
+
+@pytest.mark.parametrize("name", ["width_320", "width_1280", "width_1920", "dark_field"])
+def test_small_and_large_frames_and_a_dark_floor_are_tracked(name: str):
+    seen = row(name)
+    assert (seen.found, seen.unknown, seen.wrong, seen.covered_90) == (FRAMES, 0, 0, 1.0)
+    assert seen.tail_px is not None
+    assert seen.tail_px < 0.5
+
+
+@pytest.mark.parametrize("degrees", [6, 10])
+def test_a_tilted_camera_is_warned_of_and_its_errors_are_within_the_covariance(degrees: int):
+    assert row(f"tilt_{degrees}deg").dishonest == 0
+    for index in range(FRAMES):
+        _, image = frame_of(f"tilt_{degrees}deg", index, SEED)
+        tracker = VisionTracker(VisionTrackerSettings(), SCENE)
+        warned = re.fullmatch(r"the camera is tilted by (\d+) degrees", tracker.look(image).warning)
+        assert warned is not None
+        assert abs(int(warned[1]) - degrees) <= 1
+    assert not VisionTracker(VisionTrackerSettings(), SCENE).look(frame_of("usual", 0, SEED)[1]).warning
+
+
+def test_over_time_a_tilted_camera_on_a_dark_floor_is_tracked_as_in_each_frame():
+    image = 255 - frame_of("tilt_6deg", 1, SEED)[1]
+    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
+    alone = tracker.look(image)
+    for index in range(3):
+        seen = tracker.track(image, 0.1 * index)
+        assert seen.state is State.TRACKED
+        assert seen.warning == alone.warning != ""
+        np.testing.assert_allclose(seen.tail, alone.tail, atol=2e-5)
+
+
+def test_the_view_of_a_large_frame_is_in_its_own_pixels():
+    case, image = frame_of("width_1920", 0, SEED)
+    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
+    found = tracker.look(image)
+    assert found.view is not None
+    np.testing.assert_allclose(found.view.centre_px, case.view.centre_px, atol=1.0)
+    u, v = found.view.centre_px
+    given = VisionTrackerSettings(dish_centre_px=(u, v), metres_per_pixel=found.view.metres_per_pixel, confirm_frames=1)
+    for seen in (VisionTracker(given, SCENE).look(image), VisionTracker(given, SCENE).track(image, 0.0)):
+        np.testing.assert_allclose(seen.tail, found.tail, atol=1e-5)
+        assert seen.view is not None
+        np.testing.assert_allclose(seen.view.centre_px, (u, v))

@@ -16,6 +16,7 @@ MIN_CONTRAST = 12.0  # grey levels
 CONTRAST = 0.15  # of the floor's brightness, at least, between floor and rim
 SATURATED, SATURATED_SHARE = 253, 0.15  # grey level, and share of a ring on the floor
 BAND = 0.02  # of the radius: beyond the inner edge, the rim is darkest within
+REACH = 0.04  # of the radius, in which the rim is looked for once it is known
 RIM_RAYS = 72  # of the quick check
 RIM_REACH_PX = 7.0  # how far the quick check looks in and out
 STILL_PX = 1.0  # a rim seen this near to where it was stands still
@@ -43,7 +44,7 @@ def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
             continue
         u, v, radius = guess
         fitted = None
-        for reach, step in ((0.12, 1.0), (0.04, 0.5)):
+        for reach, step in ((0.12, 1.0), (REACH, 0.5)):
             edges, darkest = _edge_points(gray, u, v, radius, reach * radius, step, RAYS)
             fitted = _fit_circle(edges, AGREEMENT_PX)
             if fitted is None:
@@ -121,6 +122,18 @@ def _edge_points(
     band = max(4.0, BAND * radius)
     counts = rim_along_rays(gray, (u, v, radius), reach, step, band, MIN_CONTRAST, CONTRAST, edges, darkest)
     return edges[: counts[0]], darkest[: counts[1]]
+
+
+def rim_points(gray: np.ndarray, centre: tuple[float, float], radius: float) -> np.ndarray:
+    """Return points of the rim's darkest ring, or where few are seen of its inner edge, shape (m, 2) [px].
+
+    Args:
+        gray: image, shape (rows, columns), uint8.
+        centre: of the dish, about [px].
+        radius: of it, about [px].
+    """
+    edges, darkest = _edge_points(gray, *centre, radius, REACH * radius, 0.5, RAYS)
+    return darkest if len(darkest) > len(edges) // 2 else edges
 
 
 def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:

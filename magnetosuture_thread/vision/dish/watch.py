@@ -8,7 +8,8 @@ import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.find import RIM_RAYS, RIM_SHARE, STILL_PX, rim_shift
-from magnetosuture_thread.vision.look import find_view
+from magnetosuture_thread.vision.images import measured_channel
+from magnetosuture_thread.vision.look import FoundDish, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 AGREEING = 3  # frames in a row that must agree on a new view
@@ -24,49 +25,60 @@ class DishWatch:
     Args:
         settings: what to look for.
         diameter: inner diameter of the dish [m].
+
+    Attributes:
+        seen: the dish as it was found; None if it was not yet.
     """
 
     def __init__(self, settings: VisionTrackerSettings, diameter: float) -> None:
         self._settings = settings
         self._diameter = diameter
         self._fixed = settings.fixed_view()
-        self.view = self._fixed
-        self._anew: list[DishView] = []
+        self.seen: FoundDish | None = None
+        self._anew: list[FoundDish] = []
+
+    @property
+    def view(self) -> DishView | None:
+        """Where the dish is; None if it was not found yet."""
+        return self._fixed or (self.seen.view if self.seen is not None else None)
 
     def forget(self) -> None:
         """Begin anew, as with a camera of another size."""
-        self.view, self._anew = self._fixed, []
+        self.seen, self._anew = None, []
 
-    def look(self, gray: np.ndarray) -> str:
+    def look(self, image: np.ndarray) -> tuple[str, np.ndarray]:
         """Look at the rim in a frame.
 
         Args:
-            gray: image, shape (rows, columns), uint8.
+            image: shape (rows, columns) or (rows, columns, 3), uint8.
 
         Returns:
-            Why the view must not be used in this frame; empty if it may.
+            Why the view must not be used in this frame, empty if it may; and the frame as it is measured on, see
+            `FoundDish.prepared`.
         """
-        if self._fixed is not None:
-            return ""
-        if self.view is None:
-            self.view = find_view(gray, self._settings, self._diameter)
-            return "" if self.view is not None else "no dish in the image"
-        shift, rays = rim_shift(gray, self.view.centre_px, 0.5 * self._diameter / self.view.metres_per_pixel)
+        if self._fixed is not None or self.seen is None:
+            self.seen = see_dish(image, self._settings, self._diameter)
+            if self.seen is None:
+                return "no dish in the image", image
+            return "", self.seen.prepared(image)
+        prepared = self.seen.prepared(image)
+        gray, view = measured_channel(prepared), self.seen.view
+        shift, rays = rim_shift(gray, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
         seen = rays >= RIM_SHARE * RIM_RAYS
         if seen and shift < STILL_PX:
             self._anew = []
-            return ""
-        found = find_view(gray, self._settings, self._diameter)
+            return "", prepared
+        found = see_dish(image, self._settings, self._diameter)
         if found is None:
             self._anew = []
-            return "too little of the dish is seen"
-        if self._anew and not _agree(found, self._anew[-1]):
+            return "too little of the dish is seen", prepared
+        if self._anew and not _agree(found.view, self._anew[-1].view):
             self._anew = []
         self._anew.append(found)
         if len(self._anew) < AGREEING:
-            return "the dish is not where it was"
-        self.view, self._anew = found, []
-        return ""
+            return "the dish is not where it was", prepared
+        self.seen, self._anew = found, []
+        return "", found.prepared(image)
 
 
 def _agree(one: DishView, other: DishView) -> bool:

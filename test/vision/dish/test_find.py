@@ -62,13 +62,13 @@ def test_the_quick_check_tells_how_far_the_rim_has_moved():
 def test_a_bumped_camera_is_believed_only_after_several_frames():
     before, after = gray_of((322.0, 238.0), 8e-5, 3), gray_of((330.0, 235.0), 8e-5, 3)
     watch = DishWatch(VisionTrackerSettings(), 0.035)
-    assert watch.look(before) == ""
+    assert watch.look(before)[0] == ""
     seen = watch.view
-    assert [watch.look(after) != "" for _ in range(AGREEING)] == [True] * (AGREEING - 1) + [False]
+    assert [watch.look(after)[0] != "" for _ in range(AGREEING)] == [True] * (AGREEING - 1) + [False]
     assert watch.view is not None
     assert np.linalg.norm(np.subtract(watch.view.centre_px, (330.0, 235.0))) < 0.5
-    assert watch.look(before) != ""  # and one odd frame later changes nothing
-    assert watch.look(after) == ""
+    assert watch.look(before)[0] != ""  # and one odd frame later changes nothing
+    assert watch.look(after)[0] == ""
     assert seen is not None
 
 
@@ -77,13 +77,13 @@ def test_a_dark_frame_gives_no_view_and_changes_none():
     watch = DishWatch(VisionTrackerSettings(), 0.035)
     watch.look(gray)
     view = watch.view
-    assert watch.look(0 * gray) == "too little of the dish is seen"
-    assert watch.look(gray) == ""
+    assert watch.look(0 * gray)[0] == "too little of the dish is seen"
+    assert watch.look(gray)[0] == ""
     assert watch.view is view
 
 
 def test_a_given_view_needs_no_dish():
     settings = VisionTrackerSettings(dish_centre_px=(320.0, 240.0), metres_per_pixel=8e-5, camera_rotation=0.1)
     watch = DishWatch(settings, 0.035)
-    assert watch.look(np.zeros((480, 640), np.uint8)) == ""
+    assert watch.look(np.zeros((480, 640), np.uint8))[0] == ""
     assert watch.view == DishView((320.0, 240.0), 8e-5, 0.1)
