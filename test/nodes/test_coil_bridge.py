@@ -26,17 +26,19 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
     graph.wait(lambda: any(m.command == asked.header.stamp for m in currents), "currents for the command")
     expected = CoilBridgeSettings().allocation().allocate(np.array([0.005, 0.0]), TAIL, EAST).currents
     assert expected[0] > 2.0
-    graph.wait(lambda: any(np.allclose(told, expected, atol=0.05) for told in applied(node)), "the full currents")
+    drive_until(
+        graph, lambda: any(np.allclose(told, expected, atol=0.05) for told in applied(node)), "the full currents"
+    )
     last = next(m for m in reversed(currents) if not m.stop)
     assert list(last.coil) == ["coil_0", "coil_1", "coil_2", "coil_3"]
     assert not last.saturated
     full = pytest.approx(0.005, rel=0.02)
-    graph.wait(lambda: any(setpoint.twist.linear.x == full for setpoint in setpoints), "setpoint")
+    drive_until(graph, lambda: any(setpoint.twist.linear.x == full for setpoint in setpoints), "setpoint")
 
     def following() -> list[Any]:
         return [state for state in states if state.armed and not state.reasons and state.applied.x == full]
 
-    graph.wait(following, "the state, with the velocity applied")
+    drive_until(graph, following, "the state, with the velocity applied")
     state = following()[-1]
     assert state.state == CoilBridgeState.STATE_ACTIVE
     assert state.commanded.x == state.filtered.x == 0.005
