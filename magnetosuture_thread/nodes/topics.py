@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -65,7 +66,8 @@ class Topic:
     def publisher(self, node: Node) -> Publisher:
         """Return a publisher whose reliability and depth can be overridden by parameters, as usual in ROS."""
         options = QoSOverridingOptions.with_default_policies()
-        return node.create_publisher(self.message, self.name, self.qos, qos_overriding_options=options)
+        # A copy: rclpy writes overrides into the profile that it is given.
+        return node.create_publisher(self.message, self.name, copy(self.qos), qos_overriding_options=options)
 
     def decode(self, data: bytes) -> Any:
         """Return a message that came as bytes.
@@ -144,7 +146,7 @@ class Topic:
         """Subscribe to the bytes of the messages: what is too large is not made into a message first."""
         overriding = QoSOverridingOptions.with_default_policies()
         return node.create_subscription(
-            self.message, self.name, take, self.qos, qos_overriding_options=overriding, raw=True, **options
+            self.message, self.name, take, copy(self.qos), qos_overriding_options=overriding, raw=True, **options
         )
 
 

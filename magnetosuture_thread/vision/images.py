@@ -11,6 +11,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.untrusted import MAX_PIXELS
 from magnetosuture_thread.vision.image_header import image_header
 from magnetosuture_thread.vision.scene_mask import SceneMask
+from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
 FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
@@ -22,7 +23,7 @@ GLARE = 1.07  # of the floor's brightness: above, a pixel shows the lamp
 
 @dataclass(frozen=True)
 class Layer:
-    """What is measured on.
+    """One brightness of each pixel, and of the floor behind it.
 
     Attributes:
         pixels: shape (rows, columns), uint8.
@@ -35,7 +36,7 @@ class Layer:
     floor: np.ndarray
 
     def replaced(self, pixels: np.ndarray) -> Layer:
-        """Return the channel with other pixels."""
+        """Return the layer with other pixels."""
         return replace(self, pixels=pixels)
 
 
@@ -226,8 +227,10 @@ def check_image(image: np.ndarray) -> None:
     """Raise `InvalidInputError` unless an array is an image to look at."""
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise InvalidInputError("image", f"{image.dtype} of shape {image.shape}", "8-bit grey or BGR pixels")
-    if min(image.shape[:2]) < 64:
-        raise InvalidInputError("image", f"{image.shape[1]} x {image.shape[0]} pixels", "at least 64 x 64 pixels")
+    if min(image.shape[:2]) < MIN_SIDE_PX:
+        raise InvalidInputError(
+            "image", f"{image.shape[1]} x {image.shape[0]} pixels", f"at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels"
+        )
 
 
 def measured_channel(image: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from magnetosuture_thread.vision.thread.loose import has_loose_thread
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
-DARK_FLOOR = 90.0  # grey levels; with a given view, a frame whose median is below has a dark floor
+DARK_FLOOR = 130.0  # grey levels; with a given view, a frame whose median is below may have a dark floor
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
 
@@ -110,7 +110,9 @@ def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float
     gray = measured_channel(image)
     fixed = settings.fixed_view()
     if fixed is not None:
-        return FoundDish(fixed, middle(gray[::8, ::8]) < DARK_FLOOR)
+        # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
+        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _found_view(gray, settings, diameter) is None
+        return FoundDish(fixed, dark and _found_view(255 - gray, settings, diameter) is not None)
     for dark_field in (False, True):
         if dark_field:
             gray = 255 - gray
@@ -251,25 +253,23 @@ def look_once(
     image: np.ndarray,
     settings: VisionTrackerSettings,
     scene: Scene,
-    masked: Callable[[DishView], SceneMask | None] | None = None,
+    mask_for: Callable[[DishView], SceneMask | None] | None = None,
 ) -> Track:
-    """Look at one frame alone; `masked` gives the scene's mask for a view, if somebody keeps it."""
+    """Look at one frame alone; `mask_for` gives the scene's mask for a view, if somebody keeps it."""
     diameter = scene.dish.diameter
     dish = see_dish(image, settings, diameter)
     if dish is None:
         return no_pose(State.LOST, "no dish in the image", None)
     image, view = dish.prepared(image), dish.view
-    mask = masked(view) if masked is not None else mask_of(image, view, settings, scene)
+    mask = mask_for(view) if mask_for is not None else mask_of(image, view, settings, scene)
     picture = picture_of(image, view, settings, mask)
     needles, refused = needles_in(picture, view, settings, diameter)
     if not needles:
         return no_pose(State.LOST, why_none(refused), view)
     needle, walk, reason = with_thread(picture, view, settings, diameter, needles)
-    return (
-        tilted(tracked(picture, view, settings, needle, walk), dish, 0.5 * diameter)
-        if needle
-        else no_pose(State.LOST, reason, view)
-    )
+    if needle is None:
+        return no_pose(State.LOST, reason, view)
+    return tilted(tracked(picture, view, settings, needle, walk), dish, 0.5 * diameter)
 
 
 def tilted(track: Track, dish: FoundDish, radius: float) -> Track:

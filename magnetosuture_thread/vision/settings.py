@@ -11,6 +11,8 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.shared_parameters import shared_parameter
 
+MIN_SCALE = 1e-7  # m; of a pixel: finer than light resolves
+MIN_SIDE_PX = 64  # of a frame that is looked at
 WORKING_NEEDLE_PX = 5.0  # width of the needle in a frame that is measured on; more pixels take time and tell little
 
 
@@ -59,10 +61,13 @@ class VisionTrackerSettings(Configuration):
     )
 
     def check(self) -> None:
-        """Refuse more than one centre."""
+        """Refuse more than one centre, and a scale that no camera has."""
         if len(self.dish_centre_px) > 2:
             name = f"{self.GROUP}.dish_centre_px"
             raise ConfigurationError(name, self.dish_centre_px, "u and v [px], or no entries to find the dish")
+        if 0.0 < self.metres_per_pixel < MIN_SCALE:
+            name = f"{self.GROUP}.metres_per_pixel"
+            raise ConfigurationError(name, self.metres_per_pixel, f"at least {MIN_SCALE:g} m, or 0 to find it")
 
     def fixed_view(self) -> DishView | None:
         """Return the view if all of it is given; None if the dish must be found."""
@@ -74,16 +79,17 @@ class VisionTrackerSettings(Configuration):
     def working_factor(self, shape: tuple[int, ...], diameter: float) -> int:
         """Return by how much frames of a shape (rows, columns) of a dish are shrunk before they are measured on.
 
-        The needle stays at least `WORKING_NEEDLE_PX` wide. Where the scale is not given, the dish is taken to fill the
-        frame.
+        The needle stays at least `WORKING_NEEDLE_PX` wide, and the frame `MIN_SIDE_PX`. Where the scale is not given,
+        the dish is taken to fill the frame.
         """
-        scale = self.metres_per_pixel or diameter / min(shape[:2])
-        return max(1, int(self.needle_width / scale / WORKING_NEEDLE_PX))
+        side = min(shape[:2])
+        scale = self.metres_per_pixel or diameter / side
+        return max(1, min(int(self.needle_width / scale / WORKING_NEEDLE_PX), side // MIN_SIDE_PX))
 
     def shrunk(self, factor: int) -> VisionTrackerSettings:
         """Return the settings for frames shrunk by a factor."""
         if factor == 1:
             return self
         shift = 0.5 * (factor - 1.0)
-        centre = tuple((value - shift) / factor for value in self.dish_centre_px)
+        centre = tuple(max(0.0, (value - shift) / factor) for value in self.dish_centre_px)  # the frame's corner is 0
         return replace(self, dish_centre_px=centre, metres_per_pixel=self.metres_per_pixel * factor)

@@ -121,7 +121,7 @@ class VisionTracker:
         check_image(image)
         factor = self._given.working_factor(image.shape, self._scene.dish.diameter)
         small, settings = shrunk(image, factor), self._given.shrunk(factor)
-        return _enlarged(look_once(small, settings, self._scene, lambda view: self._masked(small, view)), factor)
+        return _enlarged(look_once(small, settings, self._scene, lambda view: self._mask_for(small, view)), factor)
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame.
@@ -156,7 +156,7 @@ class VisionTracker:
             return no_pose(self._missing(), reason, view)
         if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
             self._last, self._anew = None, []
-        mask = self._masked(image, view)
+        mask = self._mask_for(image, view)
         chosen, picture, reason = self._choose(image, view, mask, time_s)
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
@@ -173,11 +173,11 @@ class VisionTracker:
     def _tracked(self, picture: Picture, view: DishView, needle: MeasuredNeedle) -> Track:
         """Return what a frame shows whose needle is known."""
         walk = centreline_of(picture, view, self._settings, self._scene.dish.diameter, needle)
-        assert self._dish.seen is not None
+        assert self._dish.found is not None
         found = tracked(picture, view, self._settings, needle, walk, self._missing())
-        return tilted(found, self._dish.seen, self._scene.dish.radius)
+        return tilted(found, self._dish.found, self._scene.dish.radius)
 
-    def _masked(self, image: np.ndarray, view: DishView) -> SceneMask | None:
+    def _mask_for(self, image: np.ndarray, view: DishView) -> SceneMask | None:
         """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
 
         The view is rounded, so that the noise of a dish found in every frame anew makes no new mask.

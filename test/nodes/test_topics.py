@@ -53,7 +53,10 @@ def test_the_overrides_take_effect(graph):
         for role, policies in roles.items()
         for policy, value in policies.items()
     }
+    shared = [(topic.qos.reliability, topic.qos.depth) for topic in (*topics.INPUTS, *topics.OUTPUTS)]
     node = graph.add(ThreadModelNode, **parameters)
+    # Of this node only: rclpy writes overrides into the profile it is given, which all nodes of a process share.
+    assert [(topic.qos.reliability, topic.qos.depth) for topic in (*topics.INPUTS, *topics.OUTPUTS)] == shared
     infos = node.get_subscriptions_info_by_topic("/needle/measured_cp")
     assert infos[0].qos_profile.reliability == ReliabilityPolicy.RELIABLE
     assert QoSProfile(depth=1).durability == DurabilityPolicy.VOLATILE

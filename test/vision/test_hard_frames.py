@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
 from benchmarks.vision.frames import DISH_RADIUS
 from benchmarks.vision.measurements import Row, frame_of, measure, row_of
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.vision.look import State
@@ -51,7 +53,7 @@ def test_dark_pale_thin_and_wide_threads_are_followed(name: str):
 
 
 @pytest.mark.parametrize("name", ["thread_undyed_1px", "thread_undyed_4px"])
-def test_of_a_thread_that_is_hardly_seen_nothing_else_is_followed(name: str):
+def test_nothing_else_is_followed_in_place_of_a_faint_thread(name: str):
     assert row(name).found == FRAMES
     assert (row(name).wrong_line or 0.0) < 0.01
 
@@ -66,12 +68,18 @@ def test_of_two_needles_the_one_that_a_thread_leaves_is_taken():
     assert row("second_needle").wrong == 0
 
 
+def test_a_needle_that_no_thread_leaves_is_not_taken_for_the_one_in_glare():
+    decoys = row("decoy_needle")
+    assert decoys.found == 0
+    assert any("no thread leaves" in reason for reason in decoys.reasons)
+
+
 @pytest.mark.parametrize("name", ["width_320", "width_1280", "width_1920", "dark_field"])
 def test_small_and_large_frames_and_a_dark_floor_are_tracked(name: str):
-    seen = row(name)
-    assert (seen.found, seen.unknown, seen.wrong, seen.covered_90) == (FRAMES, 0, 0, 1.0)
-    assert seen.tail_px is not None
-    assert seen.tail_px < 0.5
+    figures = row(name)
+    assert (figures.found, figures.unknown, figures.wrong, figures.covered_90) == (FRAMES, 0, 0, 1.0)
+    assert figures.tail_px is not None
+    assert figures.tail_px < 0.5
 
 
 @pytest.mark.parametrize("degrees", [6, 10])
@@ -109,3 +117,31 @@ def test_the_view_of_a_large_frame_is_in_its_own_pixels():
         np.testing.assert_allclose(seen.tail, found.tail, atol=1e-5)
         assert seen.view is not None
         np.testing.assert_allclose(seen.view.centre_px, (u, v))
+
+
+@pytest.mark.parametrize("name", ["usual", "dark_field"])
+def test_with_a_given_view_a_dim_floor_and_a_dark_one_are_told_apart(name: str):
+    case, image = frame_of(name, 0, SEED)
+    (u, v), scale = case.view.centre_px, case.view.metres_per_pixel
+    given = VisionTrackerSettings(dish_centre_px=(u, v), metres_per_pixel=scale, confirm_frames=1)
+    dim = image if name == "dark_field" else cv2.convertScaleAbs(image, alpha=0.4)
+    tracker = VisionTracker(given, SCENE)
+    for found in (tracker.look(dim), tracker.track(dim, 0.0), tracker.track(dim, 0.1)):
+        assert found.state is State.TRACKED
+        assert np.linalg.norm(found.tail - case.needle.tail) < 1.5 * scale
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (1e5, 1e5), (320.0, 240.0)])
+@pytest.mark.parametrize("scale", [1e-7, 1e-5, 0.01])
+def test_a_view_that_cannot_be_gives_no_pose_and_no_error(centre: tuple[float, float], scale: float):
+    given = VisionTrackerSettings(dish_centre_px=centre, metres_per_pixel=scale)
+    for width in (640, 1920):
+        image = frame_of(f"width_{width}", 0, SEED)[1]
+        for found in (VisionTracker(given, SCENE).look(image), VisionTracker(given, SCENE).track(image, 0.0)):
+            assert found.state is not State.TRACKED
+            assert found.reason
+
+
+def test_a_scale_that_no_camera_has_is_refused():
+    with pytest.raises(ConfigurationError, match="at least 1e-07 m"):
+        VisionTrackerSettings(metres_per_pixel=1e-12)

@@ -23,12 +23,10 @@ class Tilt:
     Attributes:
         angle: between its axis and the dish's normal [rad].
         direction: in the image, along which the dish looks shortened [rad], from u towards v.
-        stretch: of the image along it, that undoes the shortening.
     """
 
     angle: float
     direction: float
-    stretch: float
 
     def covariance(self, radius: float) -> np.ndarray:
         """Return what perspective leaves unknown of a place and a heading, shape (3, 3) [m, m, rad].
@@ -50,7 +48,7 @@ class Tilt:
     def corrected(self, image: np.ndarray, view: DishView) -> np.ndarray:
         """Return a frame stretched about the dish's centre, so that the dish is a circle."""
         along = np.array([math.cos(self.direction), math.sin(self.direction)])
-        back = np.eye(2) + (1.0 / self.stretch - 1.0) * np.outer(along, along)
+        back = np.eye(2) + (math.cos(self.angle) - 1.0) * np.outer(along, along)
         centre = np.array(view.centre_px)
         inverse = np.column_stack([back, centre - back @ centre])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -100,4 +98,4 @@ def find_tilt(gray: np.ndarray, view: DishView, diameter: float) -> tuple[Tilt |
     direction = 0.5 * math.atan2(float(shape[1]), float(shape[0])) + 0.5 * math.pi
     middle = (view.centre_px[0] + float(fitted[1]), view.centre_px[1] + float(fitted[2]))
     scale = view.metres_per_pixel * float(fitted[0]) / (float(fitted[0]) + half)
-    return Tilt(angle, direction, 1.0 / math.cos(angle)), DishView(middle, scale, view.rotation)
+    return Tilt(angle, direction), DishView(middle, scale, view.rotation)

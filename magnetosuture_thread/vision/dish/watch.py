@@ -27,24 +27,24 @@ class DishWatch:
         diameter: inner diameter of the dish [m].
 
     Attributes:
-        seen: the dish as it was found; None if it was not yet.
+        found: the dish as it was found; None if it was not yet.
     """
 
     def __init__(self, settings: VisionTrackerSettings, diameter: float) -> None:
         self._settings = settings
         self._diameter = diameter
         self._fixed = settings.fixed_view()
-        self.seen: FoundDish | None = None
+        self.found: FoundDish | None = None
         self._anew: list[FoundDish] = []
 
     @property
     def view(self) -> DishView | None:
         """Where the dish is; None if it was not found yet."""
-        return self._fixed or (self.seen.view if self.seen is not None else None)
+        return self._fixed or (self.found.view if self.found is not None else None)
 
     def forget(self) -> None:
         """Begin anew, as with a camera of another size."""
-        self.seen, self._anew = None, []
+        self.found, self._anew = None, []
 
     def look(self, image: np.ndarray) -> tuple[str, np.ndarray]:
         """Look at the rim in a frame.
@@ -56,13 +56,13 @@ class DishWatch:
             Why the view must not be used in this frame, empty if it may; and the frame as it is measured on, see
             `FoundDish.prepared`.
         """
-        if self._fixed is not None or self.seen is None:
-            self.seen = see_dish(image, self._settings, self._diameter)
-            if self.seen is None:
+        if self._fixed is not None or self.found is None:
+            self.found = see_dish(image, self._settings, self._diameter)
+            if self.found is None:
                 return "no dish in the image", image
-            return "", self.seen.prepared(image)
-        prepared = self.seen.prepared(image)
-        gray, view = measured_channel(prepared), self.seen.view
+            return "", self.found.prepared(image)
+        prepared = self.found.prepared(image)
+        gray, view = measured_channel(prepared), self.found.view
         shift, rays = rim_shift(gray, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
         seen = rays >= RIM_SHARE * RIM_RAYS
         if seen and shift < STILL_PX:
@@ -77,7 +77,7 @@ class DishWatch:
         self._anew.append(found)
         if len(self._anew) < AGREEING:
             return "the dish is not where it was", prepared
-        self.seen, self._anew = found, []
+        self.found, self._anew = found, []
         return "", found.prepared(image)
 
 

@@ -78,7 +78,7 @@ def measure_overlaid(
     fits.sort(key=lambda fit: fit.cost)
     found: MeasuredNeedle | str = "no arc"
     for rough in fits[:MAX_FITS]:
-        found = _judged(steel, rough, length, width, toward)
+        found = _checked(steel, rough, length, width, toward)
         if isinstance(found, MeasuredNeedle):
             found = found.shifted(steel.origin)
             corners = found.arc.at(np.array([0.0, length]))
@@ -207,7 +207,7 @@ def _walk(own, start, steps):
                     tail += 1
 
 
-def _judged(
+def _checked(
     steel: SteelMap,
     rough: TemplateFit,
     length: float,

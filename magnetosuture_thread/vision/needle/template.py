@@ -22,7 +22,7 @@ from magnetosuture_thread.vision.needle.strip import (
     TAIL_ERROR_PX,
     TAPER,
 )
-from magnetosuture_thread.vision.sampling import sample
+from magnetosuture_thread.vision.sampling import straighten
 
 BLUR_PX = 1.03  # of an edge, lens and sensor together
 THIN = 0.12  # of the body's width, that a point is ground to
@@ -126,16 +126,8 @@ def _draw(along, aside, length, half, bloom, thin, drawn):
 
 @compiled
 def _sample(steel, state, along, aside, seen):
-    """Fill in the image along and aside of an arc."""
-    u, v, angle, curvature = state[0], state[1], state[2], state[3]
-    for row in range(len(along)):
-        s = along[row]
-        turned = 0.5 * curvature * s
-        chord = s if abs(turned) < 1e-9 else s * math.sin(turned) / turned
-        x, y = u + chord * math.cos(angle + turned), v + chord * math.sin(angle + turned)
-        across, down = -math.sin(angle + 2.0 * turned), math.cos(angle + 2.0 * turned)
-        for column in range(len(aside)):
-            seen[row, column] = sample(steel, x + aside[column] * across, y + aside[column] * down)
+    """Fill in the image along and aside of the arc that a state begins with."""
+    straighten(steel, (state[0], state[1], state[2], state[3]), along, aside, seen)
 
 
 @compiled

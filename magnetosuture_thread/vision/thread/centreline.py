@@ -58,7 +58,7 @@ class _Ridge:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Walk:
     """A walk in pixels of the picture, shape (m, 2), how much thread it shows [px] and its strength [grey levels]."""
 
     points: np.ndarray
@@ -112,7 +112,7 @@ def find_centreline(
     _cover(hidden, factor, needle, (left, top))
     shade = SHADE * needle.contrast * middle(picture.darkest.floor)
 
-    def search(scale: int, *, pale: bool) -> _Seen:
+    def search(scale: int, *, pale: bool) -> _Walk:
         ridge = _ridge(window, hidden, factor, scale, pale)
         _clear_shade(ridge.strength, scale, needle, (left, top), shade)
         dish = (centre[0] - left, centre[1] - top, reach)
@@ -123,7 +123,7 @@ def find_centreline(
     return _best_of(search, ENOUGH * max_length).points
 
 
-def _best_of(search: Callable[..., _Seen], enough: float) -> _Seen:
+def _best_of(search: Callable[..., _Walk], enough: float) -> _Walk:
     """Return what shows most of the thread: dark or pale, thin or wide; each is looked for where it may be needed."""
     dark = search(1, pale=False)
     if dark.shown > enough and dark.strength > FAINT:
@@ -163,7 +163,7 @@ def _walked(
     max_length: float,
     at_wall: bool,
     picture: Picture,
-) -> _Seen:
+) -> _Walk:
     """Walk along a ridge that is shrunk by a scale; `dish` is its centre and how far a walk may go from it [px]."""
     shift = 0.5 * (scale - 1)
     max_length /= scale
@@ -192,7 +192,7 @@ def _walked(
         count, points = kept, points[:kept]
     refine(ridge.strength, points, strong[:count])
     strength = float(np.median(path[1:count, 4])) if count > 1 else 0.0
-    return _Seen(points * scale + shift + origin, shown * scale, strength)
+    return _Walk(points * scale + shift + origin, shown * scale, strength)
 
 
 def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:

@@ -19,6 +19,7 @@ FORWARD = math.cos(math.radians(28.0))  # ways along the needle are within this 
 START_PX = 3.0  # the first sample's distance from the tail
 START_STEPS = 8
 MIN_ON_RIDGE = START_STEPS - 3  # of these that show the thread
+FIRST = 3  # of these, of which one at most may show nothing
 STRONGEST = 80.0  # grey levels; more counts no more
 HIDDEN_PRICE = 0.01  # of the strength for each hidden pixel on the way
 APART_PX = 8.0  # that two ways end from each other
@@ -93,8 +94,8 @@ def _try(ridge, hidden, factor, noise, faintest, tail, arc, max_hidden, ways, en
         visible += 1
         if value > faintest:
             seen += 1
-        elif visible - seen > START_STEPS - MIN_ON_RIDGE:
-            return count
+        elif visible - seen > (START_STEPS - MIN_ON_RIDGE if visible > FIRST else 1):
+            return count  # At once if it does not begin at the tail, or where it comes out: that is another thread.
     strength = total / START_STEPS
     score = strength * (1.0 - HIDDEN_PRICE * below) * seen / START_STEPS  # a gap is no way out if there is another
     if strength < faintest or score <= 0.0:
