@@ -11,7 +11,7 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.find import RAYS, rim_points
 
-MIN_ANGLE = math.radians(2.5)  # below, the light moves the rim as much
+MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
 SURE = 4.0  # standard deviations that an ellipse is off a circle at least
 NEAR = 0.1  # of its distance from the camera, that the dish's radius is at most; more is hardly used over a dish
 

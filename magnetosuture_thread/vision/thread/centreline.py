@@ -17,7 +17,7 @@ from magnetosuture_thread.vision.thread.forks import follow
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.walk import refine
 
-FAINTEST = 5.0  # grey levels; a ridge fainter than this is noise
+FAINTEST = 3.0  # grey levels; a ridge fainter than this is noise
 FAINTEST_NOISES = 3.0  # and so is one fainter than so many times the median of all
 BLUR_PX = 0.7  # before the ridge is looked for: as wide as the thinnest thread looks
 WINDOW_PX = 7  # wider than the thread looks
@@ -31,6 +31,7 @@ BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can 
 ENOUGH = 0.85  # of the greatest length: so much thread seen, dark and strong, needs no other search
 FAINT = 25.0  # grey levels; a dark ridge fainter than this may be a pale thread's shadow
 PALE_SHARE = 0.6  # of what the dark ridge shows, that a pale one must show to be the thread
+SURE_SHARE = 0.5  # of enough, that a wide or a pale thread must show: a little of one may be noise
 WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
 _WINDOW = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WINDOW_PX, WINDOW_PX))
 
@@ -125,22 +126,21 @@ def find_centreline(
 
 def _best_of(search: Callable[..., _Walk], enough: float) -> _Walk:
     """Return what shows most of the thread: dark or pale, thin or wide; each is looked for where it may be needed."""
-    dark = search(1, pale=False)
+
+    def at_both_sizes(*, pale: bool) -> _Walk:
+        thin = search(1, pale=pale)
+        if thin.shown > enough:
+            return thin
+        wide = search(2, pale=pale)
+        return wide if wide.shown > max(WIDER_SHARE * thin.shown, SURE_SHARE * enough) else thin
+
+    dark = at_both_sizes(pale=False)
     if dark.shown > enough and dark.strength > FAINT:
         return dark
-    best = dark
-    if dark.shown < enough:
-        wide = search(2, pale=False)
-        if wide.shown > WIDER_SHARE * best.shown:
-            best = wide
-    pale = search(1, pale=True)
-    if pale.shown < enough:
-        wide = search(2, pale=True)
-        if wide.shown > WIDER_SHARE * pale.shown:
-            pale = wide
-    if pale.shown > PALE_SHARE * best.shown and pale.strength > best.strength * PALE_SHARE:
-        return pale
-    return best
+    pale = at_both_sizes(pale=True)
+    if pale.shown < max(PALE_SHARE * dark.shown, SURE_SHARE * enough):
+        return dark
+    return pale if dark.shown < SURE_SHARE * enough or pale.strength > PALE_SHARE * dark.strength else dark
 
 
 def _ridge(window: np.ndarray, hidden: np.ndarray, factor: int, scale: int, pale: bool) -> _Ridge:
