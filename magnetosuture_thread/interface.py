@@ -51,6 +51,7 @@ FILTER_STATE = Channel("needle/filter_state", "magnetosuture_msgs/msg/FilterStat
 NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
 NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
 MEASURED_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
+THREAD_OBSERVATION = Channel("thread/observation", "magnetosuture_msgs/msg/ThreadObservation")
 PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
 MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
 THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")

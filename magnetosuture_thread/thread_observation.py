@@ -1,0 +1,65 @@
+"""What the camera sees of the thread: pieces, which of their ends are real, and how much of the thread is hidden."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+
+
+class PieceEnd(IntEnum):
+    """Why a piece ends where it does; the numbers are those of `ThreadPiece.msg`."""
+
+    UNKNOWN = 0  # nothing tells
+    TAIL = 1  # the thread leaves the needle here
+    FREE = 2  # the thread itself ends here
+    COVERED = 3  # the thread goes on below what hides it
+    FRAME = 4  # the thread goes on outside of the frame
+
+
+@dataclass(frozen=True)
+class ThreadPiece:
+    """A piece of the thread that is seen without a gap.
+
+    Attributes:
+        points: along the piece, in the dish frame, shape (m, 2), m >= 2 [m].
+        deviation: standard deviation of each point across the piece, shape (m,) [m].
+        first_end: why it begins at `points[0]`.
+        last_end: why it ends at `points[-1]`.
+        arc_length: least and greatest arc length of `points[0]` from the needle's tail [m]; that of `points[k]` is larger
+            by the piece's length up to it. NaN where nothing tells.
+        direction_known: whether arc length surely grows along `points`. Where it is not, `arc_length` is of either end.
+        confidence: that the piece is of this thread, and in this place along it, 0 to 1.
+    """
+
+    points: Points
+    deviation: np.ndarray
+    first_end: PieceEnd
+    last_end: PieceEnd
+    arc_length: tuple[float, float]
+    direction_known: bool = True
+    confidence: float = 1.0
+
+    @property
+    def length(self) -> float:
+        """Length along the piece [m]."""
+        return float(arc_lengths(self.points)[-1])
+
+
+@dataclass(frozen=True)
+class ThreadObservation:
+    """What one frame shows of the thread.
+
+    Attributes:
+        pieces: the one that leaves the needle first, if it is seen; then the others in the order of their arc length, last
+            those of which it is unknown.
+        complete: whether one piece shows all of the thread, from the tail to the free end.
+        hidden: outlines of what the thread may lie below, in the dish frame, each of shape (m, 2), closed [m].
+    """
+
+    pieces: tuple[ThreadPiece, ...] = ()
+    complete: bool = False
+    hidden: tuple[Points, ...] = field(default=())
