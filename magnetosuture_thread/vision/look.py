@@ -14,14 +14,16 @@ from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.dish.tilt import Tilt, find_tilt
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
 
+LENGTH_TOLERANCE = 0.1  # of the needle's length as it is set
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
@@ -168,8 +170,10 @@ def needles_in(
     toward: np.ndarray | None = None,
 ) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find the needles in a picture, in its own pixels; see `find_needles`."""
-    radius, length, width = 0.5 * diameter, settings.needle_length, settings.needle_width
-    return find_needles(picture, _local(view, picture), radius, length, width, toward)
+    size = NeedleSize(
+        settings.needle_length / view.metres_per_pixel, settings.needle_width / view.metres_per_pixel, LENGTH_TOLERANCE
+    )
+    return find_needles(picture, _local(view, picture), 0.5 * diameter, size, toward)
 
 
 def why_none(refused: list[str]) -> str:

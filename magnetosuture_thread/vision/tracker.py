@@ -31,7 +31,7 @@ from magnetosuture_thread.vision.look import (
     why_none,
     with_thread,
 )
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 

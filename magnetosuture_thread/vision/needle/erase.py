@@ -8,9 +8,8 @@ import numpy as np
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.vision.images import Layer
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
-from magnetosuture_thread.vision.needle.strip import TAPER
-from magnetosuture_thread.vision.needle.template import BLOOM_PX, BLUR_PX, THIN, edge
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.template import BLOOM_PX, BLUR_PX, TAPER, THIN, edge
 
 BESIDE_PX = 2.0 * BLUR_PX  # of the drawn outline, up to which light of the needle is mixed in
 

@@ -1,4 +1,4 @@
-"""Fits a drawn needle of known length to the image, where a thread beside, under or over it hides its edges.
+"""Fits a drawn needle to the image, also where a thread beside, under or over it hides its edges.
 
 The drawn needle is a body of one width whose last fifth tapers, or a rod, seen through the lens. Steel that it has and
 the image lacks counts in full, as nothing makes steel bright; dark that the image has and it lacks may be a thread, and
@@ -14,16 +14,10 @@ import numpy as np
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.steel import SHADOW, STEEL, SteelMap
-from magnetosuture_thread.vision.needle.strip import (
-    ANGLE_ERROR,
-    ASIDE_ERROR_PX,
-    CORRELATED_ROWS,
-    TAIL_ERROR_PX,
-    TAPER,
-)
+from magnetosuture_thread.vision.needle.steel_map import SHADOW, STEEL, SteelMap
 from magnetosuture_thread.vision.sampling import straighten
 
+TAPER = 0.2  # of the length, towards the tip
 BLUR_PX = 1.03  # of an edge, lens and sensor together
 THIN = 0.12  # of the body's width, that a point is ground to
 BESIDE_PX = 4.0  # beside and beyond the body, that is compared too
@@ -34,7 +28,11 @@ WIDTH_SLACK_PX, WIDTH_SLACK = 0.2, 0.03  # standard deviation of the body's widt
 MAX_STEP_PX, LAST_STEP_PX = 1.5, 0.02  # of a round; after a smaller one the fit is done
 PULL = 3.5  # times the variance by noise alone, as a thread beside the needle pulls all rows to one side
 DAMPING = 0.05  # of places along and aside, that of all others accordingly
-PARAMETERS = 5
+PARAMETERS = 6
+LENGTH_BEYOND = 1.1  # times the tolerance of the length, that a fit may reach
+CORRELATED_ROWS = 3.0  # rows whose error is one and the same, by the lens' blur
+# What no fit's residual tells of: most likely for the errors over hundreds of simulated poses, needles and image sizes.
+TAIL_ERROR_PX, ASIDE_ERROR_PX, ANGLE_ERROR = 0.2, 0.095, math.radians(0.085)
 
 
 @dataclass(frozen=True)
@@ -63,35 +61,47 @@ class TemplateFit:
 
 
 def fit_template(
-    steel: SteelMap, guess: Arc, length: float, width: float, *, rod: bool = False, rounds: int = 12
+    steel: SteelMap,
+    guess: Arc,
+    length: float,
+    width: float,
+    *,
+    tolerance: float = 0.0,
+    start: float = 0.0,
+    rod: bool = False,
+    rounds: int = 12,
 ) -> TemplateFit:
     """Fit a drawn needle to an image of steel.
 
         minimise  sum w(r) r^2,    r = min(perhaps(x(s, d)) - drawn(s, d), 0) + max(surely(x(s, d)) - drawn(s, d), 0),
         w = 1 where r < 0,  (1 + (r / `OTHER`)^2)^-2 elsewhere
 
-    by Gauss-Newton steps, over the place along and aside of the axis, its angle, its curvature and the width.
+    by Gauss-Newton steps, over the place along and aside of the axis, its angle, its curvature, the width and the
+    length.
 
     Args:
         steel: the image.
         guess: axis from the tail on, at most some 2 px off.
-        length: of the needle [px].
+        length: of the needle, as far as it is known [px].
         width: of its body [px].
+        tolerance: share of the length that it may be off, two standard deviations; 0: it is kept.
+        start: length to begin with [px]; 0: as known.
         rod: whether both ends are blunt.
         rounds: steps at most.
     """
     half = 0.5 * width
-    state = np.array([guess.start[0], guess.start[1], guess.angle, guess.curvature, half + BLOOM_PX])
+    state = np.array([guess.start[0], guess.start[1], guess.angle, guess.curvature, half + BLOOM_PX, start or length])
     normal = np.zeros((PARAMETERS, PARAMETERS))
-    deviation = 0.5 * (WIDTH_SLACK_PX + WIDTH_SLACK * width)
+    deviations = 0.5 * (WIDTH_SLACK_PX + WIDTH_SLACK * width), 0.5 * tolerance * length
     thin = 1.0 if rod else THIN
-    cost, missing, count = _fit(steel.surely, steel.perhaps, state, length, half, deviation, thin, rounds, normal)
-    arc = Arc(state[:2].copy(), float(state[2]), float(state[3]))
-    covariance = _at_tail(np.linalg.inv(normal), 0.5 * length) * PULL * CORRELATED_ROWS * cost / count
+    cost, missing, count = _fit(steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, normal)
+    arc, fitted = Arc(state[:2].copy(), float(state[2]), float(state[3])), float(state[5])
+    inverse = np.linalg.inv(normal) * PULL * CORRELATED_ROWS * cost / count
+    covariance = _at_tail(inverse, 0.5 * fitted)
     lengthwise = np.array([1.0, 0.0, arc.curvature])
     covariance += np.diag([0.0, ASIDE_ERROR_PX**2, ANGLE_ERROR**2])
     covariance += TAIL_ERROR_PX**2 * np.outer(lengthwise, lengthwise)
-    return TemplateFit(arc, length, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, covariance)
+    return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, covariance)
 
 
 def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:
@@ -131,32 +141,46 @@ def _sample(steel, state, along, aside, seen):
 
 
 @compiled
-def _fit(surely, perhaps, state, length, half, deviation, thin, rounds, normal):
-    """Fit; `state` (u, v, angle, curvature, half width) is changed, `normal` filled.
+def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal):
+    """Fit; `state` (u, v, angle, curvature, half width, length) is changed, `normal` filled.
 
-    The latter is that of (along, aside, angle, bend, half width).
+    The latter is that of (along, aside, angle, bend, half width, length).
 
     Place, angle and bend are those of the arc's middle, where they depend least on each other.
 
     Returns:
         Cost [px^2], missing steel [px^2], and the number of samples.
     """
-    rows, columns = int(length + 2.0 * BESIDE_PX) + 1, 2 * int((half + BESIDE_PX) / STEP_PX) + 1
-    along, aside = np.arange(rows) - BESIDE_PX, (np.arange(columns) - columns // 2) * STEP_PX
-    least, most = np.empty((rows, columns)), np.empty((rows, columns))
-    drawn, wider = np.empty((rows, columns)), np.empty((rows, columns))
+    longest = length + LENGTH_BEYOND * 2.0 * deviations[1]
+    shortest = 2.0 * length - longest
+    free = deviations[1] > 0.0
+    columns = 2 * int((half + BESIDE_PX) / STEP_PX) + 1
+    most_rows = int(longest + 2.0 * BESIDE_PX) + 1
+    aside = (np.arange(columns) - columns // 2) * STEP_PX
+    all_least, all_most = np.empty((most_rows, columns)), np.empty((most_rows, columns))
+    all_drawn, all_wider = np.empty((most_rows, columns)), np.empty((most_rows, columns))
+    all_longer = np.empty((most_rows, columns))
     right, slope, own = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
-    best, best_missing, best_state = np.inf, 0.0, state.copy()
-    middle, widened = 0.5 * length, 0.1
-    prior = OTHER * OTHER / (deviation * deviation)
+    best, best_missing, best_state, samples = np.inf, 0.0, state.copy(), 1
+    step = 0.1
+    prior = OTHER * OTHER / (deviations[0] * deviations[0])
+    length_prior = OTHER * OTHER / (deviations[1] * deviations[1]) if free else 1.0
     for _ in range(rounds):
-        bloom = state[4] - half
+        bloom, own_length = state[4] - half, state[5]
+        middle = 0.5 * own_length
+        rows = min(int(own_length + 2.0 * BESIDE_PX) + 1, most_rows)
+        along = np.arange(rows) - BESIDE_PX
+        least, most, drawn = all_least[:rows], all_most[:rows], all_drawn[:rows]
+        wider, longer = all_wider[:rows], all_longer[:rows]
         _sample(surely, state, along, aside, least)
         _sample(perhaps, state, along, aside, most)
-        _draw(along, aside, length, half, bloom, thin, drawn)
-        _draw(along, aside, length, half, bloom + widened, thin, wider)
+        _draw(along, aside, own_length, half, bloom, thin, drawn)
+        _draw(along, aside, own_length, half, bloom + step, thin, wider)
+        if free:
+            _draw(along, aside, own_length + step, half, bloom, thin, longer)
         own[:], right[:] = 0.0, 0.0
         cost, missing = 0.0, 0.0
+        slope[5] = 0.0
         for row in range(1, rows - 1):
             t = along[row] - middle
             for column in range(1, columns - 1):
@@ -177,7 +201,9 @@ def _fit(surely, perhaps, state, length, half, deviation, thin, rounds, normal):
                 slope[1] = side
                 slope[2] = t * side
                 slope[3] = 0.5 * (t * t - middle * middle / 3.0) * side
-                slope[4] = (drawn[row, column] - wider[row, column]) / widened
+                slope[4] = (drawn[row, column] - wider[row, column]) / step
+                if free:
+                    slope[5] = (drawn[row, column] - longer[row, column]) / step
                 for i in range(PARAMETERS):
                     right[i] -= weight * slope[i] * apart
                     for j in range(i + 1):
@@ -189,17 +215,22 @@ def _fit(surely, perhaps, state, length, half, deviation, thin, rounds, normal):
                 own[j, i] = own[i, j]
         own[4, 4] += prior
         right[4] -= prior * (bloom - BLOOM_PX)
+        own[5, 5] += length_prior
+        right[5] -= length_prior * (own_length - length) if free else 0.0
         own[0, 0] += DAMPING
         own[1, 1] += DAMPING
         own[2, 2] += DAMPING * middle**2 / 3.0
         own[3, 3] += DAMPING * middle**4 / 45.0
         cost = cost * STEP_PX + prior * (bloom - BLOOM_PX) ** 2
+        if free:
+            cost += length_prior * (own_length - length) ** 2
         if cost < best:
-            best, best_missing = cost, missing * STEP_PX
+            best, best_missing, samples = cost, missing * STEP_PX, rows * columns
             best_state[:] = state
             normal[:] = own
         change = np.linalg.solve(own, right)
         largest = max(abs(change[0]), abs(change[1]), abs(change[2]) * middle, abs(change[3]) * 0.5 * middle * middle)
+        largest = max(largest, abs(change[5]))
         if largest > MAX_STEP_PX:
             change *= MAX_STEP_PX / largest
         # What the middle is turned and bent by moves the tail, where the arc begins.
@@ -210,10 +241,11 @@ def _fit(surely, perhaps, state, length, half, deviation, thin, rounds, normal):
         state[2] += change[2] - change[3] * middle + change[0] * state[3]
         state[3] += change[3]
         state[4] = min(max(state[4] + change[4], 0.6 * half), 1.6 * half + BLOOM_PX)
+        state[5] = min(max(state[5] + change[5], shortest), longest)
         if largest < LAST_STEP_PX:
             break
     state[:] = best_state
-    return best, best_missing, rows * columns
+    return best, best_missing, samples
 
 
 @compiled

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall, glare_mask, without_wall
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.erase import without_needle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.forks import follow
 from magnetosuture_thread.vision.thread.outlines import count_off_outline

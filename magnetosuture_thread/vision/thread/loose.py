@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.vision.images import Picture, Wall
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 
 WINDOW_PX = 7  # wider than the thread looks

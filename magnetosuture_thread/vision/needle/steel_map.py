@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +12,11 @@ from magnetosuture_thread.vision.images import Layer, Wall
 
 AROUND_PX = 12.0  # around a dark thing, that is measured on
 DARKEST = 0.9  # quantile of its darkness that steel has
+LIGHT_PX = 3  # that the light is averaged over
+GLARE, GLARE_REACH_PX = (
+    0.07,
+    4,
+)  # of the floor's brightness, that the lamp's reflection is brighter by; looked for so near
 SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
 
 
@@ -22,6 +28,8 @@ class SteelMap:
         surely: by the brightest of the three colours, in which steel alone is dark, shape (rows, columns), 0 to 1.
         perhaps: by the darkest of them, in which a coloured thread is dark too; the same without colours.
         depth: darkness of steel, 0 to 1.
+        light: how much brighter than the floor, as a share of it, the brightest colour is around each pixel,
+            shape (rows, columns).
         pixels: the darkest colour, shape (rows, columns), uint8.
         origin: (u, v) of the first pixel in the picture.
         size: width and height of the picture [px].
@@ -31,6 +39,7 @@ class SteelMap:
     surely: NDArray[np.float32]
     perhaps: NDArray[np.float32]
     depth: float
+    light: NDArray[np.float32]
     pixels: NDArray[np.uint8]
     origin: tuple[float, float]
     size: tuple[int, int]
@@ -53,6 +62,15 @@ class SteelMap:
         rows, columns = self.hidden.shape
         u, v = np.round(points).astype(int).T
         return float(self.hidden[v.clip(0, rows - 1), u.clip(0, columns - 1)].mean())
+
+    def is_glaring(self, points: np.ndarray) -> bool:
+        """Say whether the lamp is reflected within a few pixels of points, in the map's own pixels, shape (m, 2)."""
+        rows, columns = self.light.shape
+        reach = np.arange(-GLARE_REACH_PX, GLARE_REACH_PX + 1)
+        u = np.round(points[:, :1]).astype(int) + reach
+        v = np.round(points[:, 1:]).astype(int) + reach
+        near = self.light[v.clip(0, rows - 1)[:, :, None], u.clip(0, columns - 1)[:, None, :]]
+        return float(near.max()) > GLARE
 
     @property
     def box(self) -> tuple[slice, slice]:
@@ -87,7 +105,8 @@ class SteelMap:
         surely = _share(dark, depth)
         perhaps = surely if darkest is brightest else _share(_darkness(darkest, box, factor, wall), depth)
         pixels = np.ascontiguousarray(darkest.pixels[box])
-        return SteelMap(surely, perhaps, depth, pixels, (float(left), float(top)), (columns, rows))
+        light = np.asarray(cv2.blur(-dark, (LIGHT_PX, LIGHT_PX)), dtype=np.float32)
+        return SteelMap(surely, perhaps, depth, light, pixels, (float(left), float(top)), (columns, rows))
 
 
 def _darkness(channel: Layer, box: tuple[slice, slice], factor: int, wall: Wall) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Measures a needle in a dark component that holds its thread too: beside, under or over it, or as dark as it."""
+"""Measures the needle in a dark component, which may hold its thread too: beside, under or over it, as dark as it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
-from magnetosuture_thread.vision.needle.steel import SteelMap
+from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.needle.axis_guesses import axis_guesses
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.size import NeedleSize
+from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.needle.template import (
     BLOOM_PX,
     THIN,
@@ -26,11 +27,9 @@ from magnetosuture_thread.vision.thread.leave import ways_out
 
 FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this
 LEVELS = (0.5, 0.7)  # share of steel that is dark: more of a thread over the needle is, less of one beside it
-CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no thin thread
-MAX_WIDTH = 2.6  # of the body's: what is wider is neither needle nor thread, nor both
-MIN_CORE = 0.25  # of the needle's area
-MAX_CORES, MAX_ENDS, MAX_FITS = 3, 5, 3
-LONG = 1.35  # of the needle's length: a longer core holds thread
+MAX_FITS = 3
+GLARE_PX = 4.0  # beyond an end, that the lamp may not be reflected at
+SAME_PX = 1.5  # that both ends of two guesses may differ by
 FIRST_ROUNDS = 4
 MAX_COST = 0.11  # of the length, in squared pixels
 MAX_MISSING, MISSING_ROWS = 0.13, 5  # of the steel of so many rows, that the image may lack
@@ -48,24 +47,20 @@ CLEARLY = 1.25  # times the cost that the other way has if both could be
 ROD = 0.87  # bluntness of both ends of a rod
 ROD_COST = 0.9  # of the cost of a pointed needle, that a rod has at most
 LEAVES = 2.0  # how much stronger a thread leaves the tail than the tip
-THREAD = 0.8  # of the needle's length, that a thread leads away from it at least
 WINDOW_PX = 7  # wider than a thin thread looks
 ALIKE = "ends that look alike"
 TOWARD = 0.8  # cosine between a needle and where it must point
 
 
-def measure_overlaid(
-    steel: SteelMap, length: float, width: float, toward: np.ndarray | None = None
-) -> MeasuredNeedle | str:
-    """Measure the needle in a dark component that is more than a needle.
+def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None = None) -> MeasuredNeedle | str:
+    """Measure the needle in a dark component.
 
     Axes are guessed by what is as deep in the dark as the body's middle, and by its ends; a drawn needle is fitted from
     each. Of the best fits the first is taken that nothing covers and of which tail and tip can be told apart.
 
     Args:
         steel: the image around it.
-        length: of the needle [px].
-        width: of its body [px].
+        size: of the needle.
         toward: where it must point, u right and v down; see `find_needles`.
 
     Returns:
@@ -73,15 +68,20 @@ def measure_overlaid(
     """
     if steel.depth < FAINTEST:
         return "too faint"
-    guesses = [guess for level in LEVELS for guess in _guesses(steel.surely > level, length, width)]
+    length, width = size.length_px, size.width_px
+    guesses: list[Arc] = []
+    for level in LEVELS:
+        for guess in axis_guesses(steel.surely > level, length, width):
+            if not any(_is_same(guess, other, length) for other in guesses):
+                guesses.append(guess)
     fits = [fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS) for guess in guesses]
     fits.sort(key=lambda fit: fit.cost)
     found: MeasuredNeedle | str = "no arc"
     for rough in fits[:MAX_FITS]:
-        found = _checked(steel, rough, length, width, toward)
+        found = _checked(steel, rough, size, toward)
         if isinstance(found, MeasuredNeedle):
             found = found.shifted(steel.origin)
-            corners = found.arc.at(np.array([0.0, length]))
+            corners = found.arc.at(np.array([0.0, found.length_px]))
             if corners.min() < 3.0 or (corners > np.array(steel.size) - 4.0).any():
                 return "cut by the image's border"
             return found
@@ -90,142 +90,33 @@ def measure_overlaid(
     return found
 
 
-def points_forward(steel: SteelMap, needle: MeasuredNeedle) -> bool:
-    """Say whether a needle's tail is blunt and its tip is not, also where a thread lies beside one of them."""
-    arc = needle.shifted((-steel.origin[0], -steel.origin[1])).arc
-    tail, tip = _bluntness(steel, arc, needle.length_px, needle.width_px)
-    return tail > BLUNT and tip < POINTED
-
-
-def _guesses(dark: np.ndarray, length: float, width: float) -> list[Arc]:
-    """Return axes from the tail on that a needle may have, by what of a dark component is as wide as it."""
-    deep = cv2.distanceTransform(dark.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    if deep.max() > 0.5 * MAX_WIDTH * width + 1.0:
-        return []
-    inset = CORE * width
-    core = (deep > inset).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
-    result: list[Arc] = []
-    areas = stats[1:, cv2.CC_STAT_AREA]
-    for label in 1 + np.argsort(-areas)[:MAX_CORES]:
-        if stats[label, cv2.CC_STAT_AREA] < MIN_CORE * (1.0 - 2.0 * CORE) * length * width:
-            continue
-        own = (labels == label).astype(np.uint8)
-        rows, columns = np.nonzero(own)
-        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
-        if guess is None:
-            continue
-        arc, first, last = guess
-        if last - first < 0.5 * length:
-            continue
-        if last - first < LONG * length:
-            result += _both(arc, first - inset, last + inset, length)
-        else:
-            result += _from_ends(own, length, width)
-    return result
-
-
-def _both(arc: Arc, first: float, last: float, length: float) -> list[Arc]:
-    """Return an axis in both directions, each with its tail where the dark begins."""
-    forward = arc.moved(first, 0.0, 0.0, 0.0)
-    return [forward, arc.reversed_at(last), forward.reversed_at(length), arc.reversed_at(last).reversed_at(length)]
-
-
-def _from_ends(own: np.ndarray, length: float, width: float) -> list[Arc]:
-    """Return axes that begin or end at the ends of a long, winding core."""
-    result: list[Arc] = []
-    rows, columns = np.nonzero(own)
-    steps = np.empty(own.shape, np.int32)
-    _walk(own, _pixel(own, rows[0], columns[0]), steps)
-    last = int(np.argmax(steps))
-    _walk(own, _pixel(own, last // own.shape[1], last % own.shape[1]), steps)
-    size = 2 * int(0.5 * width + 2.0) + 1
-    highest = cv2.dilate(steps.astype(np.float32), np.ones((size, size), np.uint8))
-    at = np.argwhere((steps == highest) & (own > 0))
-    ends = [np.array([last // own.shape[1], last % own.shape[1]])]
-    for place in at[np.argsort(-steps[at[:, 0], at[:, 1]])]:
-        if len(ends) < MAX_ENDS and min(np.abs(place - other).max() for other in ends) > size:
-            ends.append(place)
-    for row, column in ends:
-        _walk(own, _pixel(own, row, column), steps)
-        rows, columns = np.nonzero((steps >= 0) & (steps < 0.8 * length))
-        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
-        if guess is None:
-            continue
-        arc, first, final = guess
-        end = float(arc.coordinates(np.array([[column, row]], float))[0][0])
-        # From the end inwards; a point reaches farther than its core, by the part that is too thin for it.
-        inwards = arc.moved(first, 0.0, 0.0, 0.0) if end - first < final - end else arc.reversed_at(final)
-        for beyond in (0.1 * length, 0.03 * length):
-            result.append(inwards.moved(-beyond, 0.0, 0.0, 0.0).reversed_at(length))
-        result.append(inwards.moved(-CORE * width, 0.0, 0.0, 0.0))
-    return result
-
-
-def _pixel(own: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Return an image of one pixel."""
-    result = np.zeros_like(own)
-    result[row, column] = 1
-    return result
-
-
-def _axis_of(points: np.ndarray, width: float) -> tuple[Arc, float, float] | None:
-    """Return an arc through most of the points, and the lengths along it between which these lie."""
-    kept = points
-    for _ in range(4):
-        if len(kept) < 8:
-            return None
-        arc = fit_arc(kept)
-        along, aside = arc.coordinates(points)
-        near = np.abs(aside) < max(0.5 * width, 1.5 * middle(np.abs(aside)))
-        kept = points[near]
-    return arc, float(along[near].min()), float(along[near].max())
-
-
-@compiled
-def _walk(own, start, steps):
-    """Fill in how many steps from the nearest pixel of a start each pixel of its components is, -1 elsewhere."""
-    steps[:] = -1
-    rows, columns = own.shape
-    queue = np.empty((rows * columns, 2), np.int32)
-    head, tail = 0, 0
-    for y in range(rows):
-        for x in range(columns):
-            if start[y, x] != 0:
-                steps[y, x] = 0
-                queue[tail, 0], queue[tail, 1] = y, x
-                tail += 1
-    while head < tail:
-        r, c = queue[head]
-        head += 1
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                y, x = r + i, c + j
-                if 0 <= y < rows and 0 <= x < columns and own[y, x] != 0 and steps[y, x] < 0:
-                    steps[y, x] = steps[r, c] + 1
-                    queue[tail, 0], queue[tail, 1] = y, x
-                    tail += 1
+def _is_same(one: Arc, other: Arc, length: float) -> bool:
+    """Say whether two axes of a length have their ends at the same places [px]."""
+    ends = np.array([0.0, length])
+    return bool(np.abs(one.at(ends) - other.at(ends)).max() < SAME_PX)
 
 
 def _checked(
     steel: SteelMap,
     rough: TemplateFit,
-    length: float,
-    width: float,
+    size: NeedleSize,
     toward: np.ndarray | None,
 ) -> MeasuredNeedle | str:
     """Fit to the end, in both directions; return the needle if all looks like one, in one direction."""
-    one = fit_template(steel, rough.arc, length, width)
-    other = fit_template(steel, one.reversed(), length, width)
-    one = min((one, fit_template(steel, other.reversed(), length, width)), key=lambda each: each.cost)
-    rod = fit_template(steel, one.arc, length, width, rod=True)
+    width = size.width_px
+    one, other, rod = _fits(steel, rough, size, size.tolerance)
     best = min((one, other, rod), key=lambda each: each.cost)
+    is_measured = size.tolerance > 0.0
+    if is_measured and not _shows_ends(steel, best, size):
+        is_measured = False
+        one, other, rod = _fits(steel, rough, size, 0.0)
+        best = min((one, other, rod), key=lambda each: each.cost)
     reason = _what_covers(steel, best, width)
     if reason:
         return reason
-    if steel.share_hidden(best.arc.at(np.linspace(0.0, length, AXIS_POINTS))) > MAX_HIDDEN:
+    if steel.share_hidden(best.arc.at(np.linspace(0.0, best.length, AXIS_POINTS))) > MAX_HIDDEN:
         return "hidden"
-    if abs(best.arc.curvature) * length > 1.25 * math.pi:
+    if abs(best.arc.curvature) * best.length > 1.25 * math.pi:
         return "bent beyond a half circle"
     around = _excess(steel, best, width)
     if max(around[4], around[5]) > MAX_BESIDE:
@@ -240,13 +131,53 @@ def _checked(
     reason = _what_prolongs(steel, fit, width, is_known)
     if reason:
         return reason
-    confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * length)) ** 0.5
+    confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     confidence *= max(0.2, 1.0 - 2.0 * float(fit.covariance[1, 1]))
     covariance = fit.covariance
+    if not is_measured:
+        lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
+        covariance = covariance + (0.5 * size.tolerance * size.length_px) ** 2 * np.outer(lengthwise, lengthwise)
     if not is_known:
-        covariance = covariance + np.diag([length**2, 0.0, math.pi**2])
+        covariance = covariance + np.diag([fit.length**2, 0.0, math.pi**2])
         confidence *= 0.5
-    return MeasuredNeedle(fit.arc, length, fit.width, steel.depth, max(0.05, float(confidence)), covariance, is_known)
+    return MeasuredNeedle(
+        arc=fit.arc,
+        length_px=fit.length,
+        width_px=fit.width,
+        contrast=steel.depth,
+        confidence=max(0.05, float(confidence)),
+        covariance=covariance,
+        heading_known=is_known,
+        size_measured=is_measured,
+    )
+
+
+def _fits(
+    steel: SteelMap, rough: TemplateFit, size: NeedleSize, tolerance: float
+) -> tuple[TemplateFit, TemplateFit, TemplateFit]:
+    """Fit a pointed needle, the same the other way round, and a rod."""
+    length, width = size.length_px, size.width_px
+    one = fit_template(steel, rough.arc, length, width, tolerance=tolerance)
+    other = fit_template(steel, one.reversed(), length, width, tolerance=tolerance, start=one.length)
+    if other.cost < one.cost:  # which then may be caught beside the best place
+        again = fit_template(steel, other.reversed(), length, width, tolerance=tolerance, start=other.length)
+        one = min((one, again), key=lambda each: each.cost)
+    rod = fit_template(steel, one.arc, length, width, tolerance=tolerance, start=one.length, rod=True)
+    return one, other, rod
+
+
+def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
+    """Say whether both ends of a needle are seen where its length says, so that the length is measured.
+
+    Beyond an end that something as wide and dark goes on from, or the lamp is reflected at, the needle may go on.
+    """
+    if abs(fit.length - size.length_px) > size.tolerance * size.length_px:
+        return False
+    beyond = np.empty(6)
+    excess(steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * size.width_px, beyond)
+    if beyond[2:4].max() > MAX_BEYOND:
+        return False
+    return not steel.is_glaring(fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX])))
 
 
 def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> TemplateFit | None:

@@ -1,0 +1,58 @@
+"""The needle as it was measured in an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magnetosuture_thread.vision.needle.arc import Arc
+
+
+@dataclass(frozen=True)
+class MeasuredNeedle:
+    """The needle in the image.
+
+    Attributes:
+        arc: its axis from the tail on.
+        length_px: of the axis, from tail to tip [px].
+        width_px: mean width of the body [px].
+        contrast: darkness of the body as a share of the floor's brightness, 0 to 1.
+        confidence: how well all fits, 0 to 1.
+        covariance: of the tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3).
+        heading_known: whether it is told which end is the tail.
+        size_measured: whether the length was measured, and not only known before.
+    """
+
+    arc: Arc
+    length_px: float
+    width_px: float
+    contrast: float = 1.0
+    confidence: float = 1.0
+    covariance: np.ndarray | None = None
+    heading_known: bool = True
+    size_measured: bool = False
+
+    def shifted(self, offset: tuple[float, float]) -> MeasuredNeedle:
+        """Return the needle in pixels that begin elsewhere."""
+        return replace(self, arc=replace(self.arc, start=self.arc.start + offset))
+
+    @property
+    def tail_px(self) -> np.ndarray:
+        """The blunt end, shape (2,) [px]."""
+        return self.arc.start
+
+    @property
+    def tip_px(self) -> np.ndarray:
+        """The pointed end, shape (2,) [px]."""
+        return self.arc.at(self.length_px)
+
+    @property
+    def direction_px(self) -> np.ndarray:
+        """Unit tangent at the tail, u right and v down, shape (2,)."""
+        return self.arc.direction()
+
+    @property
+    def curvature_px(self) -> float:
+        """Of the axis [1/px]; positive turns from u towards v, clockwise as seen."""
+        return self.arc.curvature
