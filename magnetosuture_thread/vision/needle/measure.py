@@ -22,13 +22,17 @@ from magnetosuture_thread.vision.needle.template import (
     fit_template,
     steel_rows,
 )
-from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.sampling import middle, straighten
 from magnetosuture_thread.vision.thread.leave import ways_out
 
 FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this
 LEVELS = (0.5, 0.7)  # share of steel that is dark: more of a thread over the needle is, less of one beside it
 MAX_FITS = 3
+MAX_OFF = 1.2  # times the tolerance of the length, that a measured one may be off
+GOES_ON = 0.45  # of the body's width beyond an end that is dark where the needle may go on
+MIN_CHANGE = 0.4  # of the tolerance, by which what is dark is longer or shorter where another length is tried too
 GLARE_PX = 4.0  # beyond an end, that the lamp may not be reflected at
+ROUGH, MORE_PX = 0.08, 3.0  # of the length, that a first guess may be off; more than is dark, to begin a fit with
 SAME_PX = 1.5  # that both ends of two guesses may differ by
 FIRST_ROUNDS = 4
 MAX_COST = 0.11  # of the length, in squared pixels
@@ -45,7 +49,9 @@ BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
 NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and of what is no tip at least
 CLEARLY = 1.25  # times the cost that the other way has if both could be
 ROD = 0.87  # bluntness of both ends of a rod
-ROD_COST = 0.9  # of the cost of a pointed needle, that a rod has at most
+ROD_GAIN = 0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
+PASSES, PASSES_PX = 0.3, 0.3  # of the width and beside it, off the middle of an end, where a thread passes and leaves not
+SEEN_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
 LEAVES = 2.0  # how much stronger a thread leaves the tail than the tip
 WINDOW_PX = 7  # wider than a thin thread looks
 ALIKE = "ends that look alike"
@@ -157,7 +163,13 @@ def _fits(
 ) -> tuple[TemplateFit, TemplateFit, TemplateFit]:
     """Fit a pointed needle, the same the other way round, and a rod."""
     length, width = size.length_px, size.width_px
-    one = fit_template(steel, rough.arc, length, width, tolerance=tolerance)
+    starts = [(rough.arc, length)]
+    if tolerance:
+        part = _dark_part(steel, rough.arc, size)
+        if abs(part[1] - length) > MIN_CHANGE * tolerance * length:
+            starts.append(part)
+    ones = [fit_template(steel, arc, length, width, tolerance=tolerance, start=start) for arc, start in starts]
+    one = min(ones, key=lambda each: each.cost)
     other = fit_template(steel, one.reversed(), length, width, tolerance=tolerance, start=one.length)
     if other.cost < one.cost:  # which then may be caught beside the best place
         again = fit_template(steel, other.reversed(), length, width, tolerance=tolerance, start=other.length)
@@ -166,16 +178,32 @@ def _fits(
     return one, other, rod
 
 
+def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]:
+    """Return the part of an axis that is dark, with a little more: what a fit lacks draws it in from farther away."""
+    length, slack = size.length_px, (size.tolerance + ROUGH) * size.length_px
+    along = np.arange(-slack, length + slack)
+    dark = np.empty((len(along), 3))
+    axis = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
+    straighten(steel.surely, axis, along, np.array([-0.2, 0.0, 0.2]) * size.width_px, dark)
+    light = np.flatnonzero(dark.min(axis=1) < 0.5)
+    half = len(along) // 2
+    first = along[light[light < half].max(initial=-1) + 1]
+    last = along[light[light >= half].min(initial=len(along)) - 1]
+    if last - first > (1.0 + size.tolerance) * length:
+        return arc, length
+    return arc.moved(float(first), 0.0, 0.0, 0.0), min(float(last - first) + MORE_PX, (1.0 + size.tolerance) * length)
+
+
 def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """Say whether both ends of a needle are seen where its length says, so that the length is measured.
 
     Beyond an end that something as wide and dark goes on from, or the lamp is reflected at, the needle may go on.
     """
-    if abs(fit.length - size.length_px) > size.tolerance * size.length_px:
+    if abs(fit.length - size.length_px) > MAX_OFF * size.tolerance * size.length_px:
         return False
     beyond = np.empty(6)
     excess(steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * size.width_px, beyond)
-    if beyond[2:4].max() > MAX_BEYOND:
+    if beyond[2:4].max() > GOES_ON:
         return False
     return not steel.is_glaring(fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX])))
 
@@ -255,17 +283,47 @@ def _settled(
     A thread leaves the tail of a rod. Of another needle it may lie over the point, which tells nothing. Where neither
     is so, None: the length may be another's.
     """
-    is_rod = rod.cost < ROD_COST * pointed.cost and _is_rod(steel, rod)
-    here, there = threads_at_ends(steel.pixels, rod.arc, rod.length, rod.width)
+    is_rod = rod.cost < pointed.cost - ROD_GAIN * rod.length * rod.width and _is_rod(steel, rod)
     fit = rod if is_rod else pointed
     back = replace(fit, arc=fit.reversed())
+    here, there = threads_at_ends(steel.pixels, rod.arc, rod.length, rod.width)
     if is_rod and max(here, there) > LEAVES * min(here, there):
         return (fit if here > there else back), True
-    if not is_rod and max(here, there) == 0.0:
-        return None
+    if not is_rod:
+        if max(here, there) == 0.0:
+            return None
+        offsets = thread_offsets(steel, rod)
+        blunt = np.empty((2, 2))
+        bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
+        bound = PASSES * rod.width + PASSES_PX
+        for end, turned in ((0, rod), (1, replace(rod, arc=rod.reversed()))):
+            passing = offsets[1 - end]
+            if offsets[end] is None and blunt[end].min() > BLUNT and passing is not None and passing > bound:
+                ahead = turned.arc.direction() @ fit.arc.direction() > 0.0
+                return (fit if ahead else back), True
     if toward is not None and abs(along := float(fit.arc.direction() @ toward)) > TOWARD:
         return (fit if along > 0.0 else back), True
     return fit, False
+
+
+def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:
+    """Return how far off the middle of the beginning and the end of an axis a thread goes on there; None: none does.
+
+    A thread that leaves an end goes through its middle. One that lies over or under the needle passes beside it.
+    """
+    beyond = -np.arange(1.5, 6.0, 0.5)
+    aside = np.arange(-0.5 * fit.width - 3.0, 0.5 * fit.width + 3.1, 0.5)
+    dark = np.empty((len(beyond), len(aside)))
+    result: list[float | None] = []
+    for arc in (fit.arc, fit.reversed()):
+        straighten(steel.perhaps, (float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature), beyond, aside, dark)
+        widths = 0.5 * dark.sum(axis=1)
+        if middle(widths) < SEEN_PX:
+            result.append(None)
+            continue
+        centres = (dark @ aside) / np.maximum(dark.sum(axis=1), 1e-6)
+        result.append(abs(float(np.polyfit(beyond, centres, 1, w=np.minimum(widths, 1.0))[1])))
+    return result[0], result[1]
 
 
 def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:

@@ -29,7 +29,7 @@ MAX_STEP_PX, LAST_STEP_PX = 1.5, 0.02  # of a round; after a smaller one the fit
 PULL = 3.5  # times the variance by noise alone, as a thread beside the needle pulls all rows to one side
 DAMPING = 0.05  # of places along and aside, that of all others accordingly
 PARAMETERS = 6
-LENGTH_BEYOND = 1.1  # times the tolerance of the length, that a fit may reach
+LENGTH_BEYOND = 1.25  # times the tolerance of the length, that a fit may reach
 CORRELATED_ROWS = 3.0  # rows whose error is one and the same, by the lens' blur
 # What no fit's residual tells of: most likely for the errors over hundreds of simulated poses, needles and image sizes.
 TAIL_ERROR_PX, ASIDE_ERROR_PX, ANGLE_ERROR = 0.2, 0.095, math.radians(0.085)
@@ -74,7 +74,7 @@ def fit_template(
     """Fit a drawn needle to an image of steel.
 
         minimise  sum w(r) r^2,    r = min(perhaps(x(s, d)) - drawn(s, d), 0) + max(surely(x(s, d)) - drawn(s, d), 0),
-        w = 1 where r < 0,  (1 + (r / `OTHER`)^2)^-2 elsewhere
+        w = 1 where r < 0,  1 / (1 + (r / `OTHER`)^2) elsewhere
 
     by Gauss-Newton steps, over the place along and aside of the axis, its angle, its curvature, the width and the
     length.
