@@ -29,7 +29,7 @@ FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at le
 LEVELS = (0.5, 0.7)  # share of steel that is dark: more of a thread over the needle is, less of one beside it
 MAX_FITS = 3
 MAX_OFF = 1.2  # times the tolerance of the length, that a measured one may be off
-GOES_ON = 0.45  # of the body's width beyond an end that is dark where the needle may go on
+GOES_ON = 0.35  # of the body's width beyond an end that is dark where the needle may go on
 MIN_CHANGE = 0.4  # of the tolerance, by which what is dark is longer or shorter where another length is tried too
 GLARE_PX = 4.0  # beyond an end, that the lamp may not be reflected at
 ROUGH, MORE_PX = 0.08, 3.0  # of the length, that a first guess may be off; more than is dark, to begin a fit with
@@ -50,6 +50,7 @@ NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and o
 CLEARLY = 1.25  # times the cost that the other way has if both could be
 ROD = 0.87  # bluntness of both ends of a rod
 ROD_GAIN = 0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
+PULL_PX = 0.8  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = 0.3, 0.3  # of the width and beside it, off the middle of an end, where a thread passes and leaves not
 SEEN_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
 LEAVES = 2.0  # how much stronger a thread leaves the tail than the tip
@@ -140,11 +141,16 @@ def _checked(
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     confidence *= max(0.2, 1.0 - 2.0 * float(fit.covariance[1, 1]))
     covariance = fit.covariance
+    pull = PULL_PX * max(0.0, float(_excess(steel, fit, width)[3]))
     if not is_measured:
-        lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
-        covariance = covariance + (0.5 * size.tolerance * size.length_px) ** 2 * np.outer(lengthwise, lengthwise)
+        pull = math.hypot(pull, 0.5 * size.tolerance * size.length_px)
+    lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
+    covariance = covariance + pull**2 * np.outer(lengthwise, lengthwise)
     if not is_known:
-        covariance = covariance + np.diag([fit.length**2, 0.0, math.pi**2])
+        # The tail may be where the tip is taken to be.
+        chord, ahead = fit.arc.at(fit.length) - fit.arc.start, fit.arc.direction()
+        other = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
+        covariance = covariance + np.outer(other, other) + np.diag([0.0, 0.0, math.pi**2])
         confidence *= 0.5
     return MeasuredNeedle(
         arc=fit.arc,

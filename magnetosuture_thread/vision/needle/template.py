@@ -32,7 +32,7 @@ PARAMETERS = 6
 LENGTH_BEYOND = 1.25  # times the tolerance of the length, that a fit may reach
 CORRELATED_ROWS = 3.0  # rows whose error is one and the same, by the lens' blur
 # What no fit's residual tells of: most likely for the errors over hundreds of simulated poses, needles and image sizes.
-TAIL_ERROR_PX, ASIDE_ERROR_PX, ANGLE_ERROR = 0.2, 0.095, math.radians(0.085)
+TAIL_ERROR_PX, ASIDE_ERROR_PX, ANGLE_ERROR = 0.27, 0.1, math.radians(0.15)
 
 
 @dataclass(frozen=True)
