@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from magnetosuture_thread.vision.needle.arc import Arc
@@ -23,7 +22,6 @@ from magnetosuture_thread.vision.needle.template import (
     steel_rows,
 )
 from magnetosuture_thread.vision.sampling import middle, straighten
-from magnetosuture_thread.vision.thread.leave import ways_out
 
 FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this
 LEVELS = (0.5, 0.7)  # share of steel that is dark: more of a thread over the needle is, less of one beside it
@@ -38,7 +36,7 @@ FIRST_ROUNDS = 4
 MAX_COST = 0.11  # of the length, in squared pixels
 MAX_MISSING, MISSING_ROWS = 0.13, 5  # of the steel of so many rows, that the image may lack
 MAX_MISSING_TAIL, TAIL_ROWS = 0.15, 3  # of these, next to the tail
-MAX_MISSING_TIP, TIP = 0.12, 0.2  # of the steel of this last part of the length
+MAX_MISSING_TIP, TIP = 0.2, 0.2  # of the steel of this last part of the length
 SURE, SURE_ROWS = 0.75, 0.97  # share of steel that some place of a row has, and of the rows that have one
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
 MAX_BOTH = 0.2  # of it beyond both ends, which a thread leaves or passes at one only
@@ -49,12 +47,15 @@ BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
 NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and of what is no tip at least
 CLEARLY = 1.25  # times the cost that the other way has if both could be
 ROD = 0.87  # bluntness of both ends of a rod
-ROD_GAIN = 0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
-PULL_PX = 0.8  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
-PASSES, PASSES_PX = 0.3, 0.3  # of the width and beside it, off the middle of an end, where a thread passes and leaves not
+ROD_GAIN = (
+    0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
+)
+PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
+PASSES, PASSES_PX = (
+    0.3,
+    0.3,
+)  # of the width and beside it, off an end's middle: a thread passes, and does not leave
 SEEN_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
-LEAVES = 2.0  # how much stronger a thread leaves the tail than the tip
-WINDOW_PX = 7  # wider than a thin thread looks
 ALIKE = "ends that look alike"
 TOWARD = 0.8  # cosine between a needle and where it must point
 
@@ -286,30 +287,32 @@ def _settled(
 ) -> tuple[TemplateFit, bool] | None:
     """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
 
-    A thread leaves the tail of a rod. Of another needle it may lie over the point, which tells nothing. Where neither
-    is so, None: the length may be another's.
+    A thread leaves a rod's tail through its middle. A thread that passes beside one end of a pointed needle hides the
+    shape of that end; the other is the tail if it is blunt and no thread goes on there. Where no thread is seen at
+    either end of what is no rod, None: the length may be another's.
     """
     is_rod = rod.cost < pointed.cost - ROD_GAIN * rod.length * rod.width and _is_rod(steel, rod)
     fit = rod if is_rod else pointed
-    back = replace(fit, arc=fit.reversed())
-    here, there = threads_at_ends(steel.pixels, rod.arc, rod.length, rod.width)
-    if is_rod and max(here, there) > LEAVES * min(here, there):
-        return (fit if here > there else back), True
-    if not is_rod:
-        if max(here, there) == 0.0:
-            return None
-        offsets = thread_offsets(steel, rod)
-        blunt = np.empty((2, 2))
-        bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
-        bound = PASSES * rod.width + PASSES_PX
-        for end, turned in ((0, rod), (1, replace(rod, arc=rod.reversed()))):
-            passing = offsets[1 - end]
-            if offsets[end] is None and blunt[end].min() > BLUNT and passing is not None and passing > bound:
-                ahead = turned.arc.direction() @ fit.arc.direction() > 0.0
-                return (fit if ahead else back), True
-    if toward is not None and abs(along := float(fit.arc.direction() @ toward)) > TOWARD:
-        return (fit if along > 0.0 else back), True
+    offsets = thread_offsets(steel, rod)
+    if not is_rod and offsets == (None, None):
+        return None
+    blunt = np.empty((2, 2))
+    bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
+    bound = PASSES * rod.width + PASSES_PX
+    for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
+        here, there = offsets[end], offsets[1 - end]
+        leaves = is_rod and there is None and here is not None and here < bound
+        passes = not is_rod and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
+        if leaves or passes:
+            return _pointing(fit, tail_first.direction(0.5 * rod.length)), True
+    if toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD:
+        return _pointing(fit, toward), True
     return fit, False
+
+
+def _pointing(fit: TemplateFit, toward: np.ndarray) -> TemplateFit:
+    """Return a fit, the other way round unless its middle points in a direction."""
+    return fit if fit.arc.direction(0.5 * fit.length) @ toward > 0.0 else replace(fit, arc=fit.reversed())
 
 
 def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:
@@ -322,7 +325,9 @@ def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, flo
     dark = np.empty((len(beyond), len(aside)))
     result: list[float | None] = []
     for arc in (fit.arc, fit.reversed()):
-        straighten(steel.perhaps, (float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature), beyond, aside, dark)
+        straighten(
+            steel.perhaps, (float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature), beyond, aside, dark
+        )
         widths = 0.5 * dark.sum(axis=1)
         if middle(widths) < SEEN_PX:
             result.append(None)
@@ -344,26 +349,3 @@ def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
     steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, 1.0, rows)
     ends = max(rows[:TAIL_ROWS, 0].mean(), rows[-TAIL_ROWS:, 0].mean())
     return bool(ends < MAX_MISSING_TAIL and max(around[2], around[3]) < MAX_BEYOND)
-
-
-def threads_at_ends(part: np.ndarray, arc: Arc, length: float, width: float) -> tuple[float, float]:
-    """Return how strong a thread leaves the beginning and the end of an axis, in grey levels; 0 for none."""
-    ridge, faintest = _ridge(part)
-    axis = np.round(arc.at(np.linspace(0.5, length - 0.5, 24)) * 16.0).astype(np.int32)
-    cv2.polylines(ridge, [axis], False, 0, round(width + 3.0), cv2.LINE_8, 4)
-    seen = np.zeros_like(ridge)
-    strengths = []
-    for own in (arc, arc.reversed_at(length)):
-        ways = np.empty((1, 6))
-        tail = np.array([own.start[0], own.start[1], own.angle])
-        found = ways_out(ridge, seen, 1, 0.0, faintest, tail, 0.0, True, ways)
-        strengths.append(float(ways[0, 3]) if found and ways[0, 3] > 1.2 * faintest else 0.0)
-    return strengths[0], strengths[1]
-
-
-def _ridge(part: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return how much darker each pixel is than the brightest near it, and what is no noise of that [grey levels]."""
-    window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WINDOW_PX, WINDOW_PX))
-    ridge = cv2.morphologyEx(cv2.GaussianBlur(part, (5, 5), 0.7), cv2.MORPH_BLACKHAT, window)
-    noise = middle(ridge[::3, ::3])
-    return ridge, noise + max(5.0, 3.0 * noise)
