@@ -252,6 +252,7 @@ class TrackedFrame:
             "tip_m": _numbers(track.tip) if seen else None,
             "curvature_per_m": _number(track.curvature) if seen else None,
             "thread_m": None if thread is None or None in thread else thread,
+            "needle_length_m": None if track.needle_length is None else _number(track.needle_length),
             "confidence": _number(track.confidence),
             "time_s": self.duration,
             "stamp_s": self.stamp,

@@ -140,6 +140,8 @@ class VisionTrackerNode(PackageNode):
                     follower.on_measured_thread(stamp, seen.centreline)
         self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))
         values: dict[str, Any] = {"frames": self._session.frames, "tracked": self._session.tracked}
+        if track.needle_length is not None:
+            values["needle_length_mm"] = round(1e3 * track.needle_length, 3)
         if seen.problem is not None:
             self.health.refuse(seen.problem, **values)
         elif seen.tracked:

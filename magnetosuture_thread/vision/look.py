@@ -16,14 +16,13 @@ from magnetosuture_thread.vision.dish.tilt import Tilt, find_tilt
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
-from magnetosuture_thread.vision.needle.size import NeedleSize
+from magnetosuture_thread.vision.needle.size import LengthEstimator
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
 
-LENGTH_TOLERANCE = 0.1  # of the needle's length as it is set
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
@@ -59,6 +58,7 @@ class Track:
         centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
         view: where the dish is in the image; None when it is not found.
         warning: what makes the measurement worse than it could be; empty if nothing does.
+        needle_length: measured over the first frames [m]; None until it is, and of a frame looked at alone.
     """
 
     state: State
@@ -72,6 +72,7 @@ class Track:
     centreline: np.ndarray
     view: DishView | None
     warning: str = ""
+    needle_length: float | None = None
 
 
 def no_pose(state: State, reason: str, view: DishView | None) -> Track:
@@ -168,11 +169,11 @@ def needles_in(
     settings: VisionTrackerSettings,
     diameter: float,
     toward: np.ndarray | None = None,
+    estimator: LengthEstimator | None = None,
 ) -> tuple[list[MeasuredNeedle], list[str]]:
-    """Find the needles in a picture, in its own pixels; see `find_needles`."""
-    size = NeedleSize(
-        settings.needle_length / view.metres_per_pixel, settings.needle_width / view.metres_per_pixel, LENGTH_TOLERANCE
-    )
+    """Find the needles in a picture, in its own pixels, by the length as it is set or measured; see `find_needles`."""
+    estimator = LengthEstimator() if estimator is None else estimator
+    size = estimator.size(settings.needle_length, settings.needle_width, view.metres_per_pixel)
     return find_needles(picture, _local(view, picture), 0.5 * diameter, size, toward)
 
 

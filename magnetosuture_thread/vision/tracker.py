@@ -32,6 +32,7 @@ from magnetosuture_thread.vision.look import (
     with_thread,
 )
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.size import LengthEstimator
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
@@ -95,11 +96,13 @@ class VisionTracker:
         self._factor = self._given.working_factor(self._shape, diameter) if self._shape else 1
         self._settings = self._given.shrunk(self._factor)
         self._dish = DishWatch(self._settings, diameter)
+        self._length = LengthEstimator()
         self._forget()
 
     def reset(self) -> None:
         """Forget the needle and the dish."""
         self._time: float | None = None
+        self._length = LengthEstimator()
         self._forget()
 
     def _forget(self) -> None:
@@ -142,7 +145,8 @@ class VisionTracker:
         if image.shape[:2] != self._shape:
             self._shape = image.shape[:2]
             self._rescale()
-        return _enlarged(self._track(shrunk(image, self._factor), time_s), self._factor)
+        found = self._track(shrunk(image, self._factor), time_s)
+        return replace(_enlarged(found, self._factor), needle_length=self._length.length)
 
     def _track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame, shrunk."""
@@ -166,6 +170,8 @@ class VisionTracker:
             found = self._tracked(picture, view, chosen)
         if not chosen.heading_known:
             return found
+        if chosen.size_measured:
+            self._length.add(chosen.length_px * view.metres_per_pixel, chosen.confidence)
         ends = np.array([found.tail, found.tip])
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
@@ -224,13 +230,13 @@ class VisionTracker:
             _, angle = self._last.at(time)
             toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
             picture = picture_of(image, view, self._settings, mask, self._region(image, view, time))
-            needles, _ = needles_in(picture, view, self._settings, diameter, toward)
+            needles, _ = needles_in(picture, view, self._settings, diameter, toward, self._length)
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             if len(within) == 1:
                 self._take(_pose(within[0], picture, view, time), self._last)
                 return within[0], picture, ""
         picture = picture_of(image, view, self._settings, mask)
-        needles, refused = needles_in(picture, view, self._settings, diameter)
+        needles, refused = needles_in(picture, view, self._settings, diameter, estimator=self._length)
         if self._last is not None and len(needles) > 1:
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             needles = within if len(within) == 1 else needles

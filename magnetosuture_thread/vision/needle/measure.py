@@ -50,6 +50,8 @@ ROD = 0.87  # bluntness of both ends of a rod
 ROD_GAIN = (
     0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
 )
+SAME_LENGTH = 0.015  # share of the length, that need no proof
+LENGTH_GAIN = 0.1  # of the area by which another length changes the body, that its fit must cost less by
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = (
     0.3,
@@ -115,7 +117,7 @@ def _checked(
     one, other, rod = _fits(steel, rough, size, size.tolerance)
     best = min((one, other, rod), key=lambda each: each.cost)
     is_measured = size.tolerance > 0.0
-    if is_measured and not _shows_ends(steel, best, size):
+    if is_measured and not (_shows_ends(steel, best, size) and _needs_length(steel, best, size)):
         is_measured = False
         one, other, rod = _fits(steel, rough, size, 0.0)
         best = min((one, other, rod), key=lambda each: each.cost)
@@ -129,10 +131,12 @@ def _checked(
     around = _excess(steel, best, width)
     if max(around[4], around[5]) > MAX_BESIDE:
         return "something dark against it"
-    fit = _pointed_way(steel, one, other)
     is_known = True
+    pointed = min((one, other), key=lambda each: each.cost)
+    is_rod = rod.cost < pointed.cost - ROD_GAIN * rod.length * rod.width and _is_rod(steel, rod)
+    fit = None if is_rod else _pointed_way(steel, one, other)
     if fit is None:
-        settled = _settled(steel, rod, min((one, other), key=lambda each: each.cost), toward)
+        settled = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
         if settled is None:
             return ALIKE
         fit, is_known = settled
@@ -183,6 +187,16 @@ def _fits(
         one = min((one, again), key=lambda each: each.cost)
     rod = fit_template(steel, one.arc, length, width, tolerance=tolerance, start=one.length, rod=True)
     return one, other, rod
+
+
+def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
+    """Say whether the image speaks for the length that was measured, and not as well for the one that is known."""
+    change = abs(fit.length - size.length_px)
+    if change < SAME_LENGTH * size.length_px:
+        return True
+    is_rod = fit.thin == 1.0
+    known = fit_template(steel, fit.arc, size.length_px, size.width_px, rod=is_rod)
+    return known.cost - fit.cost > LENGTH_GAIN * change * size.width_px
 
 
 def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]:
@@ -283,7 +297,7 @@ def _excess(steel: SteelMap, fit: TemplateFit, width: float) -> np.ndarray:
 
 
 def _settled(
-    steel: SteelMap, rod: TemplateFit, pointed: TemplateFit, toward: np.ndarray | None
+    steel: SteelMap, fit: TemplateFit, rod: TemplateFit, toward: np.ndarray | None, *, is_rod: bool
 ) -> tuple[TemplateFit, bool] | None:
     """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
 
@@ -291,8 +305,6 @@ def _settled(
     shape of that end; the other is the tail if it is blunt and no thread goes on there. Where no thread is seen at
     either end of what is no rod, None: the length may be another's.
     """
-    is_rod = rod.cost < pointed.cost - ROD_GAIN * rod.length * rod.width and _is_rod(steel, rod)
-    fit = rod if is_rod else pointed
     offsets = thread_offsets(steel, rod)
     if not is_rod and offsets == (None, None):
         return None

@@ -46,6 +46,7 @@ class TemplateFit:
         cost: what the image differs by, robustly [px^2].
         missing: steel that the image lacks [px^2].
         covariance: of tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3).
+        thin: of the width, that its end tapers to; 1 for a rod.
     """
 
     arc: Arc
@@ -54,6 +55,7 @@ class TemplateFit:
     cost: float
     missing: float
     covariance: np.ndarray
+    thin: float = THIN
 
     def reversed(self) -> Arc:
         """Return the axis from the tip on."""
@@ -101,7 +103,7 @@ def fit_template(
     lengthwise = np.array([1.0, 0.0, arc.curvature])
     covariance += np.diag([0.0, ASIDE_ERROR_PX**2, ANGLE_ERROR**2])
     covariance += TAIL_ERROR_PX**2 * np.outer(lengthwise, lengthwise)
-    return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, covariance)
+    return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, covariance, thin)
 
 
 def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:

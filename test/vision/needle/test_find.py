@@ -13,8 +13,10 @@ from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.vision.images import prepare
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles
+from magnetosuture_thread.vision.needle.size import NeedleSize
 from test.vision.scenes import NOWHERE, VIEW, Pose, render
 
+SIZE = NeedleSize(0.007 / VIEW.metres_per_pixel, 0.0004 / VIEW.metres_per_pixel, 0.1)
 CAMERAS = {
     kappa: DishCamera(CameraScene(needle_curvature=kappa), VIEW, seed=4) for kappa in (-440.0, -120.0, 0.0, 300.0)
 }
@@ -23,7 +25,7 @@ CAMERAS = {
 def find(frame: np.ndarray, toward: np.ndarray | None = None) -> tuple[list[MeasuredNeedle], list[str]]:
     """Return the needles in a frame, and why other things are none."""
     picture = prepare(np.ascontiguousarray(frame[:, :, 1]), 2)
-    return find_needles(picture, VIEW, 0.0175, 0.007, 0.0004, toward)
+    return find_needles(picture, VIEW, 0.0175, SIZE, toward)
 
 
 @given(
@@ -57,7 +59,7 @@ def test_nearly_everywhere_it_is_found():
     assert found >= 96
 
 
-@pytest.mark.parametrize("length", [0.003, 0.0066, 0.0074, 0.012])
+@pytest.mark.parametrize("length", [0.003, 0.0058, 0.0082, 0.012])
 def test_a_needle_of_another_length_is_not_taken(length: float):
     frame = render(Pose(np.array([-0.005, 0.0]), 0.3), needle_length=length)
     needles, refused = find(frame)
@@ -110,7 +112,7 @@ def test_a_needle_cut_by_the_border_is_none():
     frame = render(Pose(np.zeros(2), 0.0))
     picture = prepare(np.ascontiguousarray(frame[:, 320:, 1]), 2)
     view = type(VIEW)((2.0, 238.0), VIEW.metres_per_pixel)
-    assert find_needles(picture, view, 0.0175, 0.007, 0.0004)[0] == []
+    assert find_needles(picture, view, 0.0175, SIZE)[0] == []
 
 
 def test_speckles_are_not_searched_for_long():
