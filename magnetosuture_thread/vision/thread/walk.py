@@ -25,6 +25,7 @@ SMOOTHING = 0.05  # weight of the newest strength in the usual one
 ASIDE_PX = 0.5
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
 FORK = 0.75  # of the usual strength, at least, along the other way
+END, END_FAINTEST = 0.5, 1.6  # of the usual strength, and of the faintest, that a faint thread shows to its end
 FORCED = 4  # steps that a walk is held to the other way
 
 
@@ -171,7 +172,27 @@ def walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
 
 
 @compiled
-def refine(ridge, points, strong):
+def count_to_end(ridge, hidden, factor, noise, faintest, path, count):
+    """Return how many vertices of a path show a faint thread, where the walk may have gone on along noise.
+
+    The thread ends where the sum of what is stronger than `END` of its usual strength, less that, is greatest.
+    """
+    values = np.empty(count)
+    for index in range(count):
+        _, values[index] = centred(ridge, noise, path[index, 0], path[index, 1], path[index, 2], 0.7)
+    bound = max(END_FAINTEST * faintest, END * np.median(path[1:count, 4])) if count > 1 else 0.0
+    total, greatest, kept = 0.0, 0.0, 1
+    for index in range(1, count):
+        if is_hidden(hidden, factor, path[index, 0], path[index, 1]):
+            continue
+        total += min(values[index], STRONGEST * path[index, 4]) - bound
+        if total >= greatest:
+            greatest, kept = total, index + 1
+    return kept
+
+
+@compiled
+def refine(ridge, noise, points, strong):
     """Centre the vertices once more, now that their neighbours on both sides are known, and even them out."""
     count = len(points)
     if count < 4:
@@ -184,7 +205,7 @@ def refine(ridge, points, strong):
         length = max(1e-9, math.hypot(x, y))
         normals[index, 0], normals[index, 1] = -y / length, x / length
         if strong[index]:
-            shifts[index], _ = centred(ridge, 0.0, points[index, 0], points[index, 1], math.atan2(y, x), 1.0)
+            shifts[index], _ = centred(ridge, noise, points[index, 0], points[index, 1], math.atan2(y, x), 1.0)
     for index in range(1, count):
         before, after = index - 1, min(count - 1, index + 1)
         even = 0.5 * shifts[index] + 0.25 * (shifts[before] + shifts[after])
