@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
-from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, without_wall
+from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, shrunk, without_wall
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.erase import without_needle
 from magnetosuture_thread.vision.sampling import middle
@@ -17,13 +17,12 @@ from magnetosuture_thread.vision.thread.forks import follow
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.ridge import (
     LEVELS,
-    OUTER_PX,
     WINDOW_PX,
     Ridge,
     black_hat,
-    difference_of_gaussians,
+    darker_than_around,
     faint_ridge,
-    shrunk_window,
+    shrunk_hidden,
 )
 from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, refine
 
@@ -38,8 +37,9 @@ ENOUGH = 0.85  # of the greatest length: so much thread seen, dark and strong, n
 FAINT = 25.0  # grey levels; a black-hat fainter than this may be a pale thread's shadow
 STRONG_SHARE = 0.2  # of enough, that a strong dark thread must show to be the thread: the rest of it is covered
 SCALES = (1, 2, 4)  # how much smaller the image is in which a faint, a pale or a wide thread is looked for
-RIM_BLURS = 2.0  # of the surroundings' blur, by which the rim reaches into a signed ridge
+RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
 THIN_SHARE = 0.5  # of its strength among larger pixels, that a thin thread shows at full size
+FAINT_ROUNDS, FAINT_HALF = 3, 3  # how often a faint walk is centred, and over how many vertices to both sides
 MIN_CENTRED = 4  # vertices
 SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
 WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
@@ -67,7 +67,7 @@ def find_centreline(
 
     The ridge strength of a dark thread is the black-hat transform, how much darker a pixel is than the brightest
     background within a few pixels, of the image without the needle. Where that shows too little, the thread is faint or
-    pale, and a difference of Gaussians is taken, whose noise has no mean; see `ridge`. The walk leaves the tail along
+    pale, and a signed difference is taken, whose noise has no mean; see `ridge`. The walk leaves the tail along
     the arc that shows most of the thread, below the needle where it must, and goes by steps along arcs that look some
     way ahead, a change of curvature having a price: so it goes straight through crossings and over gaps. Where the
     needle or the lamp's reflection hides the thread, nothing counts for or against a way. A thread wider than the
@@ -87,10 +87,15 @@ def find_centreline(
     search = _Search(picture, needle, max_length, centre, reach)
     dark = search.dark()
     enough = ENOUGH * max_length
-    if dark.strength > FAINT and dark.shown > STRONG_SHARE * enough:
+    if _is_strong(dark, enough):
         return dark.points
     faint = search.faint()
     return _best_of(dark, faint, enough).points
+
+
+def _is_strong(dark: _Walk, enough: float) -> bool:
+    """Say whether a dark walk shows a thread beyond doubt, be it that the rest of it is covered."""
+    return dark.strength > FAINT and dark.shown > STRONG_SHARE * enough
 
 
 def _best_of(dark: _Walk, faint: list[_Walk], enough: float) -> _Walk:
@@ -133,7 +138,9 @@ class _Search:
         hidden = glare_mask(picture)[top // factor : -(-bottom // factor), left // factor : -(-right // factor)]
         # Copied: a slice of the mask is handed to compiled code and to drawing, which want their own memory.
         self._hidden = np.ascontiguousarray(hidden)
-        _cover(self._hidden, factor, needle, self._origin)
+        self._covered = np.zeros_like(self._hidden)
+        _cover(self._covered, factor, needle, self._origin)
+        self._hidden |= self._covered
 
     def dark(self) -> _Walk:
         """Return the walk along the black-hat, at full size or at half of it."""
@@ -146,7 +153,7 @@ class _Search:
             return self._walked(ridge)
 
         thin, enough = at(1), ENOUGH * self._max_length
-        if thin.shown > enough or self._at_wall:  # The rim is wide.
+        if thin.shown > enough or _is_strong(thin, enough) or self._at_wall:  # The rim is wide, as covers are.
             return thin
         best = thin
         for scale in SCALES[1:]:
@@ -164,9 +171,11 @@ class _Search:
         walks: list[_Walk] = []
         thin: dict[bool, tuple[Ridge, np.ndarray]] = {}
         for scale in SCALES:
-            small, hidden, factor = shrunk_window(window, self._hidden, self._picture.factor, scale)
-            difference, deviation = difference_of_gaussians(small)
+            small = shrunk(window, scale)
+            difference, deviation = darker_than_around(small)
             for pale in (False, True):
+                # A pale thread may be as bright as the lamp's reflection.
+                hidden, factor = shrunk_hidden(self._covered if pale else self._hidden, self._picture.factor, small, scale)
                 ridge = faint_ridge(difference, deviation, hidden, factor, scale, pale=pale)
                 self._clear_shade(ridge, shade * LEVELS / deviation)
                 self._clear_wall(ridge)
@@ -192,8 +201,8 @@ class _Search:
         length = float(arc_lengths(points)[-1])
         fine = points_at(points, np.linspace(0.0, length, max(2, round(length / STEP_PX) + 1))) - self._origin
         seen = np.ones(len(fine), np.bool_)
-        for _ in range(2):
-            refine(ridge.strength, ridge.noise, fine, seen)
+        for _ in range(FAINT_ROUNDS):
+            refine(ridge.strength, ridge.noise, fine, seen, FAINT_HALF)
         return np.asarray(fine + self._origin)
 
     def _cleared(self, layer: Layer) -> np.ndarray:
@@ -221,6 +230,7 @@ class _Search:
             ridge.factor,
             ridge.noise,
             ridge.faintest,
+            ridge.single,
             np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
             (dish[0], dish[1], dish[2]),
             max_length,
@@ -239,7 +249,8 @@ class _Search:
             kept = count_off_outline(points[:kept] * scale + shift, above, self._picture.mask, origin, ridge.faintest)
         shown = max(0.0, shown - (path[count - 1, 5] - path[kept - 1, 5]))
         points = points[:kept]
-        refine(ridge.strength, ridge.noise, points, strong[:kept])
+        for _ in range(FAINT_ROUNDS if ridge.signed else 1):
+            refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
         strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
         return _Walk(points * scale + shift + origin, shown * scale, strength)
 
@@ -247,12 +258,12 @@ class _Search:
         """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""
         scale, shift = ridge.scale, 0.5 * (ridge.scale - 1)
         u, v = ((np.subtract(self._centre, self._origin) - shift) / scale).tolist()
-        width = (WALL_PX + RIM_PX) / scale + RIM_BLURS * OUTER_PX
+        width = (WALL_PX + RIM_PX) / scale + RIM_REACH_PX
         kept = None
         if self._at_wall:
             tail = (self._needle.tail_px - self._origin - shift) / scale
-            low = np.maximum(0.0, tail - (AT_WALL_PX / scale - RIM_BLURS * OUTER_PX)).astype(int)
-            high = np.maximum(0.0, tail + (AT_WALL_PX / scale - RIM_BLURS * OUTER_PX)).astype(int)
+            low = np.maximum(0.0, tail - (AT_WALL_PX / scale - RIM_REACH_PX)).astype(int)
+            high = np.maximum(0.0, tail + (AT_WALL_PX / scale - RIM_REACH_PX)).astype(int)
             box = slice(low[1], high[1]), slice(low[0], high[0])
             kept = ridge.strength[box].copy()
         radius = (self._reach + WALL_PX) / scale
