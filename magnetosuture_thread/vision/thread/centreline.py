@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -16,8 +17,13 @@ from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.forks import follow
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.ridge import (
+    DEVIATION,
+    FAINT_DEVIATIONS,
+    FAINTEST,
+    INNER_PX,
     LEVELS,
     WINDOW_PX,
+    ZERO,
     Ridge,
     black_hat,
     darker_than_around,
@@ -40,6 +46,10 @@ SCALES = (1, 2, 4)  # how much smaller the image is in which a faint, a pale or 
 RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
 THIN_SHARE = 0.5  # of its strength among larger pixels, that a thin thread shows at full size
 FAINT_ROUNDS, FAINT_HALF = 3, 3  # how often a faint walk is centred, and over how many vertices to both sides
+COARSE, COARSE_MEDIAN = 4, 15  # how much smaller an image shows what is wide, and the window of its surroundings [px]
+COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
+WIDE_SHARE, WIDE_FAINTEST = 0.8, 0.3  # of its contrast, that something wide keeps when shrunk; and shows everywhere
+BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
 MIN_CENTRED = 4  # vertices
 SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
 WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
@@ -87,10 +97,15 @@ def find_centreline(
     search = _Search(picture, needle, max_length, centre, reach)
     dark = search.dark()
     enough = ENOUGH * max_length
-    if _is_strong(dark, enough):
+    strong = _is_strong(dark, enough)
+    if strong and not search.is_edge(dark):
         return dark.points
-    faint = search.faint()
-    return _best_of(dark, faint, enough).points
+    wide = search.wide()
+    if wide.shown > SURE_SHARE * enough and search.is_edge(wide):
+        return wide.points
+    if strong:
+        return dark.points
+    return _best_of(dark, search.faint(), enough).points
 
 
 def _is_strong(dark: _Walk, enough: float) -> bool:
@@ -190,6 +205,59 @@ class _Search:
                         walk = replace(walk, points=self._recentred(walk.points, ridge))
                 walks.append(walk)
         return walks
+
+    @cached_property
+    def _coarse(self) -> np.ndarray:
+        """How much darker each colour of the image, shrunk by `COARSE`, is than around, shape (rows, columns, 1 or 3)."""
+        small = shrunk(self._picture.image[self._box], COARSE)
+        around = cv2.medianBlur(small, COARSE_MEDIAN)
+        return cv2.subtract(around, small, dtype=cv2.CV_32F).reshape(*small.shape[:2], -1)
+
+    def is_edge(self, walk: _Walk) -> bool:
+        """Say whether a walk runs along something far wider than itself: its edge, its shadow, or its texture.
+
+        What is wide keeps its contrast in a shrunk image, what is thin loses it.
+        """
+        contrast = np.linalg.norm(self._coarse, axis=2)
+        near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
+        return self._median_along(walk.points, near, COARSE) > WIDE_SHARE * walk.strength
+
+    def wide(self) -> _Walk:
+        """Return the walk along what is wide and differs from around in colour as it does where it begins.
+
+            r = d . c - |d - (d . c) c|
+
+        with the difference d in colour of a pixel from what is around it, and the colour c of what leaves the tail, by
+        a walk along |d| before.
+        """
+        difference = cv2.GaussianBlur(self._coarse, (0, 0), INNER_PX).reshape(self._coarse.shape)
+        contrast = np.linalg.norm(difference, axis=2)
+        walk = self._along(contrast)
+        if len(walk.points) < MIN_CENTRED:
+            return walk
+        at = ((walk.points[2:BEGINNING] - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(np.float32)
+        begun = cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR).reshape(len(at), -1)
+        colour = np.median(begun, axis=0)
+        colour /= max(1e-6, float(np.linalg.norm(colour)))
+        same = difference @ colour
+        return self._along(same - np.linalg.norm(difference - same[..., None] * colour, axis=2))
+
+    def _along(self, contrast: np.ndarray) -> _Walk:
+        """Return the walk along a contrast in the image that is shrunk by `COARSE`."""
+        tail = np.round((self._needle.tail_px - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(int)
+        u, v = np.maximum(tail - 2, 0)
+        strongest = float(contrast[v : v + 5, u : u + 5].max(initial=FAINTEST))
+        noise = DEVIATION * middle(np.abs(contrast[::3, ::3]))
+        gain = COARSE_LEVELS / max(strongest, FAINTEST)
+        strength = np.clip(ZERO + gain * contrast, 0.0, 255.0).astype(np.uint8)
+        window = strength
+        hidden, factor = shrunk_hidden(self._covered, self._picture.factor, window, COARSE)
+        faintest = max(WIDE_FAINTEST * COARSE_LEVELS, gain * FAINT_DEVIATIONS * noise)
+        ridge = Ridge(strength, hidden, factor, COARSE, ZERO, faintest, faintest, signed=True)
+        ridge.strength[(hidden > 0) & (ridge.strength > ZERO)] = ZERO
+        self._clear_wall(ridge)
+        walk = self._walked(ridge)
+        return replace(walk, strength=self._median_along(walk.points, contrast, COARSE))
 
     def _median_along(self, points: np.ndarray, difference: np.ndarray, scale: int) -> float:
         """Return the median along a walk of a difference that is shrunk by a scale."""
