@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -51,13 +52,22 @@ class Picture:
         factor: how much smaller `small` is.
         origin: (u, v) of the first pixel in the whole frame.
         mask: where the scene's shapes are; None if it has none.
+        image: as it came, grey or BGR.
     """
 
     brightest: Layer
     darkest: Layer
     factor: int
-    origin: tuple[int, int] = (0, 0)
-    mask: SceneMask | None = None
+    origin: tuple[int, int]
+    mask: SceneMask | None
+    image: np.ndarray
+
+    @cached_property
+    def luminance(self) -> Layer:
+        """How bright each pixel looks: of the three colours the mean by which a JPEG is coded, with the least noise."""
+        if self.image.ndim == 2:
+            return self.darkest
+        return _channel(cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY), self.factor, self.mask)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -80,11 +90,11 @@ def prepare(image: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), ma
     if image.ndim == 2:
         # Copied where need be: compiled code is compiled once more for each other layout of memory.
         both = _channel(np.ascontiguousarray(image), factor, mask)
-        return Picture(both, both, factor, origin, mask)
+        return Picture(both, both, factor, origin, mask, image)
     one, two, three = cv2.split(image)
     brightest = _channel(np.asarray(cv2.max(cv2.max(one, two), three)), factor, mask)
     darkest = _channel(np.asarray(cv2.min(cv2.min(one, two), three)), factor, mask)
-    return Picture(brightest, darkest, factor, origin, mask)
+    return Picture(brightest, darkest, factor, origin, mask, image)
 
 
 def _channel(pixels: np.ndarray, factor: int, mask: SceneMask | None) -> Layer:

@@ -3,24 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 
-from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall, glare_mask, without_wall
+from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
+from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, shrunk, without_wall
 from magnetosuture_thread.vision.needle.erase import without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.forks import follow
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
-from magnetosuture_thread.vision.thread.walk import refine
+from magnetosuture_thread.vision.thread.ridge import (
+    DEVIATION,
+    FAINT_DEVIATIONS,
+    FAINTEST,
+    INNER_PX,
+    LEVELS,
+    WINDOW_PX,
+    ZERO,
+    Ridge,
+    black_hat,
+    darker_than_around,
+    faint_ridge,
+    shrunk_hidden,
+)
+from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, refine
 
-FAINTEST = 3.0  # grey levels; a ridge fainter than this is noise
-FAINTEST_NOISES = 3.0  # and so is one fainter than so many times the median of all
-BLUR_PX = 0.7  # before the ridge is looked for: as wide as the thinnest thread looks
-WINDOW_PX = 7  # wider than the thread looks
 COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
 BEYOND_PX = 3.0  # its tip, that is not seen either
 MAX_BEYOND_PX = 12.0  # hidden by the needle and what is next to it, beside its length
@@ -29,38 +40,30 @@ WALL_PX = 4.0  # before which the walk ends
 AT_WALL_PX = 40.0  # from the wall, where its rim may look like the thread's beginning
 BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can leave
 ENOUGH = 0.85  # of the greatest length: so much thread seen, dark and strong, needs no other search
-FAINT = 25.0  # grey levels; a dark ridge fainter than this may be a pale thread's shadow
-PALE_SHARE = 0.6  # of what the dark ridge shows, that a pale one must show to be the thread
-SURE_SHARE = 0.5  # of enough, that a wide or a pale thread must show: a little of one may be noise
+FAINT = 25.0  # grey levels; a black-hat fainter than this may be a pale thread's shadow
+STRONG_SHARE = 0.08  # of enough, that a strong dark thread must show to be the thread: the rest of it is covered
+SCALES = (1, 2, 4)  # how much smaller the image is in which a faint, a pale or a wide thread is looked for
+RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
+THIN_SHARE = 0.5  # of its strength among larger pixels, that a thin thread shows at full size
+FAINT_ROUNDS, FAINT_HALF = 3, 3  # how often a faint walk is centred, and over how many vertices to both sides
+COARSE, COARSE_MEDIAN = 4, 15  # how much smaller an image shows what is wide, and the window of its surroundings [px]
+COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
+WIDE_SHARE, WIDE_FAINTEST = 0.8, 0.3  # of its contrast, that something wide keeps when shrunk; and shows everywhere
+BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
+MIN_CENTRED = 4  # vertices
+SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
 WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
-_WINDOW = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WINDOW_PX, WINDOW_PX))
-
-
-@dataclass(frozen=True)
-class _Ridge:
-    """How much darker, or brighter, each pixel is than what is near it.
-
-    Attributes:
-        strength: in grey levels, uint8.
-        hidden: where nothing can be seen, 255 there, `factor` times smaller.
-        factor: see `hidden`.
-        noise: strength where nothing is.
-    """
-
-    strength: np.ndarray
-    hidden: np.ndarray
-    factor: int
-    noise: float
-
-    @property
-    def faintest(self) -> float:
-        """A strength above noise that is no noise."""
-        return max(FAINTEST, FAINTEST_NOISES * self.noise)
 
 
 @dataclass(frozen=True)
 class _Walk:
-    """A walk in pixels of the picture, shape (m, 2), how much thread it shows [px] and its strength [grey levels]."""
+    """A walk along a ridge.
+
+    Attributes:
+        points: vertices in pixels of the picture, shape (m, 2).
+        shown: how much thread they show [px].
+        strength: median of the ridge along it [grey levels].
+    """
 
     points: np.ndarray
     shown: float
@@ -73,11 +76,12 @@ def find_centreline(
     """Follow the thread from the needle's tail to its end.
 
     The ridge strength of a dark thread is the black-hat transform, how much darker a pixel is than the brightest
-    background within a few pixels, of the image without the needle; that of a pale thread is the same of the negative.
-    The walk leaves the tail along the arc that shows most of the thread, below the needle where it must, and goes by
-    steps along arcs that look some way ahead, a change of curvature having a price: so it goes straight through
-    crossings and over gaps. Where the needle or the lamp's reflection hides the thread, nothing counts for or against
-    a way. A thread wider than the window is looked for at half the size.
+    background within a few pixels, of the image without the needle. Where that shows too little, the thread is faint or
+    pale, and a signed difference is taken, whose noise has no mean; see `ridge`. The walk leaves the tail along
+    the arc that shows most of the thread, below the needle where it must, and goes by steps along arcs that look some
+    way ahead, a change of curvature having a price: so it goes straight through crossings and over gaps. Where the
+    needle or the lamp's reflection hides the thread, nothing counts for or against a way. A thread wider than the
+    window is looked for at half the size.
 
     Args:
         picture: the frame or a part of it.
@@ -90,109 +94,263 @@ def find_centreline(
         Vertices from the tail on, shape (m, 2) [px], m = 1 if no thread is seen.
     """
     reach = wall - WALL_PX
-    rows, columns = picture.shape
-    left, top = (max(0, int(c - reach - WINDOW_PX)) for c in centre)
-    right, bottom = (int(c + reach + WINDOW_PX) + 1 for c in centre)
-    left, top, right, bottom = (
-        min(left, columns - 1),
-        min(top, rows - 1),
-        max(1, min(right, columns)),
-        max(1, min(bottom, rows)),
-    )
-    factor = picture.factor
-    left, top = left // factor * factor, top // factor * factor  # a whole pixel of the small image
-    gray, tail = without_needle(picture.darkest, factor, needle), needle.tail_px
-    at_wall = bool(np.hypot(*(tail - centre)) > reach - AT_WALL_PX)
-    if at_wall:  # else the walk would leave along the rim
-        near = Wall(centre, wall - RIM_PX)
-        gray = without_wall(picture.darkest.replaced(gray), factor, near, tail - AT_WALL_PX, tail + AT_WALL_PX)
-    window = gray[top:bottom, left:right]
-    hidden = glare_mask(picture)[top // factor : -(-bottom // factor), left // factor : -(-right // factor)]
-    # Copied: a slice of the mask is handed to compiled code and to drawing, which want their own memory.
-    hidden = np.ascontiguousarray(hidden)
-    _cover(hidden, factor, needle, (left, top))
-    shade = SHADE * needle.contrast * middle(picture.darkest.floor)
-
-    def search(scale: int, *, pale: bool) -> _Walk:
-        ridge = _ridge(window, hidden, factor, scale, pale)
-        _clear_shade(ridge.strength, scale, needle, (left, top), shade)
-        dish = (centre[0] - left, centre[1] - top, reach)
-        return _walked(ridge, scale, needle, (left, top), dish, max_length, at_wall, picture)
-
-    if at_wall:  # Its rim is wide and pale, as threads may be.
-        return search(1, pale=False).points
-    return _best_of(search, ENOUGH * max_length).points
+    search = _Search(picture, needle, max_length, centre, reach)
+    dark = search.dark()
+    enough = ENOUGH * max_length
+    strong = _is_strong(dark, enough)
+    if strong and not search.is_edge(dark):
+        return dark.points
+    wide = search.wide()
+    if wide.shown > SURE_SHARE * enough and search.is_edge(wide):
+        return wide.points
+    if strong:
+        return dark.points
+    return _best_of(dark, search.faint(), enough).points
 
 
-def _best_of(search: Callable[..., _Walk], enough: float) -> _Walk:
-    """Return what shows most of the thread: dark or pale, thin or wide; each is looked for where it may be needed."""
+def _is_strong(dark: _Walk, enough: float) -> bool:
+    """Say whether a dark walk shows a thread beyond doubt, be it that the rest of it is covered."""
+    return dark.strength > FAINT and dark.shown > STRONG_SHARE * enough
 
-    def at_both_sizes(*, pale: bool) -> _Walk:
-        thin = search(1, pale=pale)
-        if thin.shown > enough:
+
+def _best_of(dark: _Walk, faint: list[_Walk], enough: float) -> _Walk:
+    sure = [walk for walk in faint if walk.shown > SURE_SHARE * enough]
+    if not sure:
+        return dark
+    return max(sure, key=lambda walk: walk.shown * walk.strength)
+
+
+class _Search:
+    """Walks along one frame's ridges, each from the needle's tail on.
+
+    Args:
+        picture: the frame or a part of it.
+        needle: in the picture's pixels.
+        max_length: of a walk [px].
+        centre: the dish's [px].
+        reach: how far from it a walk may go [px].
+    """
+
+    def __init__(
+        self,
+        picture: Picture,
+        needle: MeasuredNeedle,
+        max_length: float,
+        centre: tuple[float, float],
+        reach: float,
+    ) -> None:
+        self._picture, self._needle, self._max_length = picture, needle, max_length
+        self._centre, self._reach = centre, reach
+        self._at_wall = bool(np.hypot(*(needle.tail_px - centre)) > reach - AT_WALL_PX)
+        rows, columns = picture.shape
+        left, top = (max(0, int(c - reach - WINDOW_PX)) for c in centre)
+        right, bottom = (int(c + reach + WINDOW_PX) + 1 for c in centre)
+        left, top = min(left, columns - 1), min(top, rows - 1)
+        right, bottom = max(1, min(right, columns)), max(1, min(bottom, rows))
+        factor = picture.factor
+        left, top = left // factor * factor, top // factor * factor  # a whole pixel of the small image
+        self._origin, self._box = (left, top), (slice(top, bottom), slice(left, right))
+        hidden = glare_mask(picture)[top // factor : -(-bottom // factor), left // factor : -(-right // factor)]
+        # Copied: a slice of the mask is handed to compiled code and to drawing, which want their own memory.
+        self._hidden = np.ascontiguousarray(hidden)
+        self._covered = np.zeros_like(self._hidden)
+        _cover(self._covered, factor, needle, self._origin)
+        self._hidden |= self._covered
+
+    def dark(self) -> _Walk:
+        """Return the walk along the black-hat, at full size or at half of it."""
+        window = self._cleared(self._picture.darkest)
+        shade = SHADE * self._needle.contrast * middle(self._picture.darkest.floor)
+
+        def at(scale: int) -> _Walk:
+            ridge = black_hat(window, self._hidden, self._picture.factor, scale)
+            self._clear_shade(ridge, shade)
+            return self._walked(ridge)
+
+        thin, enough = at(1), ENOUGH * self._max_length
+        if thin.shown > enough or _is_strong(thin, enough) or self._at_wall:  # The rim is wide, as covers are.
             return thin
-        wide = search(2, pale=pale)
-        return wide if wide.shown > max(WIDER_SHARE * thin.shown, SURE_SHARE * enough) else thin
+        best = thin
+        for scale in SCALES[1:]:
+            wide = at(scale)
+            if wide.shown > max(WIDER_SHARE * best.shown, SURE_SHARE * enough):
+                best = wide
+            if best.shown > enough:
+                break
+        return best
 
-    dark = at_both_sizes(pale=False)
-    if dark.shown > enough and dark.strength > FAINT:
-        return dark
-    pale = at_both_sizes(pale=True)
-    if pale.shown < max(PALE_SHARE * dark.shown, SURE_SHARE * enough):
-        return dark
-    return pale if dark.shown < SURE_SHARE * enough or pale.strength > PALE_SHARE * dark.strength else dark
+    def faint(self) -> list[_Walk]:
+        """Return the walks along what is a little darker or paler than its surroundings, at full size and at half."""
+        window = self._cleared(self._picture.luminance)
+        shade = SHADE * self._needle.contrast * middle(self._picture.luminance.floor)
+        walks: list[_Walk] = []
+        thin: dict[bool, tuple[Ridge, np.ndarray]] = {}
+        for scale in SCALES:
+            small = shrunk(window, scale)
+            difference, deviation = darker_than_around(small)
+            for pale in (False, True):
+                # A pale thread may be as bright as the lamp's reflection.
+                hidden, factor = shrunk_hidden(self._covered if pale else self._hidden, self._picture.factor, small, scale)
+                ridge = faint_ridge(difference, deviation, hidden, factor, scale, pale=pale)
+                self._clear_shade(ridge, shade * LEVELS / deviation)
+                self._clear_wall(ridge)
+                walk, sign = self._walked(ridge), -1.0 if pale else 1.0
+                walk = replace(walk, strength=sign * self._median_along(walk.points, difference, scale))
+                if scale == 1:
+                    thin[pale] = ridge, difference
+                elif len(walk.points) > MIN_CENTRED:
+                    # Among larger pixels a thread and its shadow are one: where it is thin, its own middle is taken.
+                    ridge, difference_1 = thin[pale]
+                    if sign * self._median_along(walk.points, difference_1, 1) > THIN_SHARE * walk.strength:
+                        walk = replace(walk, points=self._recentred(walk.points, ridge))
+                walks.append(walk)
+        return walks
 
+    @cached_property
+    def _coarse(self) -> np.ndarray:
+        """How much darker each colour of the image, shrunk by `COARSE`, is than around, shape (rows, columns, 1 or 3)."""
+        small = shrunk(self._picture.image[self._box], COARSE)
+        around = cv2.medianBlur(small, COARSE_MEDIAN)
+        return cv2.subtract(around, small, dtype=cv2.CV_32F).reshape(*small.shape[:2], -1)
 
-def _ridge(window: np.ndarray, hidden: np.ndarray, factor: int, scale: int, pale: bool) -> _Ridge:
-    """Return the ridge of a window, shrunk by a scale."""
-    if scale > 1:
-        size = (window.shape[1] // scale, window.shape[0] // scale)
-        window = cv2.resize(window, size, interpolation=cv2.INTER_AREA)
-        hidden, factor = cv2.resize(hidden, size, interpolation=cv2.INTER_NEAREST), 1
-    smooth = cv2.GaussianBlur(window, (5, 5), BLUR_PX)
-    strength = cv2.morphologyEx(smooth, cv2.MORPH_TOPHAT if pale else cv2.MORPH_BLACKHAT, _WINDOW)
-    return _Ridge(strength, hidden, factor, middle(strength[::5, ::5]))
+    def is_edge(self, walk: _Walk) -> bool:
+        """Say whether a walk runs along something far wider than itself: its edge, its shadow, or its texture.
 
+        What is wide keeps its contrast in a shrunk image, what is thin loses it.
+        """
+        contrast = np.linalg.norm(self._coarse, axis=2)
+        near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
+        return self._median_along(walk.points, near, COARSE) > WIDE_SHARE * walk.strength
 
-def _walked(
-    ridge: _Ridge,
-    scale: int,
-    needle: MeasuredNeedle,
-    origin: tuple[int, int],
-    dish: tuple[float, float, float],
-    max_length: float,
-    at_wall: bool,
-    picture: Picture,
-) -> _Walk:
-    """Walk along a ridge that is shrunk by a scale; `dish` is its centre and how far a walk may go from it [px]."""
-    shift = 0.5 * (scale - 1)
-    max_length /= scale
-    max_steps = int(max_length) + 16  # steps are longer than a pixel
-    path, strong = np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
-    tail, direction = (needle.tail_px - origin - shift) / scale, needle.direction_px
-    count, shown = follow(
-        ridge.strength,
-        ridge.hidden,
-        ridge.factor,
-        ridge.noise,
-        ridge.faintest,
-        np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
-        ((dish[0] - shift) / scale, (dish[1] - shift) / scale, dish[2] / scale),
-        max_length,
-        (needle.length_px + MAX_BEYOND_PX) / scale,
-        at_wall,
-        path,
-        strong,
-    )
-    points = path[:count, :2].copy()
-    if picture.mask is not None:
-        full = cv2.resize(ridge.strength, None, fx=scale, fy=scale) if scale > 1 else ridge.strength
-        kept = count_off_outline(points * scale + shift, full, picture.mask, origin, ridge.noise + ridge.faintest)
+    def wide(self) -> _Walk:
+        """Return the walk along what is wide and differs from around in colour as it does where it begins.
+
+            r = d . c - |d - (d . c) c|
+
+        with the difference d in colour of a pixel from what is around it, and the colour c of what leaves the tail, by
+        a walk along |d| before.
+        """
+        difference = cv2.GaussianBlur(self._coarse, (0, 0), INNER_PX).reshape(self._coarse.shape)
+        contrast = np.linalg.norm(difference, axis=2)
+        walk = self._along(contrast)
+        if len(walk.points) < MIN_CENTRED:
+            return walk
+        at = ((walk.points[2:BEGINNING] - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(np.float32)
+        begun = cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR).reshape(len(at), -1)
+        colour = np.median(begun, axis=0)
+        colour /= max(1e-6, float(np.linalg.norm(colour)))
+        same = difference @ colour
+        return self._along(same - np.linalg.norm(difference - same[..., None] * colour, axis=2))
+
+    def _along(self, contrast: np.ndarray) -> _Walk:
+        """Return the walk along a contrast in the image that is shrunk by `COARSE`."""
+        tail = np.round((self._needle.tail_px - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(int)
+        u, v = np.maximum(tail - 2, 0)
+        strongest = float(contrast[v : v + 5, u : u + 5].max(initial=FAINTEST))
+        noise = DEVIATION * middle(np.abs(contrast[::3, ::3]))
+        gain = COARSE_LEVELS / max(strongest, FAINTEST)
+        strength = np.clip(ZERO + gain * contrast, 0.0, 255.0).astype(np.uint8)
+        window = strength
+        hidden, factor = shrunk_hidden(self._covered, self._picture.factor, window, COARSE)
+        faintest = max(WIDE_FAINTEST * COARSE_LEVELS, gain * FAINT_DEVIATIONS * noise)
+        ridge = Ridge(strength, hidden, factor, COARSE, ZERO, faintest, faintest, signed=True)
+        ridge.strength[(hidden > 0) & (ridge.strength > ZERO)] = ZERO
+        self._clear_wall(ridge)
+        walk = self._walked(ridge)
+        return replace(walk, strength=self._median_along(walk.points, contrast, COARSE))
+
+    def _median_along(self, points: np.ndarray, difference: np.ndarray, scale: int) -> float:
+        """Return the median along a walk of a difference that is shrunk by a scale."""
+        at = ((points - self._origin - 0.5 * (scale - 1)) / scale).astype(np.float32)
+        return float(np.median(cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)))
+
+    def _recentred(self, points: np.ndarray, ridge: Ridge) -> np.ndarray:
+        """Return a walk in the middle of a ridge at full size, with vertices as close as the walk's steps there."""
+        length = float(arc_lengths(points)[-1])
+        fine = points_at(points, np.linspace(0.0, length, max(2, round(length / STEP_PX) + 1))) - self._origin
+        seen = np.ones(len(fine), np.bool_)
+        for _ in range(FAINT_ROUNDS):
+            refine(ridge.strength, ridge.noise, fine, seen, FAINT_HALF)
+        return np.asarray(fine + self._origin)
+
+    def _cleared(self, layer: Layer) -> np.ndarray:
+        """Return a layer's pixels in the search's window, without the needle and what is beyond the wall beside it."""
+        tail, factor = self._needle.tail_px, self._picture.factor
+        pixels = without_needle(layer, factor, self._needle)
+        if self._at_wall:  # else the walk would leave along the rim
+            wall = Wall(self._centre, self._reach + WALL_PX - RIM_PX)
+            pixels = without_wall(layer.replaced(pixels), factor, wall, tail - AT_WALL_PX, tail + AT_WALL_PX)
+        return np.asarray(pixels[self._box])
+
+    def _walked(self, ridge: Ridge) -> _Walk:
+        """Walk along a ridge."""
+        scale = ridge.scale
+        shift = 0.5 * (scale - 1)
+        max_length = self._max_length / scale
+        max_steps = int(max_length) + 16  # steps are longer than a pixel
+        path, strong = np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
+        needle, origin = self._needle, self._origin
+        tail, direction = (needle.tail_px - origin - shift) / scale, needle.direction_px
+        dish = (np.append(np.subtract(self._centre, origin) - shift, self._reach) / scale).tolist()
+        count, shown = follow(
+            ridge.strength,
+            ridge.hidden,
+            ridge.factor,
+            ridge.noise,
+            ridge.faintest,
+            ridge.single,
+            np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
+            (dish[0], dish[1], dish[2]),
+            max_length,
+            (needle.length_px + MAX_BEYOND_PX) / scale,
+            self._at_wall,
+            path,
+            strong,
+        )
+        points = path[:count, :2].copy()
+        kept = count
+        if ridge.signed:
+            kept = count_to_end(ridge.strength, ridge.hidden, ridge.factor, ridge.noise, ridge.faintest, path, count)
+        if self._picture.mask is not None:
+            full = cv2.resize(ridge.strength, None, fx=scale, fy=scale) if scale > 1 else ridge.strength
+            above = cv2.subtract(full, ridge.noise)
+            kept = count_off_outline(points[:kept] * scale + shift, above, self._picture.mask, origin, ridge.faintest)
         shown = max(0.0, shown - (path[count - 1, 5] - path[kept - 1, 5]))
-        count, points = kept, points[:kept]
-    refine(ridge.strength, points, strong[:count])
-    strength = float(np.median(path[1:count, 4])) if count > 1 else 0.0
-    return _Walk(points * scale + shift + origin, shown * scale, strength)
+        points = points[:kept]
+        for _ in range(FAINT_ROUNDS if ridge.signed else 1):
+            refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
+        strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
+        return _Walk(points * scale + shift + origin, shown * scale, strength)
+
+    def _clear_wall(self, ridge: Ridge) -> None:
+        """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""
+        scale, shift = ridge.scale, 0.5 * (ridge.scale - 1)
+        u, v = ((np.subtract(self._centre, self._origin) - shift) / scale).tolist()
+        width = (WALL_PX + RIM_PX) / scale + RIM_REACH_PX
+        kept = None
+        if self._at_wall:
+            tail = (self._needle.tail_px - self._origin - shift) / scale
+            low = np.maximum(0.0, tail - (AT_WALL_PX / scale - RIM_REACH_PX)).astype(int)
+            high = np.maximum(0.0, tail + (AT_WALL_PX / scale - RIM_REACH_PX)).astype(int)
+            box = slice(low[1], high[1]), slice(low[0], high[0])
+            kept = ridge.strength[box].copy()
+        radius = (self._reach + WALL_PX) / scale
+        # A ring from where the rim shows up to its outer side.
+        at = round(u * 16.0), round(v * 16.0)
+        cv2.circle(ridge.strength, at, round(radius * 16.0), ridge.noise, round(2.0 * width), cv2.LINE_8, 4)
+        if kept is not None:
+            ridge.strength[box] = kept
+
+    def _clear_shade(self, ridge: Ridge, shade: float) -> None:
+        """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
+        scale = ridge.scale
+        axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24)) - self._origin
+        at = np.round((axis - 0.5 * (scale - 1)) / scale * 16.0).astype(np.int32)
+        zone = np.zeros_like(ridge.strength)
+        thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / scale)
+        cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
+        floor = ridge.noise if ridge.signed else 0.0
+        ridge.strength[(zone > 0) & (ridge.strength < floor + shade)] = floor
 
 
 def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
@@ -201,15 +359,3 @@ def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tupl
     small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
     thickness = needle.width_px + 2.0 * COVERED_PX
     cv2.polylines(hidden, [small], False, 255, max(1, round(thickness / factor)), cv2.LINE_8, 4)
-
-
-def _clear_shade(
-    strength: np.ndarray, scale: int, needle: MeasuredNeedle, origin: tuple[int, int], shade: float
-) -> None:
-    """Take what is no stronger than a needle's shadow out of a ridge beside the needle."""
-    axis = needle.arc.at(np.linspace(SHADE_PX, needle.length_px, 24)) - origin
-    at = np.round((axis - 0.5 * (scale - 1)) / scale * 16.0).astype(np.int32)
-    zone = np.zeros_like(strength)
-    thickness = round((needle.width_px + 2.0 * SHADE_PX) / scale)
-    cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
-    strength[(zone > 0) & (strength < shade)] = 0

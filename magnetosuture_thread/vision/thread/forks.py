@@ -38,7 +38,7 @@ def worth(path, strong, count):
 
 
 @compiled
-def follow(ridge, hidden, factor, noise, faintest, start, dish, max_length, max_hidden, simple, path, strong):
+def follow(ridge, hidden, factor, noise, faintest, single, start, dish, max_length, max_hidden, simple, path, strong):
     """Walk along the ridge from the tail to its end, along the way out that shows most of the thread.
 
     Args:
@@ -47,6 +47,7 @@ def follow(ridge, hidden, factor, noise, faintest, start, dish, max_length, max_
         factor: see `hidden`.
         noise: the ridge's strength where nothing is.
         faintest: a strength above noise that is no noise.
+        single: see `ways_out`.
         start: the tail (u, v) and the needle's direction there [px, px, rad].
         dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk, a little longer than the thread [px].
@@ -59,7 +60,7 @@ def follow(ridge, hidden, factor, noise, faintest, start, dish, max_length, max_
         The number of vertices, and how much thread they show [px]; see `worth`.
     """
     ways = np.empty((MAX_WAYS, 6))
-    found = ways_out(ridge, hidden, factor, noise, faintest, start, max_hidden, simple, ways)
+    found = ways_out(ridge, hidden, factor, noise, faintest, single, start, max_hidden, simple, ways)
     path[0, :2], strong[0] = start[:2], False
     best, best_value, enough = 1, 0.0, SUFFICIENT_SHARE * max_length
     other, other_strong = np.empty_like(path), np.empty_like(strong)

@@ -26,7 +26,7 @@ APART_PX = 8.0  # that two ways end from each other
 
 
 @compiled
-def ways_out(ridge, hidden, factor, noise, faintest, tail, max_hidden, simple, ways):
+def ways_out(ridge, hidden, factor, noise, faintest, single, tail, max_hidden, simple, ways):
     """Find the arcs along which a thread may leave the tail.
 
     Args:
@@ -35,6 +35,7 @@ def ways_out(ridge, hidden, factor, noise, faintest, tail, max_hidden, simple, w
         factor: see `hidden`.
         noise: the ridge's strength where nothing is.
         faintest: a strength above noise that is no noise.
+        single: the same of a single point on a way that is strong enough in the mean.
         tail: u, v and the needle's direction there [px, px, rad].
         max_hidden: of a way, at most [px].
         simple: whether sharp bends and ways along the needle are not tried.
@@ -53,22 +54,22 @@ def ways_out(ridge, hidden, factor, noise, faintest, tail, max_hidden, simple, w
         for side in (-1.0, 1.0):
             for bend in BENDS:
                 arc = (angle, side * bend, math.pi)
-                count = _try(ridge, hidden, factor, noise, faintest, tail, arc, max_hidden, ways, ends, count)
+                count = _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count)
             for bend in SHARP_BENDS:
                 for turn in TURNS:
                     if simple:
                         continue
                     arc = (angle, side * bend, turn)
-                    count = _try(ridge, hidden, factor, noise, faintest, tail, arc, max_hidden, ways, ends, count)
+                    count = _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count)
     for index in range(0 if simple else BELOW_WAYS):
         for bend in BELOW_BENDS:
             arc = (tail[2] + BELOW * (2.0 * index / (BELOW_WAYS - 1) - 1.0), bend, math.pi)
-            count = _try(ridge, hidden, factor, noise, faintest, tail, arc, max_hidden, ways, ends, count)
+            count = _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count)
     return count
 
 
 @compiled
-def _try(ridge, hidden, factor, noise, faintest, tail, arc, max_hidden, ways, ends, count):
+def _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count):
     """Enter an arc among the best, in their order, unless a better one ends nearby; return how many there are."""
     angle, bend, most = arc
     u, v, s, visible, seen, total, below = tail[0], tail[1], 0.0, 0, 0, 0.0, 0.0
@@ -92,7 +93,7 @@ def _try(ridge, hidden, factor, noise, faintest, tail, arc, max_hidden, ways, en
         value = sample(ridge, u, v) - noise
         total += min(value, STRONGEST)
         visible += 1
-        if value > faintest:
+        if value > single:
             seen += 1
         elif visible - seen > (START_STEPS - MIN_ON_RIDGE if visible > FIRST else 1):
             return count  # At once if it does not begin at the tail, or where it comes out: that is another thread.

@@ -21,10 +21,12 @@ FAR_WEIGHT = 0.6
 BENDS = 31  # curvatures tried at each step ...
 SHARPEST = 0.21  # ... up to this [1/px], closer around the present one's
 BEND_COST = 1.1  # of the usual strength, for a change of curvature by 1 / px, along the way looked ahead
+NOISE_COST = 2.0  # so much higher is that price where the thread is as faint as noise
 SMOOTHING = 0.05  # weight of the newest strength in the usual one
-ASIDE_PX = 0.5
+ASIDE_PX, ACROSS = 0.5, 9  # between samples across a ridge, and how many
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
 FORK = 0.75  # of the usual strength, at least, along the other way
+END, END_FAINTEST = 0.5, 1.2  # of the usual strength, and of the faintest, that a faint thread shows to its end
 FORCED = 4  # steps that a walk is held to the other way
 
 
@@ -38,7 +40,7 @@ def is_hidden(hidden, factor, u, v):
 
 
 @compiled
-def arc_scores(ridge, hidden, factor, noise, usual, state, bends, scores):
+def arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, scores):
     """Fill in the strength of the ridge along each of many arcs ahead, as a share of the usual, less its price."""
     u, v, angle, bend = state
     for index in range(len(bends)):
@@ -60,27 +62,28 @@ def arc_scores(ridge, hidden, factor, noise, usual, state, bends, scores):
             share = 1.0 if step < NEAR_POINTS else FAR_WEIGHT
             score += share * value
             weight += share
-        scores[index] = score / weight - BEND_COST * abs(tried - bend) - 0.15 * abs(tried)
+        scores[index] = score / weight - bend_cost * abs(tried - bend) - 0.15 * abs(tried)
 
 
 @compiled
-def best_arcs(ridge, hidden, factor, noise, usual, state, bends, scores):
+def best_arcs(ridge, hidden, factor, noise, faintest, usual, state, bends, scores):
     """Return the curvature of the arc ahead that follows the ridge best, and of another, with its score.
 
     The other's score is -1 if there is none: it must be the best of its neighbours, apart from the first, and
     lie on a ridge by itself.
     """
     bend = state[3]
+    bend_cost = BEND_COST * (1.0 + NOISE_COST * (faintest / usual) ** 2)
     for index in range(BENDS):
         part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
         bends[index] = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
-    arc_scores(ridge, hidden, factor, noise, usual, state, bends, scores)
+    arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, scores)
     first = scores.argmax()
     second, score = first, -1.0
     for index in range(1, BENDS - 1):
         apart = abs(bends[index] - bends[first])
         if apart > APART and scores[index] > scores[index - 1] and scores[index] >= scores[index + 1]:
-            plain = scores[index] + BEND_COST * abs(bends[index] - bend)
+            plain = scores[index] + bend_cost * abs(bends[index] - bend)
             if plain > FORK and plain > score:
                 second, score = index, plain
     return bends[first], bends[second], score
@@ -91,10 +94,10 @@ def centred(ridge, noise, u, v, angle, max_shift):
     """Return how far aside the ridge's middle lies, at most `most`, and the strength there."""
     x, y = -math.sin(angle), math.cos(angle)
     peak = 0.0
-    for index in range(-4, 5):
+    for index in range(-(ACROSS // 2), ACROSS // 2 + 1):
         peak = max(peak, sample(ridge, u + index * ASIDE_PX * x, v + index * ASIDE_PX * y))
     total, moment = 0.0, 0.0
-    for index in range(-4, 5):
+    for index in range(-(ACROSS // 2), ACROSS // 2 + 1):
         aside = index * ASIDE_PX
         weight = sample(ridge, u + aside * x, v + aside * y) - noise - 0.3 * (peak - noise)
         if weight > 0.0:
@@ -135,7 +138,7 @@ def walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
             bend_ahead, forced = bend_first, forced - 1
         else:
             bend_ahead, other, score = best_arcs(
-                ridge, hidden, factor, noise, usual, (u, v, angle, bend), bends, scores
+                ridge, hidden, factor, noise, faintest, usual, (u, v, angle, bend), bends, scores
             )
             if score > 0.0 and fork_count < len(forks):
                 forks[fork_count, 0], forks[fork_count, 1], forks[fork_count, 2] = count, other, score
@@ -171,20 +174,58 @@ def walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
 
 
 @compiled
-def refine(ridge, points, strong):
-    """Centre the vertices once more, now that their neighbours on both sides are known, and even them out."""
+def count_to_end(ridge, hidden, factor, noise, faintest, path, count):
+    """Return how many vertices of a path show a faint thread, where the walk may have gone on along noise.
+
+    The thread ends where the sum of what is stronger than `END` of its usual strength, less that, is greatest.
+    """
+    values = np.empty(count)
+    for index in range(count):
+        _, values[index] = centred(ridge, noise, path[index, 0], path[index, 1], path[index, 2], 0.7)
+    bound = max(END_FAINTEST * faintest, END * np.median(path[1:count, 4])) if count > 1 else 0.0
+    total, greatest, kept = 0.0, 0.0, 1
+    for index in range(1, count):
+        if is_hidden(hidden, factor, path[index, 0], path[index, 1]):
+            continue
+        total += min(values[index], STRONGEST * path[index, 4]) - bound
+        if total >= greatest:
+            greatest, kept = total, index + 1
+    return kept
+
+
+@compiled
+def refine(ridge, noise, points, strong, half):
+    """Centre the vertices once more, now that their neighbours on both sides are known, and even them out.
+
+    The ridge across the thread is a mean over `half` vertices to both sides: of a faint thread each alone is noise.
+    """
     count = len(points)
     if count < 4:
         return
-    shifts = np.zeros(count)
-    normals = np.zeros((count, 2))
+    normals, profiles = np.zeros((count, 2)), np.zeros((count, ACROSS))
     for index in range(1, count):
         before, after = max(0, index - 2), min(count - 1, index + 2)
         x, y = points[after, 0] - points[before, 0], points[after, 1] - points[before, 1]
         length = max(1e-9, math.hypot(x, y))
         normals[index, 0], normals[index, 1] = -y / length, x / length
-        if strong[index]:
-            shifts[index], _ = centred(ridge, 0.0, points[index, 0], points[index, 1], math.atan2(y, x), 1.0)
+        for place in range(ACROSS):
+            aside = (place - ACROSS // 2) * ASIDE_PX
+            u, v = points[index, 0] + aside * normals[index, 0], points[index, 1] + aside * normals[index, 1]
+            profiles[index, place] = sample(ridge, u, v) - noise
+    shifts, mean = np.zeros(count), np.zeros(ACROSS)
+    for index in range(1, count):
+        if not strong[index]:
+            continue
+        mean[:] = 0.0
+        for other in range(max(1, index - half), min(count, index + half + 1)):
+            mean += profiles[other] * (half + 1 - abs(other - index))
+        bound, total, moment = 0.3 * max(0.0, mean.max()), 0.0, 0.0
+        for place in range(ACROSS):
+            if mean[place] > bound:
+                total += mean[place] - bound
+                moment += (mean[place] - bound) * (place - ACROSS // 2) * ASIDE_PX
+        if total > 0.0:
+            shifts[index] = min(1.0, max(-1.0, moment / total))
     for index in range(1, count):
         before, after = index - 1, min(count - 1, index + 1)
         even = 0.5 * shifts[index] + 0.25 * (shifts[before] + shifts[after])
