@@ -209,7 +209,9 @@ def photograph(
     middle = middle + random.uniform(-0.9, 0.9, 2) * free
     if cut:
         side = int(random.integers(2))
-        middle[side] = (2.0 * cut - 1.0) * -radius_px if random.random() < 0.5 else size[side] + (2.0 * cut - 1.0) * radius_px
+        middle[side] = (
+            (2.0 * cut - 1.0) * -radius_px if random.random() < 0.5 else size[side] + (2.0 * cut - 1.0) * radius_px
+        )
     camera = _Camera(size, radius_px * distance, distance, turn, (float(middle[0]), float(middle[1])))
     x, y = camera.plane(0.0)
     picture = _ground(random, ground, x, y)
@@ -217,7 +219,15 @@ def photograph(
     way = random.uniform(-np.pi, np.pi)
     for other in range(1, dishes):
         where = 2.5 * np.array([math.cos(way + 1.3 * other), math.sin(way + 1.3 * other)])
-        _dish(random, picture, camera, (float(where[0]), float(where[1])), str(random.choice(list(FLOORS))), height, lid=False)
+        _dish(
+            random,
+            picture,
+            camera,
+            (float(where[0]), float(where[1])),
+            str(random.choice(list(FLOORS))),
+            height,
+            lid=False,
+        )
     _dish(random, picture, camera, (0.0, 0.0), floor, height, bool(random.random() < 0.5))
     if hand:
         for _ in range(int(random.integers(1, 4))):
