@@ -6,13 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 
+import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.vision.dish.find import find_dish
-from magnetosuture_thread.vision.dish.tilt import Tilt, find_tilt
+from magnetosuture_thread.vision.dish.ellipse import find_ellipse
+from magnetosuture_thread.vision.dish.tilt import MIN_ANGLE, Tilt, find_tilt, tilt_of, unseen_tilt_covariance
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
@@ -28,7 +30,10 @@ MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a n
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 DARK_FLOOR = 130.0  # grey levels; with a given view, a frame whose median is below may have a dark floor
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
+ELLIPSE_ERROR = 0.01  # of a scale by an edge of the wall in a photograph: which one it is, and where light moves it
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
+MAX_SCALE_SLACK = 0.1  # the same, beyond which it is another dish; between, the dish's own size gives the scale
+DARK_ELLIPSE = 64.0  # grey levels; a floor whose median is below is dark: steel is no darker
 
 
 class State(Enum):
@@ -89,11 +94,32 @@ class FoundDish:
         view: where it is, once the frame is prepared.
         dark_field: whether the floor is dark, and needle, thread and rim are bright.
         tilt: of the camera; None if there is none to be sure of.
+        scale_error: standard deviation of the view's scale, as a share; 0 where the scale is given.
+        unseen_tilt: angle of a tilt that the rim would not tell [rad].
+        remark: what a user should know of the view; empty if nothing.
     """
 
     view: DishView
     dark_field: bool = False
     tilt: Tilt | None = None
+    scale_error: float = 0.0
+    unseen_tilt: float = 0.0
+    remark: str = ""
+
+    def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
+        """Return what the view leaves unknown of a tail and a heading in a dish, shape (3, 3) [m, m, rad]."""
+        total = np.zeros((3, 3))
+        total[:2, :2] = self.scale_error**2 * np.outer(tail, tail)  # A wrong scale shifts what is far from the centre.
+        if self.tilt is not None:
+            total += self.tilt.covariance(tail, heading, radius)
+        elif self.unseen_tilt:
+            total += unseen_tilt_covariance(tail, heading, self.unseen_tilt, radius)
+        return total
+
+    @property
+    def warning(self) -> str:
+        """What makes the measurement worse than it could be; empty if nothing does."""
+        return "; ".join(filter(None, (self.tilt.warning if self.tilt is not None else "", self.remark)))
 
     def prepared(self, image: np.ndarray) -> np.ndarray:
         """Return a frame with a bright floor and a round dish."""
@@ -122,23 +148,54 @@ def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float
         found = _found_view(gray, settings, diameter)
         if found is None:
             continue
+        view, remark = found
         if settings.dish_centre_px or settings.metres_per_pixel:  # measured by a calibration
-            return FoundDish(found, dark_field)
-        tilt, view = find_tilt(gray, found, diameter)
-        return FoundDish(view, dark_field, tilt)
-    return None
+            error = 0.0 if settings.metres_per_pixel and not remark else SCALE_ERROR
+            return FoundDish(view, dark_field, scale_error=error, remark=remark)
+        tilt, view = find_tilt(gray, view, diameter)
+        return FoundDish(view, dark_field, tilt, SCALE_ERROR, 0.0 if tilt is not None else MIN_ANGLE)
+    return _photographed(image, settings, diameter)
 
 
-def _found_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> DishView | None:
-    """Return the view by a dish with a bright floor; None if none is seen."""
+def _found_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> tuple[DishView, str] | None:
+    """Return the view by a dish with a bright floor, and a remark on its scale; None if none is seen."""
     found = find_dish(gray, diameter)
-    if found is None:
+    return _with_given(found, settings) if found is not None else None
+
+
+def _with_given(found: DishView, settings: VisionTrackerSettings) -> tuple[DishView, str] | None:
+    """Return a view that was found with what is given of it, and a remark; None if they don't fit at all.
+
+    Where a given scale and the dish differ by more than a rim's light can make, all that is known of the scene is
+    relative to its dish: the dish gives the scale.
+    """
+    scale, remark = settings.metres_per_pixel or found.metres_per_pixel, ""
+    apart = found.metres_per_pixel / scale - 1.0
+    if abs(apart) > MAX_SCALE_SLACK:
         return None
-    scale = settings.metres_per_pixel or found.metres_per_pixel
-    if abs(found.metres_per_pixel / scale - 1.0) > SCALE_SLACK:
-        return None
+    if abs(apart) > SCALE_SLACK:
+        scale = found.metres_per_pixel
+        remark = f"metres_per_pixel is {100.0 * abs(apart):.0f} % off what the dish's diameter makes it, which is used"
     centre = settings.dish_centre_px
-    return DishView((centre[0], centre[1]) if centre else found.centre_px, scale, settings.camera_rotation)
+    return DishView((centre[0], centre[1]) if centre else found.centre_px, scale, settings.camera_rotation), remark
+
+
+def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> FoundDish | None:
+    """Find a dish by its ellipse alone, as in a photograph: cut, saturated, with a lid, on any ground."""
+    ellipse = find_ellipse(image)
+    if ellipse is None:
+        return None
+    given = _with_given(DishView(ellipse.centre_px, 0.5 * diameter / ellipse.major), settings)
+    if given is None:
+        return None
+    view, remark = given
+    gray = measured_channel(image)
+    inside = np.zeros(gray.shape, np.uint8)
+    points, _ = ellipse.points(60)
+    cv2.fillPoly(inside, [np.round(points).astype(np.int32)], 1)
+    dark_field = middle(gray[::4, ::4][inside[::4, ::4] > 0]) < DARK_ELLIPSE
+    tilt = tilt_of(ellipse, view.rotation) if not settings.dish_centre_px and not settings.metres_per_pixel else None
+    return FoundDish(view, dark_field, tilt, ELLIPSE_ERROR, 0.0 if tilt is not None else MIN_ANGLE, remark)
 
 
 def picture_of(
@@ -238,8 +295,6 @@ def tracked(
     local = _local(view, picture)
     heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
     covariance = _in_dish(needle, view)
-    if not settings.metres_per_pixel:  # A wrong scale shifts what is far from the dish's centre.
-        covariance[:2, :2] += SCALE_ERROR**2 * np.outer(tail, tail)
     return Track(
         state=State.TRACKED if needle.heading_known else otherwise,
         reason="" if needle.heading_known else UNKNOWN_HEADING,
@@ -278,10 +333,9 @@ def look_once(
 
 
 def tilted(track: Track, dish: FoundDish, radius: float) -> Track:
-    """Return a track with what a tilt of the camera leaves unknown, and a warning of it."""
-    if dish.tilt is None:
-        return track
-    return replace(track, covariance=track.covariance + dish.tilt.covariance(radius), warning=dish.tilt.warning)
+    """Return a track with what scale and tilt of the camera leave unknown, and a warning of it."""
+    covariance = track.covariance + dish.covariance(track.tail, track.heading, radius)
+    return replace(track, covariance=covariance, warning=dish.warning)
 
 
 def _local(view: DishView, picture: Picture) -> DishView:

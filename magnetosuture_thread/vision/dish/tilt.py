@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.vision.dish.ellipse import Ellipse
 from magnetosuture_thread.vision.dish.find import RAYS, rim_points
 
 MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
+ANGLE_ERROR = math.radians(2.0)  # by which light and noise change a tilt that is told
 SURE = 4.0  # standard deviations that an ellipse is off a circle at least
 NEAR = 0.1  # of its distance from the camera, that the dish's radius is at most; more is hardly used over a dish
 
@@ -23,22 +25,31 @@ class Tilt:
     Attributes:
         angle: between its axis and the dish's normal [rad].
         direction: in the image, along which the dish looks shortened [rad], from u towards v.
+        rotation: of the dish's x axis in the image [rad]; see `DishView`.
     """
 
     angle: float
     direction: float
+    rotation: float = 0.0
 
-    def covariance(self, radius: float) -> np.ndarray:
-        """Return what perspective leaves unknown of a place and a heading, shape (3, 3) [m, m, rad].
+    @property
+    def direction_in_dish(self) -> np.ndarray:
+        """Direction along which the dish looks shortened, in the dish frame, shape (2,)."""
+        angle = -self.direction - self.rotation
+        return np.array([math.cos(angle), math.sin(angle)])
 
-        It shifts what is nearer or farther by up to R^2 / d tan(angle) and turns it by up to R / d tan(angle); which
-        side of the dish is nearer cannot be told by an ellipse.
+    def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
+        """Return what perspective leaves unknown, shape (3, 3) [m, m, rad]: an ellipse does not tell which side is nearer.
 
         Args:
+            tail: in the dish frame, shape (2,) [m].
+            heading: unit tangent there, shape (2,).
             radius: of the dish [m].
         """
-        error = NEAR * math.tan(self.angle)
-        return np.diag([radius * error, radius * error, error]) ** 2
+        along = self.direction_in_dish
+        change = perspective(tail, heading, radius)
+        either = change @ (math.tan(self.angle) * along)
+        return np.outer(either, either) + unseen_tilt_covariance(tail, heading, ANGLE_ERROR, radius)
 
     @property
     def warning(self) -> str:
@@ -54,6 +65,41 @@ class Tilt:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size = image.shape[1::-1]
         return np.asarray(cv2.warpAffine(image, inverse, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def tilt_of(ellipse: Ellipse, rotation: float) -> Tilt | None:
+    """Return the tilt under which a circle is seen as an ellipse; None below what an ellipse tells."""
+    angle = math.acos(min(1.0, ellipse.minor / ellipse.major))
+    return Tilt(angle, ellipse.direction, rotation) if angle > MIN_ANGLE else None
+
+
+def perspective(tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
+    """Return how a tail and a heading angle in a dish change with a small tilt of the camera, shape (3, 2) [m, m, rad].
+
+    Under a camera at a distance d, a tilt t (its angle, along the direction that is nearer) moves a point p of the dish
+    by p (t . p) / d, and so the centre of the rim's ellipse by R^2 t / d, from which points are measured:
+
+        dp = (p p^T - R^2 I) t / d,    d(angle) = (p . n) (h . t) / d,    n = h turned by a right angle
+
+    Args:
+        tail: p, shape (2,) [m].
+        heading: h, shape (2,).
+        radius: R of the dish [m], the share `NEAR` of d.
+    """
+    aside = np.array([-heading[1], heading[0]])
+    moved = np.outer(tail, tail) - radius**2 * np.eye(2)
+    return np.vstack([moved, float(tail @ aside) * heading]) * (NEAR / radius)
+
+
+def unseen_tilt_covariance(tail: np.ndarray, heading: np.ndarray, angle: float, radius: float) -> np.ndarray:
+    """Return what a tilt that no ellipse tells leaves unknown, shape (3, 3) [m, m, rad].
+
+    All tilts up to an angle are held to be as likely: along each axis a variance of angle^2 / 4. See `perspective`.
+    """
+    change = perspective(tail, heading, radius)
+    short = 0.5 * (1.0 - math.cos(angle))  # foreshortening, of second order
+    lengths = np.array([np.hypot(*tail), np.hypot(*tail), 1.0])
+    return np.asarray(0.25 * angle**2 * change @ change.T + np.diag((short * lengths) ** 2))
 
 
 def find_tilt(gray: np.ndarray, view: DishView, diameter: float) -> tuple[Tilt | None, DishView]:
@@ -98,4 +144,4 @@ def find_tilt(gray: np.ndarray, view: DishView, diameter: float) -> tuple[Tilt |
     direction = 0.5 * math.atan2(float(shape[1]), float(shape[0])) + 0.5 * math.pi
     middle = (view.centre_px[0] + float(fitted[1]), view.centre_px[1] + float(fitted[2]))
     scale = view.metres_per_pixel * float(fitted[0]) / (float(fitted[0]) + half)
-    return Tilt(angle, direction), DishView(middle, scale, view.rotation)
+    return Tilt(angle, direction, view.rotation), DishView(middle, scale, view.rotation)

@@ -1,0 +1,341 @@
+"""Finds a dish in a photograph: an ellipse that the edges of its wall agree on, whatever is brighter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from magnetosuture_thread.vision.dish.edges import fit_harmonics, ring_support, steepest, thinned, vote
+from magnetosuture_thread.vision.images import measured_channel
+
+COARSE_SIDE = 160  # rows or columns, whichever are fewer, of the image in which ellipses are looked for
+FINE_SIDE = 960  # of the image in which the one found is measured
+MIN_RADIUS, MAX_RADIUS = 0.12, 0.8  # of the shorter side
+STRETCHES = (1.0, 1.0 / 0.9)  # along which an ellipse is nearly a circle; the second in each of `WAYS` directions
+WAYS = 4
+CENTRES = 4  # looked at for each stretch
+MIN_GRADIENT = 4.0  # grey levels a pixel
+MAX_EDGES = 6000
+CELL = 2.0  # px; of votes
+RING = 1.03  # ratio of radii of a ring
+BINS = 72  # directions
+ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
+BAND = 0.14  # of the radius, in which edges may be of the same ellipse
+AGREEMENT = 0.012  # of the radius, within which an edge agrees with an ellipse
+TRIES = 200
+MIN_SUPPORT = 0.6  # of the directions in the frame
+MIN_SEEN = 0.5  # of the ellipse must lie in the frame
+GOOD_SUPPORT = 0.8  # that no other stretch is tried for
+MIN_RATIO = 0.8  # of the axes: a camera tilted by 37 degrees
+INNER_RADIUS = 0.82  # of the best supported ellipse, that the wall's inner edge has at least
+MAX_EDGES_OF_WALL = 4  # of wall and lid, within the best supported
+INNER_SHARE = 0.85  # of the support of the best one
+NORMALS = 180
+FINE_REACH, FINE_AGREEMENT = 0.03, 0.006  # of the radius
+
+
+@dataclass(frozen=True)
+class Ellipse:
+    """An ellipse in an image.
+
+    Attributes:
+        centre_px: u and v [px].
+        major: half of the longer axis [px].
+        minor: half of the shorter one [px].
+        direction: of the shorter one [rad], from u towards v.
+        support: share of the directions in the frame in which an edge agrees.
+    """
+
+    centre_px: tuple[float, float]
+    major: float
+    minor: float
+    direction: float
+    support: float = 0.0
+
+    def points(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return points of the ellipse and its outward normals, both of shape (count, 2)."""
+        turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        cosine, sine = math.cos(self.direction), math.sin(self.direction)
+        axes = np.array([[cosine, sine], [-sine, cosine]])
+        circle = np.column_stack([np.cos(turns), np.sin(turns)])
+        points = circle * (self.minor, self.major) @ axes + self.centre_px
+        normals = circle * (self.major, self.minor) @ axes
+        return points, normals / np.hypot(*normals.T)[:, None]
+
+    def scaled(self, factor: float) -> Ellipse:
+        """Return the ellipse in an image enlarged by a factor."""
+        shift = 0.5 * (factor - 1.0)
+        u, v = (value * factor + shift for value in self.centre_px)
+        return Ellipse((u, v), self.major * factor, self.minor * factor, self.direction, self.support)
+
+
+def find_ellipse(image: np.ndarray) -> Ellipse | None:
+    """Find the inner edge of a dish's wall, by gradients alone.
+
+    In a small image edges vote for the centres of circles along their gradients; the image is stretched in a few
+    directions beside, in which the ellipse of a tilted camera is nearly a circle. Around the centres with the most
+    votes, random samples of five edges give ellipses, and the one is kept that edges in the most directions agree on,
+    within a share of its radius. Of concentric edges, as of a wall and a lid, the innermost is taken that is about as
+    well supported as the best. In the full image the edge is measured along the ellipse's normals.
+
+    Args:
+        image: shape (rows, columns) or (rows, columns, 3), uint8.
+
+    Returns:
+        The ellipse, or None if no edges agree on one.
+    """
+    side = min(image.shape[:2])
+    factor = max(1.0, side / COARSE_SIDE)
+    size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
+    if max(size) > 4 * COARSE_SIDE:  # no frame of a camera
+        return None
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1.0 else image
+    edges = _edges(small)
+    if len(edges) < 40:
+        return None
+    best: tuple[float, Ellipse] | None = None
+    for ratio in STRETCHES:
+        ways = WAYS if ratio > 1.0 else 1
+        for way in range(ways):
+            for score, ellipse in _candidates(edges, small.shape[:2], ratio, math.pi * way / ways):
+                if best is None or score > best[0]:
+                    best = score, ellipse
+        if best is not None and best[1].support > GOOD_SUPPORT:
+            break
+    if best is None:
+        return None
+    inner = _innermost(edges, small.shape[:2], best[1])
+    scaled = image.shape[1] / small.shape[1]
+    return _refined(image, inner.scaled(scaled))
+
+
+def _edges(image: np.ndarray) -> np.ndarray:
+    """Return the edges of an image, u, v and the gradient's unit direction, shape (m, 4)."""
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+    along_u = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125)
+    along_v = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125)
+    strength = cv2.magnitude(along_u.reshape(-1), along_v.reshape(-1)).reshape(along_u.shape)
+    if image.ndim == 3:  # of the colour that changes most
+        most = strength.argmax(axis=2)[..., None]
+        along_u, along_v, strength = (
+            np.ascontiguousarray(np.take_along_axis(each, most, axis=2)[..., 0])
+            for each in (along_u, along_v, strength)
+        )
+    edges = np.empty((image.shape[0] * image.shape[1] // 2, 4))
+    low = MIN_GRADIENT
+    count = thinned(along_u, along_v, strength, low, edges)
+    while count > MAX_EDGES:  # The weak ones are texture.
+        low *= 1.3
+        count = thinned(along_u, along_v, strength, low, edges)
+    return edges[:count].copy()
+
+
+def _candidates(
+    edges: np.ndarray, shape: tuple[int, ...], ratio: float, direction: float
+) -> list[tuple[float, Ellipse]]:
+    """Return ellipses with their scores, of edges stretched in a direction by a ratio."""
+    along = np.array([math.cos(direction), math.sin(direction)])
+    stretch = np.eye(2) + (ratio - 1.0) * np.outer(along, along)
+    back = np.linalg.inv(stretch)
+    moved = np.empty_like(edges)
+    moved[:, :2] = edges[:, :2] @ stretch
+    normals = edges[:, 2:] @ back
+    moved[:, 2:] = normals / np.hypot(*normals.T)[:, None]
+    side = min(shape[:2])
+    smallest, largest = MIN_RADIUS * side, MAX_RADIUS * side
+    corners = np.array([(0, 0), (shape[1], 0), (0, shape[0]), (shape[1], shape[0])], float) @ stretch
+    low, high = corners.min(axis=0) - 0.15 * side, corners.max(axis=0) + 0.15 * side
+    cells = np.ceil((high - low) / CELL).astype(int)
+    votes = np.zeros((cells[1], cells[0]), np.float32)
+    vote(moved, smallest, largest, low, CELL, votes)
+    votes = cv2.GaussianBlur(votes, (0, 0), 1.5)
+    votes -= cv2.blur(votes, (31, 31))
+    found = []
+    for _ in range(CENTRES):
+        _, _, _, (column, row) = cv2.minMaxLoc(votes)
+        votes[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5] = -np.inf
+        centre = low + CELL * (np.array([column, row]) + 0.5)
+        found += _around(moved, centre, smallest, largest, back, shape)
+    return found
+
+
+def _around(
+    edges: np.ndarray, centre: np.ndarray, smallest: float, largest: float, back: np.ndarray, shape: tuple[int, ...]
+) -> list[tuple[float, Ellipse]]:
+    """Return the ellipses around a centre in the stretched image, with their scores."""
+    rings = int(math.log(largest / smallest) / math.log(RING)) + 2
+    marks = np.zeros((rings, BINS), np.uint8)
+    ring_support(edges, centre, smallest, RING, ALIGNMENT, marks)
+    spread = marks.copy()  # An ellipse is no circle: it lies in several rings.
+    for shift in (1, 2):
+        spread[shift:] |= marks[:-shift]
+        spread[:-shift] |= marks[shift:]
+    support = spread.sum(axis=1).astype(float)
+    found = []
+    offset = edges[:, :2] - centre
+    away = np.hypot(*offset.T)
+    facing = np.abs((offset * edges[:, 2:]).sum(axis=1)) > ALIGNMENT * away
+    for _ in range(2):
+        ring = int(support.argmax())
+        if support[ring] < 0.35 * BINS:
+            break
+        support[max(0, ring - 4) : ring + 5] = 0.0
+        radius = smallest * RING ** (ring + 0.5)
+        near = facing & (np.abs(away - radius) < BAND * radius)
+        if near.sum() < 20:
+            continue
+        angles = np.arctan2(offset[near, 1], offset[near, 0])
+        best = np.zeros(5)
+        tolerance = max(0.8, AGREEMENT * radius)
+        if not fit_harmonics(angles, away[near], tolerance, TRIES, BINS, best):
+            continue
+        turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
+        points = centre + (_harmonics(turns) @ best)[:, None] * np.column_stack([np.cos(turns), np.sin(turns)])
+        ellipse = _fitted(points @ back)
+        if ellipse is None:
+            continue
+        support_of, seen = _support(_unstretched(edges, back), shape, ellipse)
+        if seen < MIN_SEEN or support_of < _needed(seen):
+            continue
+        score = support_of * math.sqrt(seen) * (ellipse.major / min(shape[:2])) ** 0.25
+        found.append((score, replace(ellipse, support=support_of)))
+    return found
+
+
+def _unstretched(edges: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Return stretched edges as they were."""
+    normals = edges[:, 2:] @ np.linalg.inv(back)
+    return np.column_stack([edges[:, :2] @ back, normals / np.hypot(*normals.T)[:, None]])
+
+
+def _support(edges: np.ndarray, shape: tuple[int, ...], ellipse: Ellipse) -> tuple[float, float]:
+    """Return in which share of the directions in the frame edges agree with an ellipse, and the share in the frame."""
+    points, _ = ellipse.points(BINS)
+    rows, columns = shape[:2]
+    inside = (points[:, 0] > 1) & (points[:, 1] > 1) & (points[:, 0] < columns - 2) & (points[:, 1] < rows - 2)
+    if not inside.any():
+        return 0.0, 0.0
+    cosine, sine = math.cos(ellipse.direction), math.sin(ellipse.direction)
+    x, y = _in_axes(edges[:, :2], ellipse)
+    away = np.hypot(x, y)
+    normal = np.column_stack([x / ellipse.minor, y / ellipse.major])
+    normal /= np.maximum(np.hypot(*normal.T), 1e-12)[:, None]
+    gradient = np.column_stack([edges[:, 2:] @ (cosine, sine), edges[:, 2:] @ (-sine, cosine)])
+    tolerance = max(0.8 / ellipse.major, AGREEMENT)
+    agree = (np.abs(away - 1.0) < tolerance) & (np.abs((normal * gradient).sum(axis=1)) > ALIGNMENT)
+    bins = ((np.arctan2(y[agree], x[agree]) / (2.0 * np.pi) + 1.0) * BINS).astype(int) % BINS
+    marks = np.zeros(BINS, bool)
+    marks[bins] = True
+    return float((marks & inside).sum() / inside.sum()), float(inside.mean())
+
+
+def _innermost(edges: np.ndarray, shape: tuple[int, ...], best: Ellipse) -> Ellipse:
+    """Return the innermost of the edges within the best that are about as well supported.
+
+    Wall and lid are at different heights: seen by a tilted camera their edges are not concentric.
+    """
+    enough = INNER_SHARE * best.support
+    inner = best
+    for _ in range(MAX_EDGES_OF_WALL):
+        x, y = _in_axes(edges[:, :2], inner)
+        away = np.hypot(x, y)
+        normal = np.column_stack([x, y]) / np.maximum(away, 1e-9)[:, None]
+        cosine, sine = math.cos(inner.direction), math.sin(inner.direction)
+        gradient = np.column_stack([edges[:, 2:] @ (cosine, sine), edges[:, 2:] @ (-sine, cosine)])
+        facing = np.abs((gradient * normal).sum(axis=1)) > ALIGNMENT
+        outer = 1.0 - max(1.5 * AGREEMENT, 2.0 / inner.major)
+        least = INNER_RADIUS * best.major / inner.major
+        near = facing & (away > least) & (away < 1.0 + INNER_RADIUS - least)
+        near &= (away < outer) | (away > 2.0 - outer)  # not those of the one that is known
+        if near.sum() < 20:
+            break
+        shape_of = np.zeros(5)
+        angles = np.arctan2(y[near], x[near])
+        tolerance = max(0.8 / inner.major, AGREEMENT)
+        if not fit_harmonics(angles, away[near], tolerance, TRIES, BINS, shape_of):
+            break
+        turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
+        radii = _harmonics(turns) @ shape_of
+        local = radii[:, None] * np.column_stack([np.cos(turns), np.sin(turns)]) * (inner.minor, inner.major)
+        found = _fitted(local @ np.array([[cosine, sine], [-sine, cosine]]) + inner.centre_px)
+        if found is None or not INNER_RADIUS * best.major < found.major < 0.99 * inner.major:
+            break
+        support, seen = _support(edges, shape, found)
+        if support < max(enough, _needed(seen)):
+            break
+        inner = replace(found, support=support)
+    return inner
+
+
+def _needed(seen: float) -> float:
+    """Return the support that an ellipse needs of which a share lies in the frame: of a short arc chance is more."""
+    return MIN_SUPPORT + 0.5 * (1.0 - seen)
+
+
+def _harmonics(turns: np.ndarray) -> np.ndarray:
+    """Return the functions of `fit_harmonics`, shape (n, 5)."""
+    return np.column_stack([np.ones(len(turns)), np.cos(turns), np.sin(turns), np.cos(2 * turns), np.sin(2 * turns)])
+
+
+def _in_axes(points: np.ndarray, ellipse: Ellipse) -> tuple[np.ndarray, np.ndarray]:
+    """Return points along the shorter and the longer axis, in halves of them."""
+    cosine, sine = math.cos(ellipse.direction), math.sin(ellipse.direction)
+    offset = points - ellipse.centre_px
+    return offset @ (cosine, sine) / ellipse.minor, offset @ (-sine, cosine) / ellipse.major
+
+
+def _refined(image: np.ndarray, ellipse: Ellipse) -> Ellipse | None:
+    """Return an ellipse measured along its normals, in the image's own pixels."""
+    gray = measured_channel(image)
+    factor = max(1, round(min(gray.shape) / FINE_SIDE))
+    if factor > 1:
+        size = (gray.shape[1] // factor, gray.shape[0] // factor)
+        gray = cv2.resize(gray[: size[1] * factor, : size[0] * factor], size, interpolation=cv2.INTER_AREA)
+    at = ellipse.scaled(1.0 / factor)
+    for share in (FINE_REACH, 0.5 * FINE_REACH):
+        reach = max(4.0, share * at.major)
+        points, normals = at.points(NORMALS)
+        found = np.zeros((NORMALS, 2))
+        steepest(gray, points, normals, reach, 0.5, 0, found)
+        sign = 1 if np.sum(np.sign(found[:, 1]) * np.sqrt(np.abs(found[:, 1]))) > 0.0 else -1
+        steepest(gray, points, normals, reach, 0.5, sign, found)
+        seen = np.abs(found[:, 1]) > 0.5
+        fitted = _fitted_robustly(points[seen] + found[seen, :1] * normals[seen], at)
+        if fitted is None:
+            break
+        at = fitted
+    at = Ellipse(at.centre_px, at.major, at.minor, at.direction, ellipse.support)
+    return at.scaled(float(factor)) if at.minor > MIN_RATIO * at.major else None
+
+
+def _fitted_robustly(points: np.ndarray, begin: Ellipse) -> Ellipse | None:
+    """Return the ellipse that most points agree on, near a first one; None if few do."""
+    kept, at = points, begin
+    for tolerance in (4.0 * FINE_AGREEMENT, 2.0 * FINE_AGREEMENT, FINE_AGREEMENT):
+        at_or_none = _fitted(kept)
+        if at_or_none is None:
+            return None
+        at = at_or_none
+        away = np.hypot(*_in_axes(points, at))
+        kept = points[np.abs(away - 1.0) < max(tolerance, 1.0 / at.major)]
+        if len(kept) < NORMALS // 4:
+            return None
+    if math.dist(at.centre_px, begin.centre_px) > 0.05 * begin.major or abs(at.major / begin.major - 1.0) > 0.08:
+        return None
+    return at
+
+
+def _fitted(points: np.ndarray) -> Ellipse | None:
+    """Return the least-squares ellipse of points; None where there is none near a circle."""
+    if len(points) < 6:
+        return None
+    mean = points.mean(axis=0)
+    (u, v), axes, angle = cv2.fitEllipseDirect((points - mean).astype(np.float32))
+    minor, major = 0.5 * min(axes), 0.5 * max(axes)
+    if not (np.isfinite([u, v, minor, major]).all() and major > 1.0 and minor > MIN_RATIO * major):
+        return None
+    direction = math.radians(angle) + (0.0 if axes[0] <= axes[1] else 0.5 * math.pi)
+    return Ellipse((float(u + mean[0]), float(v + mean[1])), major, minor, direction)
