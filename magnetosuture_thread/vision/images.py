@@ -51,6 +51,7 @@ class Picture:
         factor: how much smaller `small` is.
         origin: (u, v) of the first pixel in the whole frame.
         mask: where the scene's shapes are; None if it has none.
+        colours: the image itself in BGR order, shape (rows, columns, 3); None of a grey one.
     """
 
     brightest: Layer
@@ -58,6 +59,7 @@ class Picture:
     factor: int
     origin: tuple[int, int] = (0, 0)
     mask: SceneMask | None = None
+    colours: np.ndarray | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -84,7 +86,7 @@ def prepare(image: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), ma
     one, two, three = cv2.split(image)
     brightest = _channel(np.asarray(cv2.max(cv2.max(one, two), three)), factor, mask)
     darkest = _channel(np.asarray(cv2.min(cv2.min(one, two), three)), factor, mask)
-    return Picture(brightest, darkest, factor, origin, mask)
+    return Picture(brightest, darkest, factor, origin, mask, image)
 
 
 def _channel(pixels: np.ndarray, factor: int, mask: SceneMask | None) -> Layer:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
+from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.dish.tilt import Tilt, find_tilt
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
@@ -21,6 +22,7 @@ from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
+from magnetosuture_thread.vision.thread.observe import observe
 
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
@@ -57,6 +59,7 @@ class Track:
         centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
         view: where the dish is in the image; None when it is not found.
         warning: what makes the measurement worse than it could be; empty if nothing does.
+        observation: the pieces of the thread that are seen, in the dish frame; the centreline is the walk from the tail.
     """
 
     state: State
@@ -70,6 +73,7 @@ class Track:
     centreline: np.ndarray
     view: DishView | None
     warning: str = ""
+    observation: ThreadObservation = field(default_factory=ThreadObservation)
 
 
 def no_pose(state: State, reason: str, view: DishView | None) -> Track:
@@ -224,11 +228,14 @@ def tracked(
     settings: VisionTrackerSettings,
     needle: MeasuredNeedle,
     walk: np.ndarray,
+    diameter: float,
     otherwise: State = State.LOST,
+    *,
+    search: bool = True,
 ) -> Track:
     """Return what a frame shows whose needle and centreline are known, in the picture's own pixels.
 
-    `otherwise` is the state if it is unknown which end is the tail.
+    `otherwise` is the state if it is unknown which end is the tail; `search` is that of `observe`.
     """
     local = _local(view, picture)
     heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
@@ -246,6 +253,16 @@ def tracked(
         covariance=covariance,
         centreline=local.to_dish(walk),
         view=view,
+        observation=observe(
+            picture,
+            needle,
+            walk,
+            local,
+            0.5 * diameter,
+            settings.thread_length,
+            scale_known=settings.metres_per_pixel > 0.0,
+            search=search,
+        ),
     )
 
 
@@ -269,7 +286,7 @@ def look_once(
     needle, walk, reason = with_thread(picture, view, settings, diameter, needles)
     if needle is None:
         return no_pose(State.LOST, reason, view)
-    return tilted(tracked(picture, view, settings, needle, walk), dish, 0.5 * diameter)
+    return tilted(tracked(picture, view, settings, needle, walk, diameter), dish, 0.5 * diameter)
 
 
 def tilted(track: Track, dish: FoundDish, radius: float) -> Track:
