@@ -142,18 +142,24 @@ def looks_alike(picture: Picture, thread: Appearance, points: Points, slack: flo
     return True
 
 
-def strengths(gray: NDArray[np.uint8], points: Points, thread: Appearance) -> Values:
-    """Return how much darker, or brighter, a line's middle is than the floor on its brighter, or darker, side."""
+def strengths(
+    gray: NDArray[np.uint8], points: Points, thread: Appearance, *, two_sided: bool = False
+) -> NDArray[np.float64]:
+    """Return how much darker, or brighter, a line's middle is than the floor on the side where it differs more.
+
+    With `two_sided`, where it differs less: next to another strand nothing then, but nothing along an edge either.
+    """
     reach = thread.beside_px
     profiles = sampled(gray, across(points, np.array([-reach, -1.0, -0.5, 0.0, 0.5, 1.0, reach]))).astype(float)
     if thread.pale:
         profiles = 255.0 - profiles
-    return np.asarray(profiles[:, (0, -1)].max(axis=1) - profiles[:, 1:-1].min(axis=1))
+    sides = profiles[:, (0, -1)]
+    return np.asarray((sides.min(axis=1) if two_sided else sides.max(axis=1)) - profiles[:, 1:-1].min(axis=1))
 
 
 def smoothed(values: Values, spacing: float) -> Values:
     """Return values along a line, averaged over `SMOOTHED_PX`."""
-    width = max(1, round(SMOOTHED_PX / max(spacing, 1e-6)))
+    width = min(len(values), max(1, round(SMOOTHED_PX / max(spacing, 1e-6))))
     count = np.convolve(np.ones_like(values), np.ones(width), "same")
     return np.asarray(np.convolve(values, np.ones(width), "same") / count)
 

@@ -31,20 +31,21 @@ from magnetosuture_thread.vision.thread.appearance import (
 )
 from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX, Hiding, find_hiding
 from magnetosuture_thread.vision.thread.order import Order, Piece, find_order, outward
-from magnetosuture_thread.vision.thread.pieces import find_pieces
+from magnetosuture_thread.vision.thread.pieces import MIN_LENGTH_PX, find_pieces, fresh_parts
 
 LENGTH_TOLERANCE = 0.03  # of the thread's length, that a whole thread may be seen shorter or longer by
 LENGTH_ERROR = 0.01  # of an arc length: by noise along the walk
 END_ERROR_PX = 4.0  # of an arc length, by the places where pieces begin and end
 SPACING_PX = 2.0  # of a piece's points
-GAP_PX = 13.0  # a piece has no gap longer than this
+GAP_PX, OBJECT_GAP_PX = 13.0, 6.0  # a piece has no gap longer than this, and below an object none longer than that
+MEETS_PX = 6.0  # from another piece's end, where the way through a crossing isn't known
 NEAR_PX = 7.0  # from an end up to which something hides the thread that goes on there
 AHEAD_PX, AHEAD = (3.0, 5.0, 7.0, 9.0, 11.0), math.radians(50.0)  # beyond an end, where floor must be seen
 BARE_STEP = 0.03  # of the floor's brightness, that bare floor beyond an end may differ from that beside it
 GOES_ON = 0.5  # of its strength, with which a thread would go on beyond an end
 SURE_STRENGTH = 2.0  # of the faintest that is seen, that a thread must have where it is seen to end
 SCALE_ERROR = 0.001  # see `look`
-UNSURE = 0.3  # confidence of a piece whose place along the thread isn't known
+WIDE, UNSURE = 0.6, 0.3  # confidence of a piece whose order is open, and of one whose direction is, too
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,10 @@ class _Strand:
     points: Points
     strength: NDArray[np.float64]
     seen: NDArray[np.bool_]
+
+    def part(self, first: int, last: int) -> _Strand:
+        """Return the vertices from one to before another."""
+        return _Strand(self.points[first:last], self.strength[first:last], self.seen[first:last])
 
 
 def observe(
@@ -91,10 +96,13 @@ def observe(
     thread = appearance_of(picture, gray, walk, ~below)
     line = _strand(gray, thread, walk, below)
     length = thread_length / view.metres_per_pixel
-    parts = _parts(line)
+    gone = _gone(line.seen, GAP_PX)
+    parts = _parts(line, gone)
     in_dish = _Dish(view, thread, scale_known)
     ends_bare = _is_bare(picture, gray, thread, parts[0], needle)
-    if len(parts) == 1 and ends_bare and abs(arc_lengths(walk)[-1] / length - 1.0) < LENGTH_TOLERANCE:
+    plain = strengths(gray, walk, thread, two_sided=True) > max(FAINTEST, SEEN_SHARE * thread.strength)
+    gapless = not gone.any() and not _gone(plain | below, OBJECT_GAP_PX).any()
+    if gapless and ends_bare and _is_whole(line, length):
         whole = in_dish.piece(line, PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), 1.0)
         return ThreadObservation((whole,), complete=True, hidden=(_outline(needle, view),))
     if not search:
@@ -102,9 +110,18 @@ def observe(
         return ThreadObservation((first,), hidden=(_outline(needle, view),))
     wall = Wall(view.centre_px, radius / view.metres_per_pixel)
     hiding = find_hiding(picture, needle, wall, view.metres_per_pixel)
-    strands = [visible for part in parts for visible in [_trimmed(part, hiding, first=part is parts[0])] if visible]
-    known = [strand.points for strand in strands]
-    others = find_pieces(picture, gray, thread, hiding, known, length)
+    on_floor = np.array([hiding.area_at(point) == 0 for point in line.points])
+    line = _Strand(line.points, line.strength, line.seen & on_floor)
+    parts = _parts(line, _gone(line.seen, GAP_PX) | _gone(line.seen | below, OBJECT_GAP_PX))
+    begun = _trimmed(parts[0])
+    known = [begun.points]
+    for part in parts[1:]:  # beyond what the walk only guessed, where it may have gone around twice
+        if part.seen.sum() > 1:
+            first, last = np.flatnonzero(part.seen)[[0, -1]]
+            fresh = fresh_parts(part.points[first : last + 1], known)
+            known += [each for each in fresh if len(each) > MIN_LENGTH_PX]
+    others = known[1:] + find_pieces(picture, gray, thread, hiding, known, length)
+    strands = _cut(begun, others)
     strands += [_strand(gray, thread, resampled(other, SPACING_PX)) for other in others]
     return _joined(picture, gray, thread, needle, hiding, strands, in_dish, length)
 
@@ -160,10 +177,9 @@ def _joined(
         pieces.append(Piece(strand.points, (area, last_area)))
     longest = length * (1.0 + LENGTH_TOLERANCE)
     order = find_order(pieces, hiding, (length * (1.0 - LENGTH_TOLERANCE), longest), in_dish.view.metres_per_pixel)
-    seen = sum(pieces[placed.index].length for placed in order.placed)
-    _tell_free(ends, order, seen, length)
+    _tell_free(ends, order, length)
     result, told = [], set()
-    for placed in order.placed:
+    for placed in (*order.placed, *order.wide):
         strand, (first, last) = strands[placed.index], ends[placed.index]
         if placed.turned:
             strand, first, last = _Strand(strand.points[::-1], strand.strength[::-1], strand.seen[::-1]), last, first
@@ -171,24 +187,31 @@ def _joined(
         if placed.index:
             low = max(0.0, low - LENGTH_ERROR * low - END_ERROR_PX)
             high = min(high + LENGTH_ERROR * high + END_ERROR_PX, max(low, longest - pieces[placed.index].length))
-        result.append(in_dish.piece(strand, first, last, (low, high), order.share if placed.index else 1.0))
+        confidence = 1.0 if not placed.index else order.share if placed in order.placed else WIDE
+        result.append(in_dish.piece(strand, first, last, (low, high), confidence))
         told.add(placed.index)
     nowhere = (math.nan, math.nan)
     for number, strand in enumerate(strands):
         if number not in told:
             first, last = ends[number]
             result.append(in_dish.piece(strand, first, last, nowhere, UNSURE, direction_known=False))
+    alone = len(strands) == 1 and ends[0][1] is PieceEnd.FREE and _is_whole(strands[0], length)
     outlines = [in_dish.view.to_dish(outline) for outline in hiding.outlines()]
-    return ThreadObservation(tuple(result), hidden=tuple(outlines))
+    return ThreadObservation(tuple(result), alone, tuple(outlines))
 
 
-def _tell_free(ends: list[list[PieceEnd]], order: Order, seen: float, length: float) -> None:
+def _is_whole(strand: _Strand, length: float) -> bool:
+    """Say whether a piece is as long as the thread."""
+    return bool(abs(arc_lengths(strand.points)[-1] / length - 1.0) < LENGTH_TOLERANCE)
+
+
+def _tell_free(ends: list[list[PieceEnd]], order: Order, length: float) -> None:
     """Let an end on bare floor count as the thread's only where it is the only one, and the lengths add up."""
     bare = [(number, side) for number, both in enumerate(ends) for side in (0, 1) if both[side] is PieceEnd.FREE]
-    last = order.placed[-1]
-    adds_up = seen + order.hidden[0] < length * (1.0 + LENGTH_TOLERANCE) + END_ERROR_PX
-    adds_up &= seen + order.hidden[1] > length * (1.0 - LENGTH_TOLERANCE) - END_ERROR_PX
-    if bare == [(last.index, 0 if last.turned else 1)] and adds_up:
+    low, high = order.length
+    adds_up = low < length * (1.0 + LENGTH_TOLERANCE) + END_ERROR_PX
+    adds_up &= high > length * (1.0 - LENGTH_TOLERANCE) - END_ERROR_PX
+    if order.last is not None and bare == [(order.last[0], 0 if order.last[1] else 1)] and adds_up:
         return
     for number, side in bare:
         ends[number][side] = PieceEnd.UNKNOWN
@@ -262,29 +285,40 @@ def _strand(
     return _Strand(points, strength, seen if below is None else seen & ~below)
 
 
-def _parts(line: _Strand) -> list[_Strand]:
-    """Cut a walk where the thread isn't seen for more than `GAP_PX`, but for its way out from below the needle."""
-    gaps = [
-        (first, last)
-        for first, last in runs(~line.seen)
-        if first > 0 and (last - first) * SPACING_PX > GAP_PX and last < len(line.seen)
-    ]
-    edges = [0, *(index for gap in gaps for index in gap), len(line.seen)]
-    return [
-        _Strand(line.points[first:last], line.strength[first:last], line.seen[first:last])
-        for first, last in zip(edges[::2], edges[1::2], strict=True)
-        if last - first > 1
-    ]
+def _gone(seen: NDArray[np.bool_], max_gap: float) -> NDArray[np.bool_]:
+    """Return where a walk isn't seen for more than a length, but for its way out from below the needle."""
+    gone = np.zeros_like(seen)
+    for first, last in runs(~seen):
+        gone[first:last] = first > 0 and last < len(seen) and (last - first) * SPACING_PX > max_gap
+    return gone
 
 
-def _trimmed(strand: _Strand, hiding: Hiding, *, first: bool) -> _Strand | None:
-    """Return a piece without its ends that lie where nothing can be seen; None if nothing is left."""
-    areas = np.array([hiding.area_at(point) for point in strand.points])
-    shown = np.flatnonzero(strand.seen & (areas == 0)) if (strand.seen & (areas == 0)).any() else np.empty(0, int)
-    if len(shown) < 2:
-        return strand if first else None
-    begin, end = (0 if first else int(shown[0])), int(shown[-1]) + 1
-    return _Strand(strand.points[begin:end], strand.strength[begin:end], strand.seen[begin:end])
+def _parts(line: _Strand, gone: NDArray[np.bool_]) -> list[_Strand]:
+    """Return what is left of a walk, the part that leaves the needle first."""
+    return [line.part(first, last) for first, last in runs(~gone) if last - first > 1]
+
+
+def _cut(strand: _Strand, others: list[Points]) -> list[_Strand]:
+    """Cut the piece that leaves the needle where another piece begins on it: there the thread may go on along it."""
+    ends = np.array([end for other in others for end in (other[0], other[-1])]).reshape(-1, 2)
+    if not len(ends):
+        return [strand]
+    apart = np.hypot(*(strand.points[:, None] - ends[None]).transpose(2, 0, 1))
+    inside = arc_lengths(strand.points)
+    met = (apart.min(axis=1) < MEETS_PX) & (inside > MEETS_PX) & (inside < inside[-1] - 2.0 * MEETS_PX)
+    found = runs(met)
+    if not found:
+        return [strand]
+    parts = [strand.part(0, found[0][0])]
+    for (_, first), last in zip(found, [begin for begin, _ in found[1:]] + [len(met)], strict=True):
+        parts.append(strand.part(first, last))
+    return [parts[0], *(part for part in parts[1:] if len(part.points) * SPACING_PX > GAP_PX)]
+
+
+def _trimmed(strand: _Strand) -> _Strand:
+    """Return the piece that leaves the needle without its end where nothing can be seen."""
+    shown = np.flatnonzero(strand.seen)
+    return strand.part(0, max(2, int(shown[-1]) + 1)) if len(shown) else strand
 
 
 def _below_needle(needle: MeasuredNeedle, points: Points) -> NDArray[np.bool_]:

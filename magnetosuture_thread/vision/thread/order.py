@@ -29,7 +29,7 @@ DIRECTION_ERROR = 0.12  # rad; of that direction
 TURNING = 60.0  # rad^2 / m; variance of a thread's tangent for each length
 MAX_PRICE = 12.0  # of one gap
 SURE = 4.0  # by which the price of every other order must be higher
-LEFT_OUT = 8.0  # price of a piece that is in no order
+LEFT_OUT = 12.0  # price of a piece that is in no order
 LENGTH_DEVIATION = 0.15  # of a gap's length, that a thread hidden there may be longer or shorter by
 MAX_BARE_PX = 10.0  # of a gap's curve, that may lie on bare floor
 MAX_ORDERED = 6  # pieces; only the longest are tried in all orders
@@ -80,14 +80,16 @@ class Order:
     Attributes:
         placed: pieces from the needle on.
         share: how likely this order is among those that were tried, 0 to 1.
-        gaps: curves below what hides the thread, between one piece and the next, each of shape (m, 2) [px].
-        hidden: least and greatest length of all gaps together [px].
+        wide: pieces that may lie in different places beyond these, but in one direction, with all of these places.
+        last: the piece that is the last one for sure, with its direction; None if that isn't known.
+        length: least and greatest length of the thread up to the end of the last piece [px].
     """
 
     placed: tuple[Placed, ...]
     share: float
-    gaps: tuple[Points, ...]
-    hidden: tuple[float, float]
+    wide: tuple[Placed, ...]
+    last: tuple[int, bool] | None
+    length: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ def find_order(pieces: list[Piece], hiding: Hiding, length: tuple[float, float],
         metres_per_pixel: of the picture [m].
 
     Returns:
-        The pieces that every order that is nearly the best begins with.
+        The pieces that every order that is nearly the best begins with, and what else all of these agree on.
     """
     gaps: dict[tuple[Step, Step], _Gap] = {}
     oriented = {(k, turned): piece.turned() if turned else piece for k, piece in enumerate(pieces) for turned in (0, 1)}
@@ -146,23 +148,37 @@ def find_order(pieces: list[Piece], hiding: Hiding, length: tuple[float, float],
     ]
     tried.sort(key=lambda each: each[0])
     best, chain = tried[0] if tried else (0.0, ((0, False),))
-    rivals = [other for price, other in tried[1:] if price < best + SURE]
+    near = [other for price, other in tried if price < best + SURE] or [chain]
     same = 1
-    while same < len(chain) and all(len(other) > same and other[same] == chain[same] for other in rivals):
+    while same < len(chain) and all(len(other) > same and other[same] == chain[same] for other in near):
         same += 1
-    sure = chain[:same]
-    # What is tried, and goes another way: its share of all.
     total = sum(math.exp(best - price) for price, _ in tried) or 1.0
-    share = sum(math.exp(best - price) for price, other in tried if other[:same] == sure) / total if tried else 1.0
+    share = sum(math.exp(best - price) for price, other in tried if other[:same] == chain[:same]) / total or 1.0
+    ways = [_placed(other, gaps, lengths, length[1]) for other in near]
+    last = chain[-1] if all(other[-1] == chain[-1] for other in near) else None
+    reached = [
+        (sum(lengths[k] for k, _ in other) + sum(gap.chord for gap in used), way[-1].arc_length[1] + lengths[other[-1][0]])
+        for other, way in zip(near, ways, strict=True)
+        for used in [[gaps[pair] for pair in zip(other, other[1:], strict=False)]]
+    ]
     return Order(
-        _placed(sure, gaps, lengths, length[1]),
+        ways[0][:same],
         share,
-        tuple(gaps[pair].curve for pair in zip(sure, sure[1:], strict=False)),
-        (
-            sum(gaps[pair].chord for pair in zip(sure, sure[1:], strict=False)),
-            sum(BULGE * gaps[pair].length for pair in zip(sure, sure[1:], strict=False)),
-        ),
+        _wide(ways, same),
+        last,
+        (min(low for low, _ in reached), max(high for _, high in reached)),
     )
+
+
+def _wide(ways: list[tuple[Placed, ...]], same: int) -> tuple[Placed, ...]:
+    """Return the pieces beyond the first ones that lie in one direction in all ways, with all of their places."""
+    result = []
+    for piece in ways[0][same:]:
+        places = [other for way in ways for other in way if (other.index, other.turned) == (piece.index, piece.turned)]
+        if len(places) == len(ways):
+            low, high = (pick(place.arc_length[k] for place in places) for k, pick in ((0, min), (1, max)))
+            result.append(Placed(piece.index, piece.turned, (low, high)))
+    return tuple(sorted(result, key=lambda placed: placed.arc_length))
 
 
 def _chains(first: Step, gaps: dict[tuple[Step, Step], _Gap], count: int) -> Iterator[tuple[Step, ...]]:

@@ -89,7 +89,7 @@ def find_pieces(
         line = _traced(ridge, noise, faintest, seed, thread.strength, dish, max_length)
         _clear(fresh, line, thread.beside_px)
         cv2.circle(fresh, (round(seed[0]), round(seed[1])), MIN_SEED_PX, 0, -1)
-        for part in _fresh_parts(line, known + found):
+        for part in fresh_parts(line, known + found):
             if arc_lengths(part)[-1] >= MIN_LENGTH_PX and _is_thread(picture, gray, thread, hiding, part):
                 found.append(part)
     return sorted(found, key=lambda line: -arc_lengths(line)[-1])
@@ -142,13 +142,15 @@ def _clear(fresh: NDArray[np.uint8], line: Points, reach: float) -> None:
     cv2.polylines(fresh, [at], False, 0, 2 * math.ceil(reach) + 1, cv2.LINE_8, 4)
 
 
-def _fresh_parts(line: Points, known: list[Points]) -> list[Points]:
-    """Return the parts of a line that run along no known one; they may cross it."""
+def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
+    """Return the parts of a line that run along no known one, nor along itself; they may cross them."""
     line = resampled(line, 1.0)
-    if not known:
-        return [line]
-    others = np.vstack([resampled(other, 1.0) for other in known])
-    twice = ((line[:, None] - others[None]) ** 2).sum(axis=2).min(axis=1) < TWICE_PX**2
+    apart = ((line[:, None] - line[None]) ** 2).sum(axis=2)
+    index = np.arange(len(line))
+    twice = ((apart < TWICE_PX**2) & (index[None] < index[:, None] - MAX_TWICE_PX)).any(axis=1)
+    if known:
+        others = np.vstack([resampled(other, 1.0) for other in known])
+        twice |= ((line[:, None] - others[None]) ** 2).sum(axis=2).min(axis=1) < TWICE_PX**2
     for first, last in runs(twice):
         if last - first < MAX_TWICE_PX and first > 0 and last < len(twice):
             twice[first:last] = False
