@@ -251,7 +251,7 @@ def compare_pieces(
             free += end is PieceEnd.FREE
             not_free += end is PieceEnd.FREE and float(np.hypot(*(point - truth[-1]))) > WRONG_END
     end = float(np.hypot(*(observation.pieces[0].points[-1] - truth[-1])))
-    shown = float((_nearest(truth, lines[0]) < bound).mean())
+    shown = float((_nearest(truth, lines[0]) < max(bound, WRONG_END)).mean())
     covered = visible * float((_nearest(seen, np.vstack(lines)) < bound).mean()) if len(seen) else 0.0
     return PieceErrors(
         covered=covered,
@@ -261,7 +261,7 @@ def compare_pieces(
         placed=sum(math.isfinite(piece.arc_length[0]) for piece in observation.pieces),
         misplaced=misplaced,
         complete=observation.complete,
-        incomplete=observation.complete and (end > WRONG_END or shown * total < total - 2.0 * WRONG_END),
+        incomplete=observation.complete and (end > WRONG_END or shown * total < total - WRONG_END),
         free=free,
         not_free=not_free,
         normalised=normalised,

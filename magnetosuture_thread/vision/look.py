@@ -293,7 +293,15 @@ def tilted(track: Track, dish: FoundDish, radius: float) -> Track:
     """Return a track with what a tilt of the camera leaves unknown, and a warning of it."""
     if dish.tilt is None:
         return track
-    return replace(track, covariance=track.covariance + dish.tilt.covariance(radius), warning=dish.tilt.warning)
+    covariance = dish.tilt.covariance(radius)
+    more = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+    pieces = tuple(replace(piece, deviation=np.hypot(piece.deviation, more)) for piece in track.observation.pieces)
+    return replace(
+        track,
+        covariance=track.covariance + covariance,
+        warning=dish.tilt.warning,
+        observation=replace(track.observation, pieces=pieces),
+    )
 
 
 def _local(view: DishView, picture: Picture) -> DishView:

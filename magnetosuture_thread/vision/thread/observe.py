@@ -96,12 +96,13 @@ def observe(
     thread = appearance_of(picture, gray, walk, ~below)
     line = _strand(gray, thread, walk, below)
     length = thread_length / view.metres_per_pixel
-    gone = _gone(line.seen, GAP_PX)
+    begin = _way_out(needle, walk)
+    gone = _gone(line.seen, GAP_PX, begin)
     parts = _parts(line, gone)
     in_dish = _Dish(view, thread, scale_known)
     ends_bare = _is_bare(picture, gray, thread, parts[0], needle)
     plain = strengths(gray, walk, thread, two_sided=True) > max(FAINTEST, SEEN_SHARE * thread.strength)
-    gapless = not gone.any() and not _gone(plain | below, OBJECT_GAP_PX).any()
+    gapless = not gone.any() and not _gone(plain | below, OBJECT_GAP_PX, begin).any()
     if gapless and ends_bare and _is_whole(line, length):
         whole = in_dish.piece(line, PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), 1.0)
         return ThreadObservation((whole,), complete=True, hidden=(_outline(needle, view),))
@@ -112,7 +113,7 @@ def observe(
     hiding = find_hiding(picture, needle, wall, view.metres_per_pixel)
     on_floor = np.array([hiding.area_at(point) == 0 for point in line.points])
     line = _Strand(line.points, line.strength, line.seen & on_floor)
-    parts = _parts(line, _gone(line.seen, GAP_PX) | _gone(line.seen | below, OBJECT_GAP_PX))
+    parts = _parts(line, _gone(line.seen, GAP_PX, begin) | _gone(line.seen | below, OBJECT_GAP_PX, begin))
     begun = _trimmed(parts[0])
     known = [begun.points]
     for part in parts[1:]:  # beyond what the walk only guessed, where it may have gone around twice
@@ -285,12 +286,20 @@ def _strand(
     return _Strand(points, strength, seen if below is None else seen & ~below)
 
 
-def _gone(seen: NDArray[np.bool_], max_gap: float) -> NDArray[np.bool_]:
-    """Return where a walk isn't seen for more than a length, but for its way out from below the needle."""
+def _gone(seen: NDArray[np.bool_], max_gap: float, begin: int) -> NDArray[np.bool_]:
+    """Return where a walk isn't seen for more than a length, in gaps that begin at a vertex or later."""
     gone = np.zeros_like(seen)
     for first, last in runs(~seen):
-        gone[first:last] = first > 0 and last < len(seen) and (last - first) * SPACING_PX > max_gap
+        gone[first:last] = first >= begin and last < len(seen) and (last - first) * SPACING_PX > max_gap
     return gone
+
+
+def _way_out(needle: MeasuredNeedle, walk: Points) -> int:
+    """Return the first vertex of a walk that lies clear of the needle."""
+    along, aside = needle.arc.coordinates(walk)
+    near = (along > -NEEDLE_PX) & (along < needle.length_px + NEEDLE_PX)
+    near &= np.abs(aside) < 0.5 * needle.width_px + 2.0 * NEEDLE_PX
+    return len(near) if near.all() else max(1, int(np.argmin(near)))
 
 
 def _parts(line: _Strand, gone: NDArray[np.bool_]) -> list[_Strand]:
