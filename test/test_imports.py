@@ -31,7 +31,7 @@ ALLOWED = {
     "barrier": {"errors", "geometry", "texts"},
     "geometry": {"errors", "compiled"},
     "scene": {*BASE, "geometry", "interface", "shared_parameters"},
-    "model": {*BASE, "barrier", "compiled", "geometry", "scene", "shared_parameters"},
+    "model": {*BASE, "barrier", "compiled", "geometry", "scene", "shared_parameters", "thread_observation"},
     "vision": {*BASE, "compiled", "geometry", "scene", "shared_parameters", "thread_observation"},
     "safety": {*BASE, "barrier", "compiled", "geometry", "scene"},
     "coils": {*BASE, "barrier", "geometry", "safety", "scene", "shared_parameters"},
@@ -39,7 +39,10 @@ ALLOWED = {
     "console": {*BASE, "geometry", "scene", "shared_parameters"},
     "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
     "bags": {*BASE, "interface", "messages"},
-    "messages": {"barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils"},
+    "messages": {
+        *("barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils"),
+        "thread_observation",
+    },
     "evaluation": {
         "barrier",
         "messages",
@@ -51,14 +54,19 @@ ALLOWED = {
         "interface",
         "model",
         "scene",
+        "thread_observation",
     },
     "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation", "texts"},
     "nodes": {
         *BASE,
         *("interface", "messages", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
-        "parameter_files",
+        *("parameter_files", "thread_observation"),
     },
-    "offline": {*BASE, "interface", "messages", "geometry", "scene", "model", "vision", "bags", "evaluation", "setups"},
+    "offline": {
+        *BASE,
+        *("interface", "messages", "geometry", "scene", "model", "vision", "bags", "evaluation", "setups"),
+        "thread_observation",
+    },
     "setups": {
         *BASE,
         *("scene", "model", "vision", "coils", "guidance", "rig", "console", "parameter_files", "shared_parameters"),
@@ -84,6 +92,7 @@ ALLOWED = {
             "setups",
             "offline",
             "messages",
+            "thread_observation",
         ),
     },
     "reproduce": {

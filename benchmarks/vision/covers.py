@@ -54,9 +54,7 @@ def _two_covers(random: Random) -> Case:
     for _ in range(MAX_TRIES):
         case = _usual(random, thread=0.028)
         widths, middles = random.uniform(2e-3, 5e-3, 2), (random.uniform(5e-3, 10e-3), random.uniform(16e-3, 22e-3))
-        posts = [
-            _post(points_at(case.thread, np.array([at]))[0], w) for at, w in zip(middles, widths, strict=True)
-        ]
+        posts = [_post(points_at(case.thread, np.array([at]))[0], w) for at, w in zip(middles, widths, strict=True)]
         apart = np.linalg.norm(posts[0].mean(axis=0) - posts[1].mean(axis=0)) - 0.5 * widths.sum()
         if apart > 1e-3 and _off_needle(case, *posts):
             return replace(case, hidden_by=tuple(Cover(post, _colour(random), 1.0) for post in posts))
@@ -117,7 +115,7 @@ def _below_needle(random: Random) -> Case:
         leaving = math.atan2(*(line[-1] - line[-2])[::-1])
         line = np.vstack([line, _laid(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
         hidden = needle.distances(line[::4][8:]) < 0.5 * needle.width
-        if _is_inside(line) and 1.5e-3 < 4 * TURN_STEP * hidden.sum() and arc_lengths(line)[-1] < 0.034:
+        if _is_inside(line) and 4 * TURN_STEP * hidden.sum() > 1.5e-3 and arc_lengths(line)[-1] < 0.034:
             return Case(needle, line, lighting=_lighting(random))
     raise RuntimeError("no thread fits below the needle")
 
@@ -128,7 +126,9 @@ def _hand_instrument(random: Random) -> Case:
         case = _usual(random, thread=0.026)
         at = points_at(case.thread, np.array([random.uniform(6e-3, 20e-3)]))[0]
         outward = at / max(float(np.hypot(*at)), 1e-6)
-        way = math.cos(lean := random.uniform(-0.8, 0.8)) * outward + math.sin(lean) * np.array([-outward[1], outward[0]])
+        way = math.cos(lean := random.uniform(-0.8, 0.8)) * outward + math.sin(lean) * np.array(
+            [-outward[1], outward[0]]
+        )
         instrument = _strip(at - 2e-3 * way, way, 0.06, random.uniform(1.5e-3, 3e-3))
         hand = _strip(at + random.uniform(6e-3, 10e-3) * way, way, 0.06, random.uniform(8e-3, 14e-3))
         if _off_needle(case, instrument, hand):

@@ -134,7 +134,7 @@ class Row:
         incomplete: of these, that don't.
         free: ends of which is said that they are the thread's.
         not_free: of these, that are not.
-        normalised: root mean square of the points' distances from the thread over their standard deviation; 1 is honest.
+        normalised: root mean square of points' distances from the thread over their standard deviation; 1 is honest.
         median_ms: CPU time of a frame.
         max_ms: the longest.
         reasons: why there was no pose, with their counts.
@@ -242,15 +242,15 @@ def compare_pieces(
     misplaced = free = not_free = points = 0
     for piece, line in zip(observation.pieces, lines, strict=True):
         length += piece.length
-        wrong += piece.length * float((tree.query(line)[0] > bound).mean())
-        off, nearest = tree.query(piece.points)
+        wrong += piece.length * float((_nearest(line, truth) > bound).mean())
+        off, nearest = (np.asarray(values) for values in tree.query(piece.points))
         normalised += float((np.square(off / piece.deviation))[off < bound].sum())
         points += int((off < bound).sum())
         misplaced += _is_misplaced(piece, at[nearest])
         for end, point in ((piece.first_end, piece.points[0]), (piece.last_end, piece.points[-1])):
             free += end is PieceEnd.FREE
             not_free += end is PieceEnd.FREE and float(np.hypot(*(point - truth[-1]))) > WRONG_END
-    end = float(np.hypot(*(observation.pieces[0].points[-1] - truth[-1])))
+    last = float(np.hypot(*(observation.pieces[0].points[-1] - truth[-1])))
     shown = float((_nearest(truth, lines[0]) < max(bound, WRONG_END)).mean())
     covered = visible * float((_nearest(seen, np.vstack(lines)) < bound).mean()) if len(seen) else 0.0
     return PieceErrors(
@@ -261,7 +261,7 @@ def compare_pieces(
         placed=sum(math.isfinite(piece.arc_length[0]) for piece in observation.pieces),
         misplaced=misplaced,
         complete=observation.complete,
-        incomplete=observation.complete and (end > WRONG_END or shown * total < total - WRONG_END),
+        incomplete=observation.complete and (last > WRONG_END or shown * total < total - WRONG_END),
         free=free,
         not_free=not_free,
         normalised=normalised,

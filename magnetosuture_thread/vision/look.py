@@ -59,7 +59,7 @@ class Track:
         centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
         view: where the dish is in the image; None when it is not found.
         warning: what makes the measurement worse than it could be; empty if nothing does.
-        observation: the pieces of the thread that are seen, in the dish frame; the centreline is the walk from the tail.
+        observation: the pieces of the thread that are seen, in the dish frame.
     """
 
     state: State

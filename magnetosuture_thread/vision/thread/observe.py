@@ -45,6 +45,7 @@ BARE_STEP = 0.03  # of the floor's brightness, that bare floor beyond an end may
 GOES_ON = 0.5  # of its strength, with which a thread would go on beyond an end
 SURE_STRENGTH = 2.0  # of the faintest that is seen, that a thread must have where it is seen to end
 SCALE_ERROR = 0.001  # see `look`
+MAX_UNKNOWN = 24  # pieces of unknown place that are published
 WIDE, UNSURE = 0.6, 0.3  # confidence of a piece whose order is open, and of one whose direction is, too
 
 
@@ -55,6 +56,10 @@ class _Strand:
     points: Points
     strength: NDArray[np.float64]
     seen: NDArray[np.bool_]
+
+    def turned(self) -> _Strand:
+        """Return it from its other end."""
+        return _Strand(self.points[::-1], self.strength[::-1], self.seen[::-1])
 
     def part(self, first: int, last: int) -> _Strand:
         """Return the vertices from one to before another."""
@@ -167,35 +172,33 @@ def _joined(
     length: float,
 ) -> ThreadObservation:
     """Order the pieces, and tell why each of them ends."""
-    ends = []
-    pieces = []
+    ends, pieces = [], []
     for number, strand in enumerate(strands):
-        turned = _Strand(strand.points[::-1], strand.strength[::-1], strand.seen[::-1])
-        both = [PieceEnd.TAIL if number == 0 else _end(picture, gray, thread, turned, needle, hiding)[0], None]
-        area = 0 if number == 0 else _end(picture, gray, thread, turned, needle, hiding)[1]
+        first, area = PieceEnd.TAIL, 0
+        if number:
+            first, area = _end(picture, gray, thread, strand.turned(), needle, hiding)
         last, last_area = _end(picture, gray, thread, strand, needle, hiding)
-        ends.append([both[0], last])
+        ends.append([first, last])
         pieces.append(Piece(strand.points, (area, last_area)))
     longest = length * (1.0 + LENGTH_TOLERANCE)
     order = find_order(pieces, hiding, (length * (1.0 - LENGTH_TOLERANCE), longest), in_dish.view.metres_per_pixel)
     _tell_free(ends, order, length)
-    result, told = [], set()
+    result = []
     for placed in (*order.placed, *order.wide):
         strand, (first, last) = strands[placed.index], ends[placed.index]
         if placed.turned:
-            strand, first, last = _Strand(strand.points[::-1], strand.strength[::-1], strand.seen[::-1]), last, first
+            strand, first, last = strand.turned(), last, first
         low, high = placed.arc_length
         if placed.index:
             low = max(0.0, low - LENGTH_ERROR * low - END_ERROR_PX)
             high = min(high + LENGTH_ERROR * high + END_ERROR_PX, max(low, longest - pieces[placed.index].length))
         confidence = 1.0 if not placed.index else order.share if placed in order.placed else WIDE
         result.append(in_dish.piece(strand, first, last, (low, high), confidence))
-        told.add(placed.index)
+    told = {placed.index for placed in (*order.placed, *order.wide)}
     nowhere = (math.nan, math.nan)
-    for number, strand in enumerate(strands):
-        if number not in told:
-            first, last = ends[number]
-            result.append(in_dish.piece(strand, first, last, nowhere, UNSURE, direction_known=False))
+    for number in sorted(set(range(len(strands))) - told)[:MAX_UNKNOWN]:
+        first, last = ends[number]
+        result.append(in_dish.piece(strands[number], first, last, nowhere, UNSURE, direction_known=False))
     alone = len(strands) == 1 and ends[0][1] is PieceEnd.FREE and _is_whole(strands[0], length)
     outlines = [in_dish.view.to_dish(outline) for outline in hiding.outlines()]
     return ThreadObservation(tuple(result), alone, tuple(outlines))

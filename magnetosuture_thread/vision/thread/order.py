@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -132,7 +133,9 @@ def find_order(pieces: list[Piece], hiding: Hiding, length: tuple[float, float],
         The pieces that every order that is nearly the best begins with, and what else all of these agree on.
     """
     gaps: dict[tuple[Step, Step], _Gap] = {}
-    oriented = {(k, turned): piece.turned() if turned else piece for k, piece in enumerate(pieces) for turned in (0, 1)}
+    oriented = {
+        (k, turned): piece.turned() if turned else piece for k, piece in enumerate(pieces) for turned in (False, True)
+    }
     count = min(len(pieces), MAX_ORDERED)
     for before in oriented:
         for after in oriented:
@@ -157,9 +160,12 @@ def find_order(pieces: list[Piece], hiding: Hiding, length: tuple[float, float],
     ways = [_placed(other, gaps, lengths, length[1]) for other in near]
     last = chain[-1] if all(other[-1] == chain[-1] for other in near) else None
     reached = [
-        (sum(lengths[k] for k, _ in other) + sum(gap.chord for gap in used), way[-1].arc_length[1] + lengths[other[-1][0]])
+        (
+            sum(lengths[k] for k, _ in other) + sum(gap.chord for gap in used),
+            way[-1].arc_length[1] + lengths[other[-1][0]],
+        )
         for other, way in zip(near, ways, strict=True)
-        for used in [[gaps[pair] for pair in zip(other, other[1:], strict=False)]]
+        for used in [[gaps[pair] for pair in pairwise(other)]]
     ]
     return Order(
         ways[0][:same],
@@ -201,7 +207,7 @@ def _price(
     oriented: dict[Step, Piece],
 ) -> float:
     """Return what an order costs; infinite if the thread is too short for it."""
-    used = [gaps[pair] for pair in zip(chain, chain[1:], strict=False)]
+    used = [gaps[pair] for pair in pairwise(chain)]
     seen = sum(lengths[index] for index, _ in chain)
     if seen + sum(gap.chord for gap in used) > length[1]:
         return math.inf
@@ -252,7 +258,7 @@ def _placed(
     chain: tuple[Step, ...], gaps: dict[tuple[Step, Step], _Gap], lengths: list[float], longest: float
 ) -> tuple[Placed, ...]:
     """Return where along the thread the pieces of an order begin."""
-    used = [gaps[pair] for pair in zip(chain, chain[1:], strict=False)]
+    used = [gaps[pair] for pair in pairwise(chain)]
     result = [Placed(chain[0][0], chain[0][1], (0.0, 0.0))]
     for position, (index, turned) in enumerate(chain[1:], start=1):
         low, high = result[-1].arc_length

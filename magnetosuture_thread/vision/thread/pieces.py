@@ -54,7 +54,12 @@ def two_sided_ridge(gray: NDArray[np.uint8], thread: Appearance, hiding: Hiding)
 
 
 def find_pieces(
-    picture: Picture, gray: NDArray[np.uint8], thread: Appearance, hiding: Hiding, known: list[Points], max_length: float
+    picture: Picture,
+    gray: NDArray[np.uint8],
+    thread: Appearance,
+    hiding: Hiding,
+    known: list[Points],
+    max_length: float,
 ) -> list[Points]:
     """Find all other pieces of a thread.
 
@@ -157,12 +162,8 @@ def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
     return [line[first:last] for first, last in runs(~twice) if last - first > 1]
 
 
-def _is_thread(
-    picture: Picture, gray: NDArray[np.uint8], thread: Appearance, hiding: Hiding, line: Points
-) -> bool:
+def _is_thread(picture: Picture, gray: NDArray[np.uint8], thread: Appearance, hiding: Hiding, line: Points) -> bool:
     """Say whether a line looks like the thread and lies on the floor."""
-
-
     reach = thread.beside_px
     ground = sampled(gray, across(line, np.array([-reach, reach]))).astype(float)
     floor = sampled(hiding.floor, line).astype(float)[:, None]
