@@ -128,39 +128,28 @@ class ThreadModelNode(PackageNode):
         self._report(outcome, time.perf_counter() - began)
 
     def on_measured_thread_message(self, data: bytes) -> None:
-        """Keep a centreline to start from, where no tracker tells whether it is all of the thread.
+        """Start from a centreline, where no tracker tells whether it is all of the thread, as in older bags.
 
         Most are not needed, and to read a path of a hundred poses takes as long as some predictions: so
         only the stamp is read of those.
         """
-        stamp = header_stamp(data) or 0
-        if not self._session.needs_measured_thread(stamp) or self._is_observed():
-            return
-        try:
-            centreline = reading.path_points(topics.MEASURED_THREAD.decode(data))
-        except InvalidInputError as error:
-            self.health.refuse(error)
-            return
-        self._start(self._session.on_measured_thread(stamp, centreline))
-
-    def _is_observed(self) -> bool:
-        """Return whether a tracker tells what part of the thread it sees; a bag may hold the centreline alone."""
         name = self.resolve_topic_name(topics.THREAD_OBSERVATION.name)
         self._observed = self._observed or self.count_publishers(name) > 0
-        return self._observed
+        if not self._observed:
+            self._take(data, topics.MEASURED_THREAD, reading.path_points, self._session.on_measured_thread)
 
     def on_observation_message(self, data: bytes) -> None:
-        """Take what the camera sees of the thread, to start from; as above, most are not read."""
+        """Start from what the camera sees of the thread; as above, most are not read."""
         self._observed = True
+        self._take(data, topics.THREAD_OBSERVATION, reading.thread_observation, self._session.on_observation)
+
+    def _take(self, data: bytes, topic: topics.Topic, read: Callable[[Any], Any], start: Callable[..., Any]) -> None:
         stamp = header_stamp(data) or 0
-        if not self._session.needs_measured_thread(stamp):
-            return
-        try:
-            observation = reading.thread_observation(topics.THREAD_OBSERVATION.decode(data))
-        except InvalidInputError as error:
-            self.health.refuse(error)
-            return
-        self._start(self._session.on_observation(stamp, observation))
+        if self._session.needs_measured_thread(stamp):
+            try:
+                self._start(start(stamp, read(topic.decode(data))))
+            except InvalidInputError as error:
+                self.health.refuse(error)
 
     def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
         """Handle an observation of the thread handed over by a tracker in the same process."""

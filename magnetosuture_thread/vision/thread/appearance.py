@@ -1,4 +1,4 @@
-"""What a thread looks like across: its width and darkness, where it is seen, and how well its middle is known."""
+"""What a thread looks like across: its width and darkness, where it is visible, and how well its middle is known."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from magnetosuture_thread.vision.sampling import middle
 REACH_PX, STEP_PX = 16.0, 0.5  # of profiles: to both sides, and between samples
 BESIDE_PX = 2.5  # from a thread's edge to the floor beside it
 BLUR_PX = 0.7  # of the picture, before it is sampled
-SEEN_SHARE = 0.3  # of the usual darkness: below, the thread isn't seen
+MIN_SHARE = 0.3  # of the usual darkness: below, the thread isn't visible
 FAINTEST = 3.0  # grey levels; less is noise
 SMOOTHED_PX = 9.0  # along the thread, over which its darkness is averaged
 LOCAL_PX = 4.0  # along the thread, over which its middle is averaged
 MIN_DEVIATION_PX = 0.12  # of a middle: by pixels, compression, and the evening out of bends
-BEND = 0.004  # 1 / px; standard deviation of the curvature of a thread that isn't seen
+BEND = 0.004  # 1 / px; standard deviation of the curvature of a thread that isn't visible
 
 Values = NDArray[np.float64]
 
@@ -84,18 +84,18 @@ def across(points: Points, aside: Values) -> Points:
     return np.asarray(points[:, None] + aside[None, :, None] * normals[:, None])
 
 
-def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, seen: NDArray[np.bool_]) -> Appearance:
+def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, visible: NDArray[np.bool_]) -> Appearance:
     """Measure how a thread looks.
 
     Args:
         picture: the frame or a part of it.
         gray: its darkest colour without the needle, smoothed.
         points: along the thread, shape (m, 2) [px].
-        seen: where it is seen for sure, shape (m,), or nowhere for all of it.
+        visible: where it is visible for sure, shape (m,), or nowhere for all of it.
     """
-    chosen = points[seen] if seen.sum() >= MIN_POINTS else points
+    chosen = points[visible] if visible.sum() >= MIN_POINTS else points
     aside = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-    at = across(chosen, aside) if seen.sum() < MIN_POINTS else across(points, aside)[seen]
+    at = across(chosen, aside) if visible.sum() < MIN_POINTS else across(points, aside)[visible]
     profiles = sampled(gray, at)
     beside = np.abs(aside) > 0.5 * REACH_PX
     usual = np.median(profiles - np.median(profiles[:, beside], axis=1, keepdims=True), axis=0)
@@ -164,15 +164,15 @@ def smoothed(values: Values, spacing: float) -> Values:
     return np.asarray(np.convolve(values, np.ones(width), "same") / count)
 
 
-def deviations(thread: Appearance, strength: Values, seen: NDArray[np.bool_], points: Points) -> Values:
+def deviations(thread: Appearance, strength: Values, visible: NDArray[np.bool_], points: Points) -> Values:
     """Return the standard deviation across at each vertex [px].
 
-    Where a thread isn't seen over a gap of length g, its middle at a distance t from the gap's beginning is off by
+    Where a thread isn't visible over a gap of length g, its middle at a distance t from the gap's beginning is off by
     1/2 kappa t (g - t) for a curvature that differs by kappa from that of the curve through it; see `BEND`.
     """
     at = arc_lengths(points)
-    result = thread.deviation(smoothed(np.where(seen, strength, 0.0), at[-1] / max(1, len(at) - 1)))
-    for first, last in runs(~seen):
+    result = thread.deviation(smoothed(np.where(visible, strength, 0.0), at[-1] / max(1, len(at) - 1)))
+    for first, last in runs(~visible):
         begin = at[max(0, first - 1)]
         end = at[min(len(at) - 1, last)]
         off = 0.5 * BEND * (at[first:last] - begin) * (end - at[first:last])
@@ -186,7 +186,7 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
-def resampled(points: Points, spacing: float) -> Points:
+def respaced(points: Points, spacing: float) -> Points:
     """Return a polyline with vertices of about equal distance."""
     length = float(arc_lengths(points)[-1])
     return points_at(points, np.linspace(0.0, length, max(2, round(length / spacing) + 1)))

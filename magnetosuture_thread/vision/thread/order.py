@@ -106,7 +106,7 @@ class _Gap:
 Step = tuple[int, bool]  # index of a piece, and whether it is turned
 
 
-def outward(points: Points) -> Points:
+def end_direction(points: Points) -> Points:
     """Return the unit direction in which a polyline leaves at its last point, shape (2,)."""
     at = arc_lengths(points)
     first = int(np.searchsorted(at, at[-1] - DIRECTION_PX))
@@ -224,7 +224,7 @@ def _gap(before: Piece, after: Piece, hiding: Hiding, turning: float) -> _Gap | 
     if not before.areas[1] or before.areas[1] != after.areas[0]:
         return None
     start, end = before.points[-1], after.points[0]
-    leaving, arriving = outward(before.points), -outward(after.points[::-1])
+    leaving, arriving = end_direction(before.points), -end_direction(after.points[::-1])
     chord = float(np.hypot(*(end - start)))
     along = (end - start) / max(chord, 1e-9)
     angles = np.array([_angle(along, leaving), _angle(along, arriving)])

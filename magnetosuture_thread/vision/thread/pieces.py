@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.sampling import middle
-from magnetosuture_thread.vision.thread.appearance import Appearance, across, looks_alike, resampled, runs, sampled
+from magnetosuture_thread.vision.thread.appearance import Appearance, across, looks_alike, respaced, runs, sampled
 from magnetosuture_thread.vision.thread.hiding import WALL_PX, Hiding
 from magnetosuture_thread.vision.thread.walk import walk_on
 
@@ -149,12 +149,12 @@ def _clear(fresh: NDArray[np.uint8], line: Points, reach: float) -> None:
 
 def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
     """Return the parts of a line that run along no known one, nor along itself; they may cross them."""
-    line = resampled(line, 1.0)
+    line = respaced(line, 1.0)
     apart = ((line[:, None] - line[None]) ** 2).sum(axis=2)
     index = np.arange(len(line))
     twice = ((apart < TWICE_PX**2) & (index[None] < index[:, None] - MAX_TWICE_PX)).any(axis=1)
     if known:
-        others = np.vstack([resampled(other, 1.0) for other in known])
+        others = np.vstack([respaced(other, 1.0) for other in known])
         twice |= ((line[:, None] - others[None]) ** 2).sum(axis=2).min(axis=1) < TWICE_PX**2
     for first, last in runs(twice):
         if last - first < MAX_TWICE_PX and first > 0 and last < len(twice):
