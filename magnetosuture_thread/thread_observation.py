@@ -29,8 +29,8 @@ class ThreadPiece:
         deviation: standard deviation of each point across the piece, shape (m,) [m].
         first_end: why it begins at `points[0]`.
         last_end: why it ends at `points[-1]`.
-        arc_length: least and greatest arc length of `points[0]` from the needle's tail [m]; that of `points[k]` is larger
-            by the piece's length up to it. NaN where nothing tells.
+        arc_length: least and greatest arc length of `points[0]` from the needle's tail [m]; that of `points[k]` is
+            larger by the piece's length up to it. NaN where nothing tells.
         direction_known: whether arc length surely grows along `points`. Where it is not, `arc_length` is of either end.
         confidence: that the piece is of this thread, and in this place along it, 0 to 1.
     """
@@ -54,8 +54,8 @@ class ThreadObservation:
     """What one frame shows of the thread.
 
     Attributes:
-        pieces: the one that leaves the needle first, if it is seen; then the others in the order of their arc length, last
-            those of which it is unknown.
+        pieces: the one that leaves the needle first, if it is seen; then the others in the order of their arc length,
+            last those of which it is unknown.
         complete: whether one piece shows all of the thread, from the tail to the free end.
         hidden: outlines of what the thread may lie below, in the dish frame, each of shape (m, 2), closed [m].
     """
@@ -63,3 +63,10 @@ class ThreadObservation:
     pieces: tuple[ThreadPiece, ...] = ()
     complete: bool = False
     hidden: tuple[Points, ...] = field(default=())
+
+    @property
+    def from_tail(self) -> Points | None:
+        """Points of the piece that leaves the needle, shape (m, 2) [m]; None where it isn't seen."""
+        if self.pieces and self.pieces[0].first_end is PieceEnd.TAIL:
+            return self.pieces[0].points
+        return None

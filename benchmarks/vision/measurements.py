@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from benchmarks.vision.cases import CLASSES
+from benchmarks.vision.covers import CLASSES
 from benchmarks.vision.frames import DISH_RADIUS, Case, Image, dense, render
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.look import Track
 from magnetosuture_thread.vision.session import published_centreline
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -29,6 +30,40 @@ REVERSED = 0.5 * math.pi
 UNKNOWN_ANGLE = 1.0  # rad; a standard deviation beyond which the heading is called unknown
 HONEST = 14.16  # squared Mahalanobis distance of three numbers that 0.27 % of honest poses exceed
 WRONG_LINE_PX = 1.5  # beyond, or beyond half of the thread's width, a point of a centreline is wrong
+WRONG_END = 0.6e-3  # m; from the thread's end, beyond which an end claimed free is wrong
+
+
+@dataclass(frozen=True)
+class PieceErrors:
+    """How far the pieces of the thread in one frame are from the ground truth.
+
+    Attributes:
+        covered: length of the visible thread that lies on a piece [m].
+        length: of all pieces [m].
+        wrong: of it, where no thread is [m].
+        pieces: number of them.
+        placed: of these, with a known place along the thread.
+        misplaced: of these, whose interval or direction is wrong.
+        complete: whether all of the thread is claimed to be seen.
+        incomplete: whether it is not, though claimed.
+        free: number of ends that are claimed to be the thread's.
+        not_free: of these, beyond `WRONG_END` from it.
+        normalised: sum of the squares of points' distances from the thread over their standard deviation.
+        points: number of these points, which lie on the thread.
+    """
+
+    covered: float = 0.0
+    length: float = 0.0
+    wrong: float = 0.0
+    pieces: int = 0
+    placed: int = 0
+    misplaced: int = 0
+    complete: bool = False
+    incomplete: bool = False
+    free: int = 0
+    not_free: int = 0
+    normalised: float = 0.0
+    points: int = 0
 
 
 @dataclass(frozen=True)
@@ -45,6 +80,7 @@ class Result:
         covered: of it, followed [m].
         line: length of the published centreline [m].
         wrong: of it, where no thread is [m].
+        pieces: what is said of the pieces of the thread; see `PieceErrors`.
         seconds: of CPU.
         reason: why there is no pose.
     """
@@ -58,6 +94,7 @@ class Result:
     covered: float
     line: float
     wrong: float
+    pieces: PieceErrors
     seconds: float
     reason: str
 
@@ -89,6 +126,15 @@ class Row:
         covered: share of the visible thread that was followed, over all frames.
         covered_90: share of the frames with 90 % of it followed.
         wrong_line: share of the published centreline where no thread is; None if none was published.
+        pieces: share of the visible thread that lies on pieces, over all frames.
+        wrong_pieces: share of the pieces' length where no thread is; None without pieces.
+        unplaced: number of pieces whose place along the thread isn't known.
+        misplaced: number of those whose place is said to be known and is wrong.
+        complete: frames of which is said that they show all of the thread.
+        incomplete: of these, that don't.
+        free: ends of which is said that they are the thread's.
+        not_free: of these, that are not.
+        normalised: root mean square of points' distances from the thread over their standard deviation; 1 is honest.
         median_ms: CPU time of a frame.
         max_ms: the longest.
         reasons: why there was no pose, with their counts.
@@ -106,6 +152,15 @@ class Row:
     covered: float
     covered_90: float
     wrong_line: float | None
+    pieces: float
+    wrong_pieces: float | None
+    unplaced: int
+    misplaced: int
+    complete: int
+    incomplete: int
+    free: int
+    not_free: int
+    normalised: float | None
     median_ms: float
     max_ms: float
     reasons: dict[str, int]
@@ -135,7 +190,7 @@ def compare(case: Case, track: Track, seconds: float) -> Result:
     seen = case.visible_thread()
     visible = _step(seen, case) * len(seen)
     if not len(track.tail):
-        return Result(False, False, 0.0, 0.0, True, visible, 0.0, 0.0, 0.0, seconds, track.reason)
+        return Result(False, False, 0.0, 0.0, True, visible, 0.0, 0.0, 0.0, PieceErrors(), seconds, track.reason)
     off = np.append(track.tail - case.needle.tail, 0.0)
     turned = math.atan2(track.heading[1], track.heading[0]) - case.needle.heading
     off[2] = (turned + math.pi) % (2.0 * math.pi) - math.pi
@@ -159,9 +214,74 @@ def compare(case: Case, track: Track, seconds: float) -> Result:
         covered=covered,
         line=length,
         wrong=wrong,
+        pieces=compare_pieces(case, track.observation, bound, seen, visible),
         seconds=seconds,
         reason="",
     )
+
+
+def compare_pieces(
+    case: Case, observation: ThreadObservation, bound: float, seen: Points, visible: float
+) -> PieceErrors:
+    """Compare pieces of the thread with the ground truth.
+
+    Args:
+        case: what the frame shows.
+        observation: what is said of it.
+        bound: beyond which a point is wrong [m].
+        seen: points along the visible thread, shape (m, 2) [m].
+        visible: its length [m].
+    """
+    if not observation.pieces:
+        return PieceErrors()
+    truth = dense(case.thread)
+    at, total = arc_lengths(truth), float(arc_lengths(case.thread)[-1])
+    tree = KDTree(truth)
+    lines = [dense(piece.points) for piece in observation.pieces]
+    length = wrong = normalised = 0.0
+    misplaced = free = not_free = points = 0
+    for piece, line in zip(observation.pieces, lines, strict=True):
+        length += piece.length
+        wrong += piece.length * float((_nearest(line, truth) > bound).mean())
+        off, nearest = (np.asarray(values) for values in tree.query(piece.points))
+        normalised += float((np.square(off / piece.deviation))[off < bound].sum())
+        points += int((off < bound).sum())
+        misplaced += _is_misplaced(piece, at[nearest])
+        for end, point in ((piece.first_end, piece.points[0]), (piece.last_end, piece.points[-1])):
+            free += end is PieceEnd.FREE
+            not_free += end is PieceEnd.FREE and float(np.hypot(*(point - truth[-1]))) > WRONG_END
+    last = float(np.hypot(*(observation.pieces[0].points[-1] - truth[-1])))
+    shown = float((_nearest(truth, lines[0]) < max(bound, WRONG_END)).mean())
+    covered = visible * float((_nearest(seen, np.vstack(lines)) < bound).mean()) if len(seen) else 0.0
+    return PieceErrors(
+        covered=covered,
+        length=length,
+        wrong=wrong,
+        pieces=len(lines),
+        placed=sum(math.isfinite(piece.arc_length[0]) for piece in observation.pieces),
+        misplaced=misplaced,
+        complete=observation.complete,
+        incomplete=observation.complete and (last > WRONG_END or shown * total < total - WRONG_END),
+        free=free,
+        not_free=not_free,
+        normalised=normalised,
+        points=points,
+    )
+
+
+def _is_misplaced(piece: ThreadPiece, truth: np.ndarray) -> bool:
+    """Say whether a piece lies elsewhere along the thread than is said; `truth` is the arc length at its points [m]."""
+    along = arc_lengths(piece.points)
+    # Medians: where the thread crosses itself, the nearest point of it may be of the other strand.
+    grows = float(np.median(np.diff(truth))) > 0.0
+    first = float(np.median(truth - along)) if grows else float(np.median(truth + along))
+    if piece.direction_known and not grows and math.isfinite(piece.arc_length[0]):
+        return True
+    if not math.isfinite(piece.arc_length[0]):
+        return False
+    if not piece.direction_known and not grows:
+        first = float(np.median(truth + along)) - float(along[-1])
+    return not piece.arc_length[0] - WRONG_END <= first <= piece.arc_length[1] + WRONG_END
 
 
 def _step(seen: Points, case: Case) -> float:
@@ -180,6 +300,8 @@ def row_of(name: str, results: Iterable[Result]) -> Row:
     found = [each for each in every if each.found]
     right = [each for each in found if not each.is_wrong and not each.unknown]
     visible, line = sum(each.visible for each in every), sum(each.line for each in every)
+    pieces = [each.pieces for each in every]
+    length, points = sum(each.length for each in pieces), sum(each.points for each in pieces)
     times = [1e3 * each.seconds for each in every]
     return Row(
         name=name,
@@ -194,6 +316,15 @@ def row_of(name: str, results: Iterable[Result]) -> Row:
         covered=sum(each.covered for each in every) / visible if visible else 0.0,
         covered_90=float(np.mean([each.covered >= 0.9 * each.visible for each in every])),
         wrong_line=sum(each.wrong for each in every) / line if line else None,
+        pieces=sum(each.covered for each in pieces) / visible if visible else 0.0,
+        wrong_pieces=sum(each.wrong for each in pieces) / length if length else None,
+        unplaced=sum(each.pieces - each.placed for each in pieces),
+        misplaced=sum(each.misplaced for each in pieces),
+        complete=sum(each.complete for each in pieces),
+        incomplete=sum(each.incomplete for each in pieces),
+        free=sum(each.free for each in pieces),
+        not_free=sum(each.not_free for each in pieces),
+        normalised=math.sqrt(sum(each.normalised for each in pieces) / points) if points else None,
         median_ms=float(np.median(times)),
         max_ms=max(times),
         reasons=dict(Counter(_short(each.reason) for each in every if not each.found).most_common()),

@@ -15,6 +15,7 @@ from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.margins import Margins, node_clearance
 from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.thread_observation import ThreadObservation
 
 Array = NDArray[np.float64]
 
@@ -42,6 +43,7 @@ class Observation:
         ground_truth: of the thread, if the bag holds it, shape (m, 2) [m].
         reason: why the needle was not found.
         processing: time that the tracker took for the frame [s]; nan where the poses were recorded.
+        observation: what is seen of the thread; None where a bag holds the centreline alone.
     """
 
     stamp: int
@@ -51,6 +53,7 @@ class Observation:
     ground_truth: Points = field(default_factory=_no_points)
     reason: str = ""
     processing: float = math.nan
+    observation: ThreadObservation | None = None
 
     @property
     def found(self) -> bool:

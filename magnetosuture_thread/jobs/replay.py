@@ -27,6 +27,7 @@ from magnetosuture_thread.interface import (
     PAUSE_REPLAY,
     PROCESSES,
     SCENE,
+    THREAD_OBSERVATION,
     Channel,
 )
 from magnetosuture_thread.jobs.output import whole_folder
@@ -70,7 +71,9 @@ class GraphInput:
     def channels(self) -> list[Channel]:
         """Channels that are played."""
         recording = self.given.recording
-        source = (recording.camera, CAMERA_INFO) if self.transport else (NEEDLE_POSE, MEASURED_THREAD)
+        source = (
+            (recording.camera, CAMERA_INFO) if self.transport else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
+        )
         changing = (channel for channel in CHANGING if channel != SCENE)
         possible = (*source, NEEDLE_COMMAND, *changing)
         return [SCENE, *(channel for channel in possible if channel and recording.counts.get(channel.recorded))]

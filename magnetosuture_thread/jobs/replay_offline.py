@@ -15,7 +15,15 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
-from magnetosuture_thread.interface import MARGINS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, SCENE, TRACKER_STATE
+from magnetosuture_thread.interface import (
+    MARGINS,
+    MEASURED_THREAD,
+    NEEDLE_POSE,
+    PREDICTED_THREAD,
+    SCENE,
+    THREAD_OBSERVATION,
+    TRACKER_STATE,
+)
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import (
     BagInput,
@@ -27,7 +35,13 @@ from magnetosuture_thread.jobs.replay_inputs import (
     write_results,
 )
 from magnetosuture_thread.messages.cdr import time_of
-from magnetosuture_thread.messages.packing import packed_margins, packed_path, packed_pose, packed_prediction
+from magnetosuture_thread.messages.packing import (
+    packed_margins,
+    packed_observation,
+    packed_path,
+    packed_pose,
+    packed_prediction,
+)
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationReader
 from magnetosuture_thread.offline.predictions import Step, predictions, read_observations
@@ -47,9 +61,9 @@ def replay_offline(
 ) -> ReplaySummary:
     """Put a bag through tracker and model without a graph, and evaluate the predictions.
 
-    `output` is made at the end, whole or not at all: `bag/`, `summary.json` and `summary.png`. The bag holds pose
-    and measured thread, prediction and margins, each logged at its own stamp, with the numbers that the live graph
-    gives. Two runs write it alike to the last bit: times that steps took are in the summary alone. The coil bridge
+    `output` is made at the end, whole or not at all: `bag/`, `summary.json` and `summary.png`. The bag holds pose,
+    what is seen of the thread, prediction and margins, each logged at its own stamp, with the numbers of the live
+    graph. Two runs write it alike to the last bit: times that steps took are in the summary alone. The coil bridge
     has no part in it: what it does depends on real time.
 
     Args:
@@ -145,8 +159,10 @@ class _Output:
         self._bag = bag
         bag.add_topic(SCENE.recorded, SCENE.type_name)
         bag.write_message(SCENE.recorded, given.begin, MESSAGES.scene_message(given.begin, given.setup.scene))
-        states = [TRACKER_STATE] if seen.source == "camera" else []
-        for channel in (NEEDLE_POSE, *states, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
+        by_tracker = [TRACKER_STATE, THREAD_OBSERVATION] if seen.source == "camera" else []
+        if seen.source == "poses" and given.recording.counts.get(THREAD_OBSERVATION.recorded):
+            by_tracker = [THREAD_OBSERVATION]
+        for channel in (NEEDLE_POSE, *by_tracker, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
             bag.add_topic(channel.recorded, channel.type_name)
         self._version = given.setup.scene.version
         seen.on_frame, seen.on_record = self._frame, self._record
@@ -168,6 +184,8 @@ class _Output:
         if seen.tracked:
             pose = packed_pose(time_of(stamp), track.tail, track.heading, track.covariance)
             self._bag.write(NEEDLE_POSE.recorded, max(stamp, 0), pose)
+            observed = packed_observation(time_of(stamp), track.observation)
+            self._bag.write(THREAD_OBSERVATION.recorded, max(stamp, 0), observed)
             if len(seen.centreline):
                 self._bag.write(MEASURED_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
         self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), MESSAGES.tracker_state(stamp, track))

@@ -23,6 +23,7 @@ from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.interface import CAMERA, STORAGE_SUFFIXES
+from magnetosuture_thread.thread_observation import ThreadPiece
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.image_header import image_header
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -253,11 +254,26 @@ class TrackedFrame:
             "curvature_per_m": _number(track.curvature) if seen else None,
             "thread_m": None if thread is None or None in thread else thread,
             "needle_length_m": None if track.needle_length is None else _number(track.needle_length),
+            "pieces": [_piece(piece) for piece in track.observation.pieces] if seen else None,
+            "complete": track.observation.complete,
             "confidence": _number(track.confidence),
             "time_s": self.duration,
             "stamp_s": self.stamp,
             **({"unverified": self.unverified} if self.unverified else {}),
         }
+
+
+def _piece(piece: ThreadPiece) -> dict[str, Any]:
+    """Return what is written of a piece of the thread, in SI units; null where nothing tells."""
+    return {
+        "points_m": piece.points.tolist(),
+        "deviation_m": piece.deviation.tolist(),
+        "first_end": piece.first_end.name.lower(),
+        "last_end": piece.last_end.name.lower(),
+        "arc_length_m": [_number(value) for value in piece.arc_length],
+        "direction_known": piece.direction_known,
+        "confidence": piece.confidence,
+    }
 
 
 def settings_with(

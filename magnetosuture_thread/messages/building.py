@@ -28,11 +28,13 @@ from magnetosuture_thread.interface import (
     NEEDLE_POSE,
     SCENE,
     SCENE_MARKERS,
+    THREAD_OBSERVATION,
     TIP_SETPOINT,
     TRACKER_STATE,
 )
 from magnetosuture_thread.messages.scene import scene_fields
 from magnetosuture_thread.scene import Scene, SceneShape
+from magnetosuture_thread.thread_observation import ThreadObservation
 
 if TYPE_CHECKING:
     from magnetosuture_thread.coils.bridge import BridgeOutput
@@ -146,6 +148,33 @@ class MessageBuilder:
     def path_message(self, stamp: Any, points: Points) -> Any:
         """Return a polyline of shape (m, 2) [m] as a Path."""
         return self.path(self.header(stamp), [self.flat_pose(point, 0.0) for point in points])
+
+    def observation_message(self, stamp: Any, observation: ThreadObservation) -> Any:
+        """Return what a frame shows of the thread as a ThreadObservation."""
+        pieces = [
+            self.make(
+                "magnetosuture_msgs/msg/ThreadPiece",
+                points=self.points(piece.points),
+                deviation=self.numbers("d", piece.deviation),
+                first_end=int(piece.first_end),
+                last_end=int(piece.last_end),
+                arc_length_min=float(piece.arc_length[0]),
+                arc_length_max=float(piece.arc_length[1]),
+                direction_known=bool(piece.direction_known),
+                confidence=float(piece.confidence),
+            )
+            for piece in observation.pieces
+        ]
+        hidden = [
+            self.make("magnetosuture_msgs/msg/Outline", corners=self.points(outline)) for outline in observation.hidden
+        ]
+        return self.make(
+            THREAD_OBSERVATION.type_name,
+            header=self.header(stamp),
+            pieces=pieces,
+            complete=observation.complete,
+            hidden=hidden,
+        )
 
     def twist(self, linear: Any, angular: Any) -> Any:
         """Return a Twist of two vectors."""

@@ -31,6 +31,7 @@ from magnetosuture_thread.messages.cdr import (
 )
 from magnetosuture_thread.model.margins import UNKNOWN, FrictionState, Margins, friction_colour
 from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.thread_observation import ThreadObservation
 
 _UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
 _BARRIER, _NODE, _OBSTACLE = (np.dtype(code) for code in ("u1", "<u4", "<i4"))
@@ -86,6 +87,28 @@ def packed_path(time: Time, points: Points) -> bytes:
     poses["length"], poses["frame"] = DISH
     poses["x"], poses["y"], poses["w"] = points[:, 0], points[:, 1], 1.0
     return BEGIN + _PATH.pack(*time, *DISH, len(points)) + poses.tobytes()
+
+
+def packed_observation(time: Time, observation: ThreadObservation) -> bytes:
+    """Return what a frame shows of the thread as a ThreadObservation.
+
+    Args:
+        time: of the frame, seconds and nanoseconds.
+        observation: of the thread.
+    """
+    codes, values = [*HEADER, "I"], [*time, *DISH, len(observation.pieces)]
+    for piece in observation.pieces:
+        count = len(piece.points)
+        codes += [*array_codes(count, "d", 3), *array_codes(count, "d"), "B", "B", "d", "d", "?", "d"]
+        values += [count, points_of(piece.points), count, numbers(piece.deviation, REAL)]
+        values += [int(piece.first_end), int(piece.last_end), *map(float, piece.arc_length)]
+        values += [bool(piece.direction_known), float(piece.confidence)]
+    codes += ["?", "I"]
+    values += [bool(observation.complete), len(observation.hidden)]
+    for outline in observation.hidden:
+        codes += array_codes(len(outline), "d", 3)
+        values += [len(outline), points_of(outline)]
+    return BEGIN + form(*codes).pack(*values)
 
 
 def packed_prediction(time: Time, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import CLOCK, DISH_FRAME, MARGINS, MEASURED_THREAD, NEEDLE_POSE
+from magnetosuture_thread.interface import CLOCK, DISH_FRAME, MARGINS, MEASURED_THREAD, NEEDLE_POSE, THREAD_OBSERVATION
 from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
 from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 _POSE = struct.Struct("<7d")  # position and quaternion
 _COUNT = struct.Struct("<I")
@@ -27,6 +28,7 @@ _MAX_NAME = 256  # bytes of the names of frames that are passed over in a path
 _POSE_AT, _COUNT_AT = aligned(DISH_END, 8), aligned(DISH_END, 4)
 _PATH_AT = _COUNT_AT + _COUNT.size
 _NAME_AT = _PATH_AT + 8  # the length of the frame's name in a path's first pose
+MAX_PIECES, MAX_PIECE_POINTS, MAX_OUTLINES = 64, 4096, 256  # of an observation of the thread
 MAX_HEADING_DEVIATION = 1.0  # rad; beyond, it is unknown which end of the needle is the tail
 _STAMP = f"{NEEDLE_POSE.name}.header.stamp"
 _ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
@@ -150,6 +152,61 @@ def path_points(message: Any, field: str = MEASURED_THREAD.name) -> Points:
     return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
 
 
+def thread_observation(message: Any, field: str = THREAD_OBSERVATION.name) -> ThreadObservation:
+    """Return a ThreadObservation that is valid.
+
+    Raises:
+        InvalidInputError: wrong frame; too many pieces, points or outlines; a piece of fewer than 2 points, of another
+            number of deviations, with numbers that are not finite, an end that is none, or an interval that is none.
+    """
+    require_dish_frame(message.header.frame_id, field)
+    if len(message.pieces) > MAX_PIECES:
+        raise InvalidInputError(f"{field}.pieces", len(message.pieces), f"at most {MAX_PIECES}")
+    if len(message.hidden) > MAX_OUTLINES:
+        raise InvalidInputError(f"{field}.hidden", len(message.hidden), f"at most {MAX_OUTLINES}")
+    pieces = tuple(_piece(piece, f"{field}.pieces[{number}]") for number, piece in enumerate(message.pieces))
+    outlines = tuple(
+        _finite_points(outline.corners, f"{field}.hidden[{number}].corners", 3)
+        for number, outline in enumerate(message.hidden)
+    )
+    if message.complete and not (len(pieces) == 1 and pieces[0].last_end is PieceEnd.FREE):
+        raise InvalidInputError(f"{field}.complete", True, "False unless one piece ends freely")
+    return ThreadObservation(pieces, bool(message.complete), outlines)
+
+
+def _piece(message: Any, field: str) -> ThreadPiece:
+    """Return a ThreadPiece; see `thread_observation`."""
+    points = _finite_points(message.points, f"{field}.points", 2)
+    deviation = np.asarray(message.deviation, np.float64)
+    if len(deviation) != len(points) or not np.isfinite(deviation).all() or (deviation < 0.0).any():
+        raise InvalidInputError(f"{field}.deviation", f"{len(deviation)} values", f"{len(points)}, finite, at least 0")
+    ends = []
+    for name, value in (("first_end", message.first_end), ("last_end", message.last_end)):
+        if value not in set(PieceEnd):
+            raise InvalidInputError(f"{field}.{name}", value, "an end of ThreadPiece")
+        ends.append(PieceEnd(value))
+    low, high = message.arc_length_min, message.arc_length_max
+    unknown = math.isnan(low) and math.isnan(high)
+    if not unknown and not 0.0 <= low <= high < math.inf:
+        raise InvalidInputError(
+            f"{field}.arc_length_min", f"{low:g} to {high:g}", "an interval from 0 on, or twice NaN"
+        )
+    if not 0.0 <= message.confidence <= 1.0:
+        raise InvalidInputError(f"{field}.confidence", message.confidence, "0 to 1")
+    known, sure = bool(message.direction_known), float(message.confidence)
+    return ThreadPiece(points, deviation, ends[0], ends[1], (float(low), float(high)), known, sure)
+
+
+def _finite_points(corners: Any, field: str, minimum: int) -> Points:
+    """Return points in the plane, shape (m, 2) [m]."""
+    if not minimum <= len(corners) <= MAX_PIECE_POINTS:
+        raise InvalidInputError(field, f"{len(corners)} points", f"{minimum} to {MAX_PIECE_POINTS}")
+    points = np.array([[point.x, point.y] for point in corners])
+    if not np.isfinite(points).all():
+        raise InvalidInputError(field, "a number that is not finite", "finite numbers")
+    return points
+
+
 def plane_velocity(message: Any, field: str) -> NDArray[np.float64]:
     """Return the velocity of a TwistStamped in the dish plane, shape (2,) [m/s].
 
@@ -220,6 +277,16 @@ def read_path(record: SerializedMessage) -> Points:
     """
     found = _plain_path(record.data)
     return path_points(record.decode(), record.topic) if found is None else found
+
+
+def read_observation(record: SerializedMessage) -> ThreadObservation:
+    """Return a recorded observation of the thread.
+
+    Raises:
+        BagError: it cannot be decoded.
+        InvalidInputError: it is not valid; see `thread_observation`.
+    """
+    return thread_observation(record.decode(), record.topic)
 
 
 def _plain_path(data: bytes) -> Points | None:

@@ -19,9 +19,11 @@ from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Pre
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread_observation import ThreadObservation
 
 MAX_WAITING_POSES = 30  # poses that may wait for the centreline of their frame
 MAX_LATENESS = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
+PARTIAL_WAIT = 1_000_000_000  # ns; for all of the thread to be seen, before the rest of a part is extrapolated
 WAITING = "waiting for the thread to be seen"
 _OBSTACLES = (Disc((0.0, 0.0), 1e-3), Polygon(((0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3))))  # one of each kind
 
@@ -86,6 +88,7 @@ class ThreadSession:
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
+        self._partial: int | None = None  # stamp of the first part that was seen
         self._motion = settings.node_motion()
 
     @property
@@ -150,6 +153,31 @@ class ThreadSession:
         self._early.clear()
         return (self.on_pose(at, pose) for at, pose in early)
 
+    def on_observation(self, stamp: int, observation: ThreadObservation) -> Iterator[PredictionResult]:
+        """Start from what the camera sees of the thread: from all of it, or after a while from a part.
+
+        Half of a thread looks like a shorter one. So the thread starts from the first observation that is complete. If
+        there was none for `PARTIAL_WAIT` of the frames' time since a part was first seen, it starts from the piece that
+        leaves the needle, and what is missing goes on straight; see `ThreadPredictor.start`.
+
+        Args:
+            stamp: of the frame [ns].
+            observation: of the thread.
+
+        Returns:
+            See `on_measured_thread`.
+        """
+        points = observation.from_tail
+        if points is None or not self.needs_measured_thread(stamp):
+            return iter(())
+        if not observation.complete:
+            if self._partial is None or stamp < self._partial:
+                self._partial = stamp
+            if stamp - self._partial < PARTIAL_WAIT:
+                return iter(())
+        self._partial = None
+        return self.on_measured_thread(stamp, points)
+
     def on_pose(self, stamp: int, pose: NeedlePose) -> PredictionResult:
         """Follow the needle to a pose.
 
@@ -159,7 +187,7 @@ class ThreadSession:
         """
         if self._last is not None and stamp < self._last - MAX_LATENESS:
             self._predictor.reset()
-            self._last = None
+            self._last = self._partial = None
             self._early.clear()
             if self._seen is not None and self._seen[0] > stamp:
                 self._seen = None  # of the time before it was set back

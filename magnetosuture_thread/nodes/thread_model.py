@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.thread_observation import ThreadObservation
 
 
 class ThreadSettings:
@@ -70,7 +71,8 @@ class ThreadModelNode(PackageNode):
     """Predicts the thread at every needle pose.
 
     Args:
-        listens: whether poses and seen threads come by topics; else a tracker in the same process hands them over.
+        listens: whether poses and observations of the thread come by topics; else a tracker in the same process
+            hands them over.
         options: for rclpy's node.
     """
 
@@ -85,6 +87,7 @@ class ThreadModelNode(PackageNode):
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
+        self._observed = False
         if listens:
             self.listen()
         self.health.warn("no needle pose yet")
@@ -95,7 +98,8 @@ class ThreadModelNode(PackageNode):
         )
 
     def listen(self) -> None:
-        """Subscribe to needle poses and measured threads."""
+        """Subscribe to needle poses and to what is seen of the thread."""
+        topics.THREAD_OBSERVATION.subscribe(self, self.on_observation_message, raw=True)
         topics.MEASURED_THREAD.subscribe(self, self.on_measured_thread_message, raw=True)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
 
@@ -124,28 +128,36 @@ class ThreadModelNode(PackageNode):
         self._report(outcome, time.perf_counter() - began)
 
     def on_measured_thread_message(self, data: bytes) -> None:
-        """Keep the thread that the camera sees, to start from.
+        """Start from a centreline, where no tracker tells whether it is all of the thread, as in older bags.
 
         Most are not needed, and to read a path of a hundred poses takes as long as some predictions: so
         only the stamp is read of those.
         """
+        name = self.resolve_topic_name(topics.THREAD_OBSERVATION.name)
+        self._observed = self._observed or self.count_publishers(name) > 0
+        if not self._observed:
+            self._take(data, topics.MEASURED_THREAD, reading.path_points, self._session.on_measured_thread)
+
+    def on_observation_message(self, data: bytes) -> None:
+        """Start from what the camera sees of the thread; as above, most are not read."""
+        self._observed = True
+        self._take(data, topics.THREAD_OBSERVATION, reading.thread_observation, self._session.on_observation)
+
+    def _take(self, data: bytes, topic: topics.Topic, read: Callable[[Any], Any], start: Callable[..., Any]) -> None:
         stamp = header_stamp(data) or 0
-        if not self._session.needs_measured_thread(stamp):
-            return
-        try:
-            centreline = reading.path_points(topics.MEASURED_THREAD.decode(data))
-        except InvalidInputError as error:
-            self.health.refuse(error)
-            return
-        self._start(stamp, centreline)
+        if self._session.needs_measured_thread(stamp):
+            try:
+                self._start(start(stamp, read(topic.decode(data))))
+            except InvalidInputError as error:
+                self.health.refuse(error)
 
-    def on_measured_thread(self, stamp: Time, centreline: np.ndarray) -> None:
-        """Handle a measured thread handed over by a tracker in the same process."""
-        self._start(reading.nanoseconds(stamp), centreline)
+    def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
+        """Handle an observation of the thread handed over by a tracker in the same process."""
+        self._start(self._session.on_observation(reading.nanoseconds(stamp), observation))
 
-    def _start(self, stamp: int, centreline: np.ndarray) -> None:
+    def _start(self, outcomes: Iterator[PredictionResult]) -> None:
         began = time.perf_counter()
-        for outcome in self._session.on_measured_thread(stamp, centreline):
+        for outcome in outcomes:
             self._report(outcome, time.perf_counter() - began)
             began = time.perf_counter()
 

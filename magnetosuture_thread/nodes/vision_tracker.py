@@ -1,4 +1,4 @@
-"""The node `vision_tracker`: camera frames in, needle pose and measured thread out."""
+"""The node `vision_tracker`: camera frames in, needle pose and what is seen of the thread out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_path, packed_pose
+from magnetosuture_thread.messages.packing import packed_observation, packed_path, packed_pose
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import PackageNode
@@ -23,6 +23,7 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.look import State, no_pose
 from magnetosuture_thread.vision.session import TrackerSession
@@ -34,13 +35,13 @@ SILENCE = 0.5  # s without a frame, after which the tracker says that it sees no
 
 
 class Follower(Protocol):
-    """Receiver of poses and measured threads in the same process."""
+    """Receiver of poses and observations of the thread in the same process."""
 
     def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
         """Receive what is published as needle pose."""
 
-    def on_measured_thread(self, stamp: Time, centreline: np.ndarray) -> None:
-        """Receive what is published as measured thread."""
+    def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
+        """Receive what is published as observation of the thread."""
 
 
 class VisionTrackerNode(PackageNode):
@@ -63,6 +64,7 @@ class VisionTrackerNode(PackageNode):
         self._poses = topics.NEEDLE_POSE.publisher(self)
         self._states = topics.TRACKER_STATE.publisher(self)
         self._followers: list[Follower] = []
+        self._observations = topics.THREAD_OBSERVATION.publisher(self)
         self._threads = topics.MEASURED_THREAD.publisher(self)
         if settings.image_transport == "compressed":
             topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
@@ -80,7 +82,7 @@ class VisionTrackerNode(PackageNode):
             self._session.set_scene(scene)
 
     def hand_to(self, follower: Follower) -> None:
-        """Hand every pose and measured thread to a follower in the same process, right after it is published."""
+        """Hand every pose and observation of the thread to a follower in the same process, once it is published."""
         self._followers.append(follower)
 
     def on_compressed(self, message: CompressedImage) -> None:
@@ -134,10 +136,11 @@ class VisionTrackerNode(PackageNode):
         if seen.tracked:
             for follower in self._followers:
                 follower.on_tracked(stamp, track.tail, track.heading)
+            self._observations.publish(packed_observation(when, track.observation))
+            for follower in self._followers:
+                follower.on_observation(stamp, track.observation)
             if len(seen.centreline):
                 self._threads.publish(packed_path(when, seen.centreline))
-                for follower in self._followers:
-                    follower.on_measured_thread(stamp, seen.centreline)
         self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))
         values: dict[str, Any] = {"frames": self._session.frames, "tracked": self._session.tracked}
         if track.needle_length is not None:

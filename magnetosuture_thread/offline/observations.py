@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,15 @@ from magnetosuture_thread.interface import (
     MEASURED_THREAD,
     NEEDLE_POSE,
     SCENE,
+    THREAD_OBSERVATION,
     Channel,
 )
-from magnetosuture_thread.messages.reading import read_path, read_pose, stamp_of
+from magnetosuture_thread.messages.reading import read_observation, read_path, read_pose, stamp_of
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.session import MAX_WAITING_POSES
 from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
 from magnetosuture_thread.vision.warm_up import warm_up
@@ -43,6 +46,7 @@ NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
 Progress = Callable[[float], None]
 _CHANGING = {channel.recorded for channel in CHANGING}
 _TRUE, _SEEN = GROUND_TRUTH_THREAD.recorded, MEASURED_THREAD.recorded
+_OBSERVED = THREAD_OBSERVATION.recorded
 _NOTHING = np.empty((0, 2))
 
 
@@ -83,7 +87,7 @@ class ObservationReader(Iterator[Observation]):
         self._recording = recording
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
-        sources = (recording.camera,) if source == "camera" else (NEEDLE_POSE, MEASURED_THREAD)
+        sources = (recording.camera,) if source == "camera" else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
         given = (GROUND_TRUTH_THREAD, *CHANGING, *sources)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
         records = recording.records(channels, start=start, duration=duration)
@@ -91,7 +95,7 @@ class ObservationReader(Iterator[Observation]):
         self._changes = [record for record in earlier if record.time < begin]
         for record in self._changes:
             self._follow(record)
-        awaited = {GROUND_TRUTH_THREAD, MEASURED_THREAD} & set(channels)
+        awaited = {GROUND_TRUTH_THREAD, MEASURED_THREAD, THREAD_OBSERVATION} & set(channels)
         self._going = self._go(_telling(records, begin, whole, progress), awaited)
 
     def __next__(self) -> Observation:
@@ -122,7 +126,7 @@ class ObservationReader(Iterator[Observation]):
     def _go(self, records: Iterator[RecordedMessage], awaited: set[Channel]) -> Iterator[Observation]:
         """Give a sight once what belongs to it has come, or cannot be expected any more."""
         waiting: deque[Observation | RecordedMessage] = deque()
-        parts: dict[str, dict[int, Points]] = {channel.recorded: {} for channel in awaited}
+        parts: dict[str, dict[int, Any]] = {channel.recorded: {} for channel in awaited}
         for record in records:
             if record.topic in parts:
                 self._keep(parts[record.topic], record)
@@ -152,16 +156,35 @@ class ObservationReader(Iterator[Observation]):
             return  # counted and reported where the model takes it
         self._scene = scene
 
-    def _next(self, head: Observation | RecordedMessage, parts: dict[str, dict[int, Points]]) -> Iterator[Observation]:
+    def _next(self, head: Observation | RecordedMessage, parts: dict[str, dict[int, Any]]) -> Iterator[Observation]:
         if isinstance(head, RecordedMessage):
             self._changes.append(head)
         else:
             yield self._whole(head, parts)
 
-    def _keep(self, known: dict[int, Points], record: RecordedMessage) -> None:
+    def _keep(self, known: dict[int, Any], record: RecordedMessage) -> None:
         stamp = stamp_of(record)
-        if record.topic == _SEEN:
+        if record.topic in (_SEEN, _OBSERVED):
             self.on_record(stamp, record)
+        if record.topic == _OBSERVED:
+            known[stamp] = self._observed(record)
+        else:
+            known[stamp] = self._path(record)
+        if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
+            del known[next(iter(known))]
+
+    def _observed(self, record: RecordedMessage) -> ThreadObservation:
+        """Return what a frame showed of the thread; nothing where that isn't valid."""
+        try:
+            observation = read_observation(record)
+        except InvalidInputError as error:
+            self.refused[f"{record.topic}: {error}"] += 1
+            return ThreadObservation()
+        for piece in observation.pieces:
+            self._check_place(record.topic, piece.points)
+        return observation
+
+    def _path(self, record: RecordedMessage) -> Points:
         try:
             points = read_path(record)
         except InvalidInputError as error:
@@ -174,25 +197,17 @@ class ObservationReader(Iterator[Observation]):
                 self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
                 self._measured += 1
             self._threads += 1
-        known[stamp] = points
-        if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
-            del known[next(iter(known))]
+        return points
 
-    def _whole(self, observation: Observation, parts: dict[str, dict[int, Points]]) -> Observation:
+    def _whole(self, observation: Observation, parts: dict[str, dict[int, Any]]) -> Observation:
         truth = parts.get(_TRUE, {}).get(observation.stamp, _NOTHING)
         seen = parts.get(_SEEN, {}).get(observation.stamp, _NOTHING)
-        if not len(truth) and not len(seen):
-            return observation
-        seen = seen if self.source == "poses" else observation.measured
-        return Observation(
-            observation.stamp,
-            observation.tail,
-            observation.heading,
-            seen,
-            truth,
-            observation.reason,
-            observation.processing,
-        )
+        if self.source != "poses":
+            return replace(observation, ground_truth=truth) if len(truth) else observation
+        observed = observation.observation
+        if _OBSERVED in parts:  # As live, the centreline alone tells nothing where observations come.
+            observed = parts[_OBSERVED].get(observation.stamp, ThreadObservation())
+        return replace(observation, measured=seen, ground_truth=truth, observation=observed)
 
     def _pose(self, record: RecordedMessage) -> Observation:
         """Return what a recorded pose says."""
@@ -231,7 +246,14 @@ class ObservationReader(Iterator[Observation]):
             return Observation(stamp, reason=seen.track.reason, processing=taken)
         self.found += 1
         heading = round_trip_heading(seen.track.heading, NEEDLE_POSE.name)
-        return Observation(stamp, np.asarray(seen.track.tail), heading, seen.centreline, processing=taken)
+        return Observation(
+            stamp,
+            np.asarray(seen.track.tail),
+            heading,
+            seen.centreline,
+            processing=taken,
+            observation=seen.track.observation,
+        )
 
     def _check_place(self, topic: str, points: Points) -> None:
         """Refuse what is farther away than the dish is wide."""

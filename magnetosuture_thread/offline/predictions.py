@@ -127,11 +127,15 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
             _change(session, given)
         if not observation.found:
             continue
-        if len(observation.measured):
+        results: Iterator[PredictionResult] = iter(())
+        if observation.observation is not None:
+            results = session.on_observation(observation.stamp, observation.observation)
+        elif len(observation.measured):
+            results = session.on_measured_thread(observation.stamp, observation.measured)
+        began = time.perf_counter()
+        for result in results:
+            yield step(waiting.get(result.stamp, observation), result, began)
             began = time.perf_counter()
-            for result in session.on_measured_thread(observation.stamp, observation.measured):
-                yield step(waiting.get(result.stamp, observation), result, began)
-                began = time.perf_counter()
         began = time.perf_counter()
         pose = NeedlePose(observation.stamp * 1e-9, observation.tail, observation.heading)
         yield step(observation, session.on_pose(observation.stamp, pose), began)

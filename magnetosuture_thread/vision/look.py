@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import cv2
@@ -12,6 +12,7 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
+from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.dish.ellipse import find_ellipse
 from magnetosuture_thread.vision.dish.tilt import MIN_ANGLE, Tilt, find_tilt, tilt_of, unseen_tilt_covariance
@@ -24,6 +25,7 @@ from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
+from magnetosuture_thread.vision.thread.observe import observe
 
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
@@ -64,6 +66,7 @@ class Track:
         view: where the dish is in the image; None when it is not found.
         warning: what makes the measurement worse than it could be; empty if nothing does.
         needle_length: measured over the first frames [m]; None until it is, and of a frame looked at alone.
+        observation: the pieces of the thread that are seen, in the dish frame.
     """
 
     state: State
@@ -78,6 +81,7 @@ class Track:
     view: DishView | None
     warning: str = ""
     needle_length: float | None = None
+    observation: ThreadObservation = field(default_factory=ThreadObservation)
 
 
 def no_pose(state: State, reason: str, view: DishView | None) -> Track:
@@ -286,11 +290,14 @@ def tracked(
     settings: VisionTrackerSettings,
     needle: MeasuredNeedle,
     walk: np.ndarray,
+    diameter: float,
     otherwise: State = State.LOST,
+    *,
+    search: bool = True,
 ) -> Track:
     """Return what a frame shows whose needle and centreline are known, in the picture's own pixels.
 
-    `otherwise` is the state if it is unknown which end is the tail.
+    `otherwise` is the state if it is unknown which end is the tail; `search` is that of `observe`.
     """
     local = _local(view, picture)
     heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
@@ -306,6 +313,16 @@ def tracked(
         covariance=covariance,
         centreline=local.to_dish(walk),
         view=view,
+        observation=observe(
+            picture,
+            needle,
+            walk,
+            local,
+            0.5 * diameter,
+            settings.thread_length,
+            scale_known=settings.metres_per_pixel > 0.0,
+            search=search,
+        ),
     )
 
 
@@ -329,13 +346,22 @@ def look_once(
     needle, walk, reason = with_thread(picture, view, settings, diameter, needles)
     if needle is None:
         return no_pose(State.LOST, reason, view)
-    return tilted(tracked(picture, view, settings, needle, walk), dish, 0.5 * diameter)
+    return tilted(tracked(picture, view, settings, needle, walk, diameter), dish, 0.5 * diameter)
 
 
 def tilted(track: Track, dish: FoundDish, radius: float) -> Track:
     """Return a track with what scale and tilt of the camera leave unknown, and a warning of it."""
     covariance = track.covariance + dish.covariance(track.tail, track.heading, radius)
-    return replace(track, covariance=covariance, warning=dish.warning)
+    pieces = tuple(_less_sure(piece, dish, radius) for piece in track.observation.pieces)
+    observation = replace(track.observation, pieces=pieces)
+    return replace(track, covariance=covariance, warning=dish.warning, observation=observation)
+
+
+def _less_sure(piece: ThreadPiece, dish: FoundDish, radius: float) -> ThreadPiece:
+    """Return a piece with what the view leaves unknown of where it is, as far out as it reaches."""
+    farthest = piece.points[np.argmax(np.hypot(*piece.points.T))]
+    view = dish.covariance(farthest, np.array([1.0, 0.0]), radius)[:2, :2]
+    return replace(piece, deviation=np.sqrt(piece.deviation**2 + np.linalg.eigvalsh(view)[-1]))
 
 
 def _local(view: DishView, picture: Picture) -> DishView:

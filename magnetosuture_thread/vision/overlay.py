@@ -13,12 +13,15 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.outputs import output_problem
 from magnetosuture_thread.scene.scene import Scene
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
 from magnetosuture_thread.vision.look import State, Track
 from magnetosuture_thread.vision.scene_mask import mask_outlines
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
 SHIFT = 4  # binary places of a coordinate
 NEEDLE, TIP, THREAD, DISH = (40, 140, 255), (40, 200, 255), (70, 190, 60), (200, 170, 60)
+UNPLACED, HIDDEN = (60, 60, 220), (170, 130, 170)  # a piece of unknown place; what hides the thread
+DASH_PX, GAP_PX = 4.0, 8.0  # of the line between two pieces, and from one dash to the next
 SHAPE = (190, 90, 170)
 PLATES = {State.TRACKED: (70, 150, 50), State.LOST: (50, 50, 200), State.SEARCHING: (160, 120, 40)}
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -26,6 +29,9 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: str = "") -> np.ndarray:
     """Draw dish, thread and needle over a frame, and the state as text.
+
+    Pieces of the thread whose place along it is known are green, and joined by dashes; others are red. A dot is the
+    thread's end, a ring where it goes on unseen, and thin lines surround what may hide it.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.
@@ -42,10 +48,10 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
     if view is not None:
         _circle(drawn, np.asarray(view.centre_px), 2.5 * unit, DISH, -1)
     if view is not None and not track.reason:
-        if len(track.centreline) > 1:
-            line = view.to_pixels(track.centreline)
-            _line(drawn, line, THREAD, unit)
-            _circle(drawn, line[-1], 2.5 * unit, THREAD, -1)
+        if track.observation.pieces:
+            _pieces(drawn, view, track.observation, unit)
+        elif len(track.centreline) > 1:
+            _line(drawn, view.to_pixels(track.centreline), THREAD, unit)
         heading = float(np.arctan2(track.heading[1], track.heading[0]))
         points, _ = needle_axis(track.tail, heading, needle_length, track.curvature, np.linspace(0.0, 1.0, 25))
         axis = view.to_pixels(points)
@@ -128,6 +134,32 @@ class OverlayWriter:
         """End the video."""
         if self._video is not None:
             self._video.release()
+
+
+def _pieces(image: np.ndarray, view: DishView, observation: ThreadObservation, unit: int) -> None:
+    """Draw what is seen of the thread, and what may hide the rest of it."""
+    if not observation.complete:
+        for outline in observation.hidden:
+            _line(image, view.to_pixels(np.vstack([outline, outline[:1]])), HIDDEN, 1)
+    before: np.ndarray | None = None
+    for piece in observation.pieces:
+        line = view.to_pixels(piece.points)
+        placed = bool(np.isfinite(piece.arc_length[0]))
+        colour = THREAD if placed else UNPLACED
+        if placed and before is not None:
+            _dashes(image, before, line[0], THREAD, unit)
+        before = line[-1] if placed else None
+        _line(image, line, colour, unit)
+        for end, at in ((piece.first_end, line[0]), (piece.last_end, line[-1])):
+            if end is not PieceEnd.TAIL:
+                _circle(image, at, 2.5 * unit, colour, -1 if end is PieceEnd.FREE else unit)
+
+
+def _dashes(image: np.ndarray, start: np.ndarray, end: np.ndarray, colour: tuple[int, int, int], unit: int) -> None:
+    length = float(np.hypot(*(end - start)))
+    along = (end - start) / max(length, 1e-9)
+    for at in np.arange(0.0, length, GAP_PX * unit):
+        _line(image, start + along * np.array([[at], [min(at + DASH_PX * unit, length)]]), colour, unit)
 
 
 def _plate(image: np.ndarray, track: Track, title: str, unit: int) -> None:

@@ -164,10 +164,11 @@ class VisionTracker:
         chosen, picture, reason = self._choose(image, view, mask, time_s)
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
-        found = self._tracked(picture, view, chosen)
-        if picture.shape != image.shape[:2] and self._is_cut(found, picture):
+        whole = picture.shape == image.shape[:2]
+        found = self._tracked(picture, view, chosen, search=whole)
+        if not whole and self._is_cut(found, picture):
             picture, chosen = _in_whole(picture, chosen, picture_of(image, view, self._settings, mask))
-            found = self._tracked(picture, view, chosen)
+            found = self._tracked(picture, view, chosen, search=True)
         if not chosen.heading_known:
             return found
         if chosen.size_measured:
@@ -176,11 +177,12 @@ class VisionTracker:
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
 
-    def _tracked(self, picture: Picture, view: DishView, needle: MeasuredNeedle) -> Track:
+    def _tracked(self, picture: Picture, view: DishView, needle: MeasuredNeedle, *, search: bool) -> Track:
         """Return what a frame shows whose needle is known."""
-        walk = centreline_of(picture, view, self._settings, self._scene.dish.diameter, needle)
+        diameter = self._scene.dish.diameter
+        walk = centreline_of(picture, view, self._settings, diameter, needle)
         assert self._dish.found is not None
-        found = tracked(picture, view, self._settings, needle, walk, self._missing())
+        found = tracked(picture, view, self._settings, needle, walk, diameter, self._missing(), search=search)
         return tilted(found, self._dish.found, self._scene.dish.radius)
 
     def _mask_for(self, image: np.ndarray, view: DishView) -> SceneMask | None:
@@ -211,6 +213,10 @@ class VisionTracker:
     def _is_cut(self, found: Track, picture: Picture) -> bool:
         """Say whether the thread may go on beyond the part of the frame that was looked at."""
         assert found.view is not None
+        if found.reason:
+            return False
+        if not found.observation.complete:
+            return True
         line = found.view.to_pixels(found.centreline)
         if _length(line) < MIN_SHARE * _length(self._thread[2:]):
             return True

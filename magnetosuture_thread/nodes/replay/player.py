@@ -112,7 +112,8 @@ class LiveReplay:
         }
         self._echoed = {topic.channel.recorded for topic in played if topic in topics.OUTPUTS}
         # Poses are played where no tracker runs.
-        unheard = {*self._echoed, *([topics.TRACKER_STATE.channel.recorded] if self._echoed else [])}
+        by_tracker = (topics.TRACKER_STATE, topics.THREAD_OBSERVATION)
+        unheard = {*self._echoed, *(topic.channel.recorded for topic in by_tracker if self._echoed)}
         self._outputs = {
             topic.name: self._node.create_subscription(
                 topic.message, topic.name, self._taker(topic), _lossless(topic.qos), raw=True
