@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.vision.images import prepare
 from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.centreline import find_centreline
 
 Image = NDArray[np.uint8]

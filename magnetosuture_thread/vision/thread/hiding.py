@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Picture, Wall, glare_mask
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 
 HALF = 2  # the search for objects is at half the size

@@ -13,8 +13,8 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.images import Picture, Wall
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
 from magnetosuture_thread.vision.needle.erase import without_needle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.appearance import (
     BLUR_PX,
     FAINTEST,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.thread_observation import PieceEnd
 from magnetosuture_thread.vision.images import Picture
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.appearance import FAINTEST, Appearance, across, sampled
 from magnetosuture_thread.vision.thread.hiding import Hiding
 from magnetosuture_thread.vision.thread.order import end_direction

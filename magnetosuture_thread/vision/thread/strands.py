@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.vision.needle.body import MeasuredNeedle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.appearance import FAINTEST, MIN_SHARE, Appearance, runs, strengths
 from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX
 
