@@ -51,7 +51,7 @@ def is_bare_beyond(
     picture: Picture, gray: NDArray[np.uint8], thread: Appearance, strand: Strand, needle: MeasuredNeedle
 ) -> bool:
     """Say whether there is nothing but floor beyond a piece's last point, like that beside it, where it is strong."""
-    if len(strand.points) < 4:
+    if len(strand.points) < 6:
         return False
     usual = float(np.median(strand.strength[-6:]))
     if usual < max(SURE_STRENGTH * FAINTEST, 2.0 * SURE_STRENGTH * thread.noise):
