@@ -235,6 +235,8 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
     A thread may lie over the point, and another axis make it look blunt: each is judged by its own fit.
     """
     for fit, against in ((one, other), (other, one)):
+        if fit.cost > CLEARLY * against.cost:
+            continue
         tail, tip = _bluntness(steel, fit.arc, fit.length, fit.width)
         if tail < BLUNT or tip > POINTED:
             continue
