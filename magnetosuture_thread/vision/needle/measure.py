@@ -52,6 +52,7 @@ ROD_GAIN = (
 )
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 LENGTH_GAIN = 0.1  # of the area by which another length changes the body, that its fit must cost less by
+FADES_PX = 1.5  # over which a tail fades whose end is not where it seems to be
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = (
     0.3,
@@ -189,6 +190,17 @@ def _fits(
     return one, other, rod
 
 
+def _fading(steel: SteelMap, fit: TemplateFit) -> float:
+    """Return over which length the steel fades at a tail [px]: glare and what lies out of focus end it less sharply."""
+    along = np.arange(-4.0, 4.1, 0.25)
+    share = np.empty((len(along), 5))
+    axis = float(fit.arc.start[0]), float(fit.arc.start[1]), fit.arc.angle, fit.arc.curvature
+    straighten(steel.surely, axis, along, np.linspace(-0.3, 0.3, 5) * fit.width, share)
+    # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
+    profile = np.maximum.accumulate(share.min(axis=1))
+    return float(along[np.searchsorted(profile, 0.8).clip(max=len(along) - 1)] - along[np.searchsorted(profile, 0.2)])
+
+
 def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """Say whether the image speaks for the length that was measured, and not as well for the one that is known."""
     change = abs(fit.length - size.length_px)
@@ -225,6 +237,8 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     beyond = np.empty(6)
     excess(steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * size.width_px, beyond)
     if beyond[2:4].max() > GOES_ON:
+        return False
+    if _fading(steel, fit) > FADES_PX:
         return False
     return not steel.is_glaring(fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX])))
 

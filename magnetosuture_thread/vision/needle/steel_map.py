@@ -12,7 +12,7 @@ from magnetosuture_thread.vision.images import Layer, Wall
 
 AROUND_PX = 12.0  # around a dark thing, that is measured on
 DARKEST = 0.9  # quantile of its darkness that steel has
-LIGHT_PX = 5  # that the light is averaged over
+LIGHT_PX = 3  # that the light is averaged over
 GLARE, GLARE_REACH_PX = (
     0.07,
     4,
