@@ -51,7 +51,7 @@ ROD_GAIN = (
     0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
 )
 SAME_LENGTH = 0.015  # share of the length, that need no proof
-LENGTH_GAIN = 0.1  # of the area by which another length changes the body, that its fit must cost less by
+LENGTH_GAIN = 0.1  # px; times the width, that the fit of another length must cost less by
 FADES_PX = 1.5  # over which a tail fades whose end is not where it seems to be
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = (
@@ -203,12 +203,11 @@ def _fading(steel: SteelMap, fit: TemplateFit) -> float:
 
 def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """Say whether the image speaks for the length that was measured, and not as well for the one that is known."""
-    change = abs(fit.length - size.length_px)
-    if change < SAME_LENGTH * size.length_px:
+    if abs(fit.length - size.length_px) < SAME_LENGTH * size.length_px:
         return True
     is_rod = fit.thin == 1.0
     known = fit_template(steel, fit.arc, size.length_px, size.width_px, rod=is_rod)
-    return known.cost - fit.cost > LENGTH_GAIN * change * size.width_px
+    return known.cost - fit.cost > LENGTH_GAIN * size.width_px
 
 
 def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]:
