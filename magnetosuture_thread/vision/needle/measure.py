@@ -52,7 +52,7 @@ ROD_GAIN = (
 )
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 LENGTH_GAIN = 0.1  # px; times the width, that the fit of another length must cost less by
-FADES_PX = 1.5  # over which a tail fades whose end is not where it seems to be
+FADES_PX = 0.6  # over which a tail may fade more than the sides do
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = (
     0.3,
@@ -191,14 +191,30 @@ def _fits(
 
 
 def _fading(steel: SteelMap, fit: TemplateFit) -> float:
-    """Return over which length the steel fades at a tail [px]: glare and what lies out of focus end it less sharply."""
-    along = np.arange(-4.0, 4.1, 0.25)
-    share = np.empty((len(along), 5))
+    """Return over how much more length the steel fades at a tail than at the body's sides [px].
+
+    Glare over a tail ends it less sharply than lens and sensor do.
+    """
     axis = float(fit.arc.start[0]), float(fit.arc.start[1]), fit.arc.angle, fit.arc.curvature
-    straighten(steel.surely, axis, along, np.linspace(-0.3, 0.3, 5) * fit.width, share)
+    beyond = np.arange(-4.0, 4.1, 0.25)
+    share = np.empty((len(beyond), 5))
+    straighten(steel.surely, axis, beyond, np.linspace(-0.3, 0.3, 5) * fit.width, share)
     # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
-    profile = np.maximum.accumulate(share.min(axis=1))
-    return float(along[np.searchsorted(profile, 0.8).clip(max=len(along) - 1)] - along[np.searchsorted(profile, 0.2)])
+    tail = _fade(beyond, share.min(axis=1))
+    body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
+    sides = []
+    for side in (-1.0, 1.0):
+        share = np.empty((len(body), len(outside)))
+        straighten(steel.surely, axis, body, side * outside, share)
+        sides.append(_fade(-outside, np.median(share, axis=0)))
+    return tail - min(sides)
+
+
+def _fade(along: np.ndarray, share: np.ndarray) -> float:
+    """Return the length over which a share rises from 0.2 to 0.8."""
+    rising = np.maximum.accumulate(share)
+    low, high = (np.searchsorted(rising, level).clip(max=len(along) - 1) for level in (0.2, 0.8))
+    return float(along[high] - along[low])
 
 
 def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
