@@ -52,7 +52,7 @@ ROD_GAIN = (
 )
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 LENGTH_GAIN = 0.1  # px; times the width, that the fit of another length must cost less by
-FADES_PX = 0.6  # over which a tail may fade more than the sides do
+FADES_PX = 0.7  # over which a tail may fade more than the sides do
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = (
     0.3,
