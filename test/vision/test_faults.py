@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.rig.camera.dish_camera import Cover
-from magnetosuture_thread.rig.camera.scene import Lighting
 from magnetosuture_thread.vision.dish import find as dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker

@@ -58,7 +58,7 @@ PASSES, PASSES_PX = (
     0.3,
     0.3,
 )  # of the width and beside it, off an end's middle: a thread passes, and does not leave
-SEEN_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
+VISIBLE_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
 ALIKE = "ends that look alike"
 TOWARD = 0.8  # cosine between a needle and where it must point
 
@@ -155,8 +155,8 @@ def _checked(
     if not is_known:
         # The tail may be where the tip is taken to be.
         chord, ahead = fit.arc.at(fit.length) - fit.arc.start, fit.arc.direction()
-        other = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
-        covariance = covariance + np.outer(other, other) + np.diag([0.0, 0.0, math.pi**2])
+        tip = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
+        covariance = covariance + np.outer(tip, tip) + np.diag([0.0, 0.0, math.pi**2])
         confidence *= 0.5
     return MeasuredNeedle(
         arc=fit.arc,
@@ -372,7 +372,7 @@ def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, flo
             steel.perhaps, (float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature), beyond, aside, dark
         )
         widths = 0.5 * dark.sum(axis=1)
-        if middle(widths) < SEEN_PX:
+        if middle(widths) < VISIBLE_PX:
             result.append(None)
             continue
         centres = (dark @ aside) / np.maximum(dark.sum(axis=1), 1e-6)

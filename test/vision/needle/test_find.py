@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.vision.images import prepare
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from test.vision.scenes import NOWHERE, VIEW, Pose, render
 
