@@ -23,7 +23,7 @@ from benchmarks.vision.frames import (
     tilted,
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.rig.camera.dish_camera import STEEL_BGR, Cover
 from magnetosuture_thread.rig.camera.scene import Lighting
 
 Random = np.random.Generator
@@ -44,6 +44,7 @@ COLOURS = {
 WIDTHS_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 4.0, 6.0, 12.0)
 COVERS = (1.5, 3.0, 6.0, 10.0)  # mm
 COVER_BGR = ((168.0, 176.0, 205.0), (60.0, 58.0, 55.0), (210.0, 205.0, 200.0))
+NO_THREAD = np.array([[0.5, 0.5], [0.519, 0.5]])  # m; outside of the image
 SKIN_BGR = (150.0, 170.0, 225.0)
 
 
@@ -339,6 +340,48 @@ def _hand(random: Random) -> Case:
     raise RuntimeError("no finger stays off the needle")
 
 
+def _length_off(share: float, random: Random) -> Case:
+    """Return the usual frame, and a length of the needle that is set wrong by a share."""
+    return replace(_usual(random), length_error=share * random.choice((-1.0, 1.0)))
+
+
+def _rod_in_path(random: Random) -> Case:
+    """Return a rod without a thread, of a length known to 10 %, in a frame into which its way is drawn."""
+    length = random.uniform(3e-3, 10e-3)
+    needle = replace(_needle(random, length), curvature=0.0)
+    centre, _ = needle.axis(np.array([random.uniform(0.1, 0.9)]))
+    angle = random.uniform(-np.pi, np.pi)
+    line = _laid(random, centre[0] - 6e-3 * _unit(angle), angle, 0.012, 100.0)
+    bgr = tuple(int(value) for value in random.integers(40, 220, 3))
+    drawn = drawn_path(line, (bgr[0], bgr[1], bgr[2]), int(random.integers(1, 4)))
+    error = random.uniform(-0.1, 0.1)
+    return Case(needle, NO_THREAD, lighting=_lighting(random), rod=True, finish=(drawn,), length_error=error)
+
+
+def _suture_needle(random: Random) -> Case:
+    """Return a needle bent up to a half circle, of any usual length and width."""
+    length, width = random.uniform(2e-3, 12e-3), float(random.choice((0.28e-3, 0.4e-3, 0.6e-3)))
+    for _ in range(MAX_TRIES):
+        needle = replace(_needle(random, length, width=width), curvature=random.uniform(-np.pi, np.pi) / length)
+        line = _laid(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), 0.015)
+        axis, _ = needle.axis(np.linspace(0.0, 1.0, 20))
+        if _is_inside(line) and _is_inside(axis) and _is_clear(needle, line) and not _crosses_itself(line):
+            return Case(needle, line, lighting=_lighting(random))
+    raise RuntimeError("no thread fits into the dish")
+
+
+def _instrument_beside(random: Random) -> Case:
+    """Return a frame with a dark instrument as wide as the needle, but longer, that lies in the dish."""
+    for _ in range(MAX_TRIES):
+        case = _usual(random)
+        length, angle = random.uniform(1.4, 3.0) * case.needle.length, random.uniform(-np.pi, np.pi)
+        outline = _strip(random.uniform(-0.012, 0.012, 2), _unit(angle), length, case.needle.width)
+        axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
+        if _signed(outline, np.vstack([axis, case.thread])) < -1.2e-3 and _is_inside(outline):
+            return replace(case, hidden_by=(Cover(outline, STEEL_BGR, 0.3),))
+    raise RuntimeError("no instrument stays off the needle")
+
+
 def _classes() -> dict[str, MakeCase]:
     classes: dict[str, MakeCase] = {"usual": _usual}
     for length in (2.5, 7.0):
@@ -354,6 +397,8 @@ def _classes() -> dict[str, MakeCase]:
     classes |= {f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)}
     classes |= {"saturated": _saturated, "dark_field": _dark_field, "blunt_rod": _blunt_rod}
     classes |= {"drawn_path": _drawn_path, "distortion": _distorted, "cut_dish": _cut_dish, "hand": _hand}
+    classes |= {f"length_off_{percent}": partial(_length_off, 0.01 * percent) for percent in (2, 5, 10)}
+    classes |= {"rod_in_path": _rod_in_path, "suture_needle": _suture_needle, "instrument_beside": _instrument_beside}
     return classes
 
 

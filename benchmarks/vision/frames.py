@@ -82,6 +82,7 @@ class Case:
         hidden_by: what hides needle and thread.
         finish: what is done to the picture, one after the other.
         quality: of the JPEG that the frame is sent as.
+        length_error: share by which the tracker is told another length of the needle.
         labels: further facts, for a person.
     """
 
@@ -99,6 +100,7 @@ class Case:
     hidden_by: tuple[Cover, ...] = ()
     finish: tuple[Finish, ...] = ()
     quality: int = 92
+    length_error: float = 0.0
     labels: dict[str, Any] = field(default_factory=dict)
 
     @property

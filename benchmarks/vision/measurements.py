@@ -177,7 +177,9 @@ def measure(case: Case, image: Image) -> Result:
     """Give a frame to a tracker that has seen no other, and compare."""
     lengths = arc_lengths(case.thread)
     settings = VisionTrackerSettings(
-        needle_length=case.needle.length, needle_width=case.needle.width, thread_length=float(lengths[-1])
+        needle_length=case.needle.length * (1.0 + case.length_error),
+        needle_width=case.needle.width,
+        thread_length=float(lengths[-1]),
     )
     tracker = VisionTracker(settings, Scene(dish=Dish(2.0 * DISH_RADIUS)))
     began = time.process_time()

@@ -94,34 +94,6 @@ class SceneMask:
         box = self.depth[top : max(top, int(high[1]) + 1), left : max(left, int(high[0]) + 1)]
         return float(cv2.minMaxLoc(box)[1]) if box.size else -OUTSIDE_DEPTH_PX
 
-    def without_shapes(self, gray: Mask, floor: Mask, low: Points, high: Points, beyond_px: float) -> Mask:
-        """Return a frame in which the shapes have the floor's brightness within a box.
-
-        Args:
-            gray: shape (rows, columns), uint8.
-            floor: brightness of the floor, `factor` times smaller.
-            low: least u and v of the box [px].
-            high: greatest u and v [px].
-            beyond_px: depth in a shape from which on it is replaced [px].
-
-        Returns:
-            A copy, or the frame itself where no shape reaches into the box.
-        """
-        rows, columns = gray.shape
-        left, top = (max(0, int(value) // self.factor * self.factor) for value in low)
-        right, bottom = min(columns, int(high[0]) + 1), min(rows, int(high[1]) + 1)
-        if right <= left or bottom <= top:
-            return gray
-        box = (slice(top, bottom), slice(left, right))
-        within = cv2.compare(self.depth[box], beyond_px, cv2.CMP_GT)
-        if not within.any():
-            return gray
-        small = floor[top // self.factor : -(-bottom // self.factor), left // self.factor : -(-right // self.factor)]
-        behind = cv2.resize(small, (right - left, bottom - top), interpolation=cv2.INTER_LINEAR)
-        shown = gray.copy()
-        cv2.copyTo(behind, within, shown[box])
-        return shown
-
     def depths(self, points: Points) -> NDArray[np.float32]:
         """Return how deep points lie in a shape, negative outside of all, shape (m,) [px]."""
         rows, columns = self.depth.shape

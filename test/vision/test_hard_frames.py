@@ -63,6 +63,17 @@ def test_a_rod_never_points_the_wrong_way():
     assert (rods.wrong, rods.found) == (0, FRAMES)
 
 
+def test_a_thread_that_leaves_a_rod_tells_its_tail():
+    assert row("blunt_rod").unknown == 0
+    assert row("blunt_rod").dishonest == 0
+
+
+@pytest.mark.parametrize("name", ["length_off_2", "length_off_5", "suture_needle", "instrument_beside"])
+def test_needles_of_other_lengths_and_bends_are_measured(name: str):
+    assert (row(name).wrong, row(name).dishonest) == (0, 0)
+    assert row(name).found - row(name).unknown >= FRAMES - 1
+
+
 def test_of_two_needles_the_one_that_a_thread_leaves_is_taken():
     assert row("second_needle").found >= FRAMES - 1
     assert row("second_needle").wrong == 0

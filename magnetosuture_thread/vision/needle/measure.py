@@ -51,13 +51,14 @@ ROD_GAIN = (
     0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
 )
 SAME_LENGTH = 0.015  # share of the length, that need no proof
-LENGTH_GAIN = 0.1  # of the area by which another length changes the body, that its fit must cost less by
+LENGTH_GAIN = 0.1  # px; times the width, that the fit of another length must cost less by
+FADES_PX = 0.7  # over which a tail may fade more than the sides do
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = (
     0.3,
     0.3,
 )  # of the width and beside it, off an end's middle: a thread passes, and does not leave
-SEEN_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
+VISIBLE_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
 ALIKE = "ends that look alike"
 TOWARD = 0.8  # cosine between a needle and where it must point
 
@@ -154,8 +155,8 @@ def _checked(
     if not is_known:
         # The tail may be where the tip is taken to be.
         chord, ahead = fit.arc.at(fit.length) - fit.arc.start, fit.arc.direction()
-        other = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
-        covariance = covariance + np.outer(other, other) + np.diag([0.0, 0.0, math.pi**2])
+        tip = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
+        covariance = covariance + np.outer(tip, tip) + np.diag([0.0, 0.0, math.pi**2])
         confidence *= 0.5
     return MeasuredNeedle(
         arc=fit.arc,
@@ -189,14 +190,40 @@ def _fits(
     return one, other, rod
 
 
+def _fading(steel: SteelMap, fit: TemplateFit) -> float:
+    """Return over how much more length the steel fades at a tail than at the body's sides [px].
+
+    Glare over a tail ends it less sharply than lens and sensor do.
+    """
+    axis = float(fit.arc.start[0]), float(fit.arc.start[1]), fit.arc.angle, fit.arc.curvature
+    beyond = np.arange(-4.0, 4.1, 0.25)
+    share = np.empty((len(beyond), 5))
+    straighten(steel.surely, axis, beyond, np.linspace(-0.3, 0.3, 5) * fit.width, share)
+    # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
+    tail = _fade(beyond, share.min(axis=1))
+    body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
+    sides = []
+    for side in (-1.0, 1.0):
+        share = np.empty((len(body), len(outside)))
+        straighten(steel.surely, axis, body, side * outside, share)
+        sides.append(_fade(-outside, np.median(share, axis=0)))
+    return tail - min(sides)
+
+
+def _fade(along: np.ndarray, share: np.ndarray) -> float:
+    """Return the length over which a share rises from 0.2 to 0.8."""
+    rising = np.maximum.accumulate(share)
+    low, high = (np.searchsorted(rising, level).clip(max=len(along) - 1) for level in (0.2, 0.8))
+    return float(along[high] - along[low])
+
+
 def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """Say whether the image speaks for the length that was measured, and not as well for the one that is known."""
-    change = abs(fit.length - size.length_px)
-    if change < SAME_LENGTH * size.length_px:
+    if abs(fit.length - size.length_px) < SAME_LENGTH * size.length_px:
         return True
     is_rod = fit.thin == 1.0
     known = fit_template(steel, fit.arc, size.length_px, size.width_px, rod=is_rod)
-    return known.cost - fit.cost > LENGTH_GAIN * change * size.width_px
+    return known.cost - fit.cost > LENGTH_GAIN * size.width_px
 
 
 def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]:
@@ -226,6 +253,8 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     excess(steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * size.width_px, beyond)
     if beyond[2:4].max() > GOES_ON:
         return False
+    if _fading(steel, fit) > FADES_PX:
+        return False
     return not steel.is_glaring(fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX])))
 
 
@@ -235,6 +264,8 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
     A thread may lie over the point, and another axis make it look blunt: each is judged by its own fit.
     """
     for fit, against in ((one, other), (other, one)):
+        if fit.cost > CLEARLY * against.cost:
+            continue
         tail, tip = _bluntness(steel, fit.arc, fit.length, fit.width)
         if tail < BLUNT or tip > POINTED:
             continue
@@ -341,7 +372,7 @@ def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, flo
             steel.perhaps, (float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature), beyond, aside, dark
         )
         widths = 0.5 * dark.sum(axis=1)
-        if middle(widths) < SEEN_PX:
+        if middle(widths) < VISIBLE_PX:
             result.append(None)
             continue
         centres = (dark @ aside) / np.maximum(dark.sum(axis=1), 1e-6)
