@@ -60,7 +60,9 @@ def ways_out(ridge, hidden, factor, noise, faintest, single, tail, max_hidden, s
                     if simple:
                         continue
                     arc = (angle, side * bend, turn)
-                    count = _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count)
+                    count = _try(
+                        ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count
+                    )
     for index in range(0 if simple else BELOW_WAYS):
         for bend in BELOW_BENDS:
             arc = (tail[2] + BELOW * (2.0 * index / (BELOW_WAYS - 1) - 1.0), bend, math.pi)
