@@ -267,7 +267,7 @@ class _Search:
 
     @cached_property
     def _coarse(self) -> np.ndarray:
-        """How much darker each colour of the image, shrunk by `COARSE`, is than around, shape (rows, columns, 1 or 3)."""
+        """How much darker than around each colour of the shrunk image is, shape (rows, columns, 1 or 3)."""
         small = shrunk(self._picture.image[self._box], COARSE)
         around = cv2.medianBlur(small, COARSE_MEDIAN)
         return cv2.subtract(around, small, dtype=cv2.CV_32F).reshape(*small.shape[:2], -1)
@@ -294,8 +294,8 @@ class _Search:
 
             r = d . c - k |d - (d . c) c|
 
-        with the difference d in colour of a pixel from what is around it, and the colour c of what leaves the tail, first
-        right behind it, then along a walk there.
+        with the difference d in colour of a pixel from what is around it, and the colour c of what leaves the tail:
+        first right behind it, then along a walk there.
         """
         difference = cv2.GaussianBlur(self._coarse, (0, 0), INNER_PX).reshape(self._coarse.shape)
         walk = self._along(self._same_colour(difference, self._beginning(difference)))

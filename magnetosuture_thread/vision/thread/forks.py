@@ -63,7 +63,7 @@ def follow(
         The number of vertices, and how much thread they show [px]; see `worth`.
     """
     ways = np.empty((MAX_WAYS, 6))
-    found = ways_out(ridge, hidden, factor, noise, faintest, single, start, max_hidden, simple, ways)
+    found = ways_out(ridge, hidden, factor, noise, faintest, start, max_hidden, simple, ways, single)
     path[0, :2], strong[0] = start[:2], False
     best, best_value, enough = 1, 0.0, SUFFICIENT_SHARE * max_length
     other, other_strong = np.empty_like(path), np.empty_like(strong)
