@@ -7,6 +7,7 @@ is reversed. 20 frames of each class take ten minutes.
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ from rich.table import Table
 
 from benchmarks.vision.covers import CLASSES
 from benchmarks.vision.measurements import Row, frame_of, measure_vision
+from benchmarks.vision.ropes import ROPES, rope_row
 from magnetosuture_thread.cli.arguments import count_argument, whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
 from magnetosuture_thread.errors import ConfigurationError
@@ -43,15 +45,23 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         name, index, file = options.save
         return _save(name, index, file, options.seed), True
     names = [name for name in CLASSES if name.startswith(tuple(options.classes))]
-    if not names:
-        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}")
+    ropes = [name for name in ROPES if name.startswith(tuple(options.classes))]
+    if not names and not ropes:
+        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}, ropes")
     with progress(console, "vision") as advance:
         rows, figures = measure_vision(names, options.count, options.seed, advance)
-    console.print(table(rows))
-    console.print(table_of_pieces(rows))
+    if rows:
+        console.print(table(rows))
+        console.print(table_of_pieces(rows))
+    rope_rows = [rope_row(name, options.count, options.seed) for name in ropes]
+    for row in rope_rows:
+        make_log(console)(
+            f"{row.name}: 90 % of the rope followed in {row.covered_90:.0%} of the pictures, "
+            f"{row.covered:.1%} in the mean; {row.wrong:.1%} of what was followed is not on it; {row.median_ms:.1f} ms"
+        )
     total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
     make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
-    return {**figures, "total": total}, total["reversed"] == 0
+    return {**figures, "ropes": [asdict(row) for row in rope_rows], "total": total}, total["reversed"] == 0
 
 
 def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+import zlib
 from dataclasses import dataclass
 from functools import partial
 
@@ -24,7 +26,15 @@ SIZE = (640, 480)  # px
 MARGIN_PX = 40.0
 PIECE_PX = 24.0  # of a rope, that lies over or under as a whole
 LENGTHS_PX = (500.0, 800.0)
-ROPE_BGR = ((60, 60, 200), (190, 110, 40), (60, 150, 70), (40, 40, 42), (225, 228, 230), (150, 190, 215), (120, 60, 140))
+ROPE_BGR = (
+    (60, 60, 200),
+    (190, 110, 40),
+    (60, 150, 70),
+    (40, 40, 42),
+    (225, 228, 230),
+    (150, 190, 215),
+    (120, 60, 140),
+)
 TABLE_BGR = ((205, 210, 212), (150, 180, 205), (95, 130, 165), (90, 95, 92), (232, 230, 228))
 SHALLOW = (15.0, 40.0)  # degrees
 MAX_TRIES = 4000
@@ -61,12 +71,17 @@ def _wound(random: Random, length: float, bend: float) -> Points | None:
     return None
 
 
+def _nearest(points: Points, line: Points) -> NDArray[np.float64]:
+    """Return how far each of the points is from the vertices of a line [px]."""
+    return np.asarray(cKDTree(line).query(points)[0])
+
+
 def _crossings(one: Points, other: Points, *, own: bool) -> list[tuple[float, float]]:
     """Return where two lines cross, as a length along the first [px] and the angle between them [degrees]."""
-    near = cKDTree(other[::2]).query_ball_point(one[::2], 1.6)
+    tree = cKDTree(other[::2])
     found: list[tuple[float, float]] = []
-    for index, others in enumerate(near):
-        others = [each for each in others if not own or abs(each - index) > 20]
+    for index, point in enumerate(one[::2]):
+        others = [each for each in list(tree.query_ball_point(point, 1.6)) if not own or abs(each - index) > 20]
         if not others or (found and 2.0 * index - found[-1][0] < 30.0):
             continue
         a = one[min(2 * index + 3, len(one) - 1)] - one[max(0, 2 * index - 3)]
@@ -93,7 +108,7 @@ def rope_case(count: int, shallow: bool, random: Random) -> RopeCase:
         # Its beginning is free.
         rest = np.vstack([every[0][60:], *every[1:]])
         width = random.uniform(10.0, 20.0)
-        if cKDTree(rest).query(every[0][:30])[0].min() < 1.6 * width:
+        if _nearest(every[0][:30], rest).min() < 1.6 * width:
             continue
         colour = ROPE_BGR[int(random.integers(len(ROPE_BGR)))]
         same = random.random() < 0.6
@@ -124,18 +139,17 @@ def render_ropes(case: RopeCase, seed: int) -> Image:
         at = np.round((line + shift) * 16.0).astype(np.int32)
         cv2.polylines(shade, [at], False, 1.0, round(width), cv2.LINE_8, 4)
     image *= 1.0 - random.uniform(0.1, 0.4) * cv2.GaussianBlur(shade, (0, 0), 4.0)[..., None]
-    pieces = []
+    pieces: list[tuple[int, NDArray[np.int64]]] = []
     pitch = random.uniform(0.6, 1.2)
     for number, line in enumerate(case.lines):
-        tree = cKDTree(line)
         count = max(1, round(len(line) / PIECE_PX))
-        pieces += [(number, tree, part) for part in np.array_split(np.arange(len(line)), count)]
+        pieces += [(number, part) for part in np.array_split(np.arange(len(line)), count)]
     order = random.permutation(len(pieces))
     for index in order:
-        number, _, part = pieces[index]
+        number, part = pieces[int(index)]
         _draw_piece(image, case, number, part, pitch, random.uniform(0.08, 0.2))
     image = cv2.GaussianBlur(image, (0, 0), 0.8) + random.normal(0.0, 2.0, image.shape)
-    return np.clip(image, 0.0, 255.0).astype(np.uint8)
+    return np.asarray(np.clip(image, 0.0, 255.0), dtype=np.uint8)
 
 
 def _draw_piece(
@@ -183,8 +197,47 @@ def compared(case: RopeCase, found: Points) -> tuple[float, float]:
         return 0.0, 0.0
     length = float(arc_lengths(found)[-1])
     own = points_at(found, np.arange(0.0, length))
-    covered = float((cKDTree(own).query(line)[0] < bound).mean())
-    return covered, float((cKDTree(line).query(own)[0] > bound).mean())
+    return float((_nearest(line, own) < bound).mean()), float((_nearest(own, line) > bound).mean())
+
+
+def measure_rope(name: str, index: int, seed: int) -> tuple[float, float, float]:
+    """Return what `compared` does of a picture of a class, and the seconds of CPU that it took."""
+    own = [seed, zlib.crc32(name.encode()), index]
+    case = ROPES[name](np.random.default_rng(own))
+    image = render_ropes(case, int(np.random.default_rng([*own, 1]).integers(2**31)))
+    began = time.process_time()
+    found = followed(case, image)
+    seconds = time.process_time() - began
+    return (*compared(case, found), seconds)
+
+
+@dataclass(frozen=True)
+class RopeRow:
+    """A class of pictures of ropes.
+
+    Attributes:
+        name: of the class.
+        frames: number of pictures.
+        covered: share of the first rope that was followed, mean.
+        covered_90: share of the pictures with 90 % of it followed.
+        wrong: share of what was followed that is not on it, mean.
+        median_ms: CPU time of a picture.
+    """
+
+    name: str
+    frames: int
+    covered: float
+    covered_90: float
+    wrong: float
+    median_ms: float
+
+
+def rope_row(name: str, count: int, seed: int) -> RopeRow:
+    """Measure pictures of a class."""
+    figures = np.array([measure_rope(name, index, seed) for index in range(count)])
+    covered, wrong, seconds = figures.T
+    ninety = float((covered >= 0.9).mean())
+    return RopeRow(name, count, float(covered.mean()), ninety, float(wrong.mean()), 1e3 * float(np.median(seconds)))
 
 
 ROPES = {f"ropes_{count}": partial(rope_case, count, False) for count in (1, 2, 3)} | {

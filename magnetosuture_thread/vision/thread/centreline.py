@@ -30,7 +30,7 @@ from magnetosuture_thread.vision.thread.ridge import (
     faint_ridge,
     shrunk_hidden,
 )
-from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, refine
+from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, least_confidence, refine
 
 COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
 BEYOND_PX = 3.0  # its tip, that is not seen either
@@ -48,7 +48,11 @@ THIN_SHARE = 0.5  # of its strength among larger pixels, that a thin thread show
 FAINT_ROUNDS, FAINT_HALF = 3, 3  # how often a faint walk is centred, and over how many vertices to both sides
 COARSE, COARSE_MEDIAN = 4, 15  # how much smaller an image shows what is wide, and the window of its surroundings [px]
 COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
-WIDE_SHARE, WIDE_FAINTEST = 0.8, 0.3  # of its contrast, that something wide keeps when shrunk; and shows everywhere
+WIDE_SHARE = 1.2  # of a walk's contrast, that what is wide has beside it in the shrunk image
+WIDE_FAINTEST = 0.3  # of the contrast at the tail, that it shows everywhere
+WIDE_STIFFNESS = 3.0  # of a wide thread, that bends in many of its widths, in the shrunk image
+WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
+OTHER_COLOUR = 0.5  # weight of what a pixel has of another colour, against it
 BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
 MIN_CENTRED = 4  # vertices
 SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
@@ -63,11 +67,30 @@ class _Walk:
         points: vertices in pixels of the picture, shape (m, 2).
         shown: how much thread they show [px].
         strength: median of the ridge along it [grey levels].
+        ridge: that was followed.
+        path: the walk in the ridge's pixels; see `walk_on`.
     """
 
     points: np.ndarray
     shown: float
     strength: float
+    ridge: Ridge | None
+    path: np.ndarray
+
+
+@dataclass(frozen=True)
+class FollowedThread:
+    """A thread's centreline, and how sure it is that it is one thread's.
+
+    Attributes:
+        points: vertices from the tail on, shape (m, 2) [px], m = 1 if no thread is seen.
+        confidence: least of all its crossings, 0 to 1; 1 if it crosses nothing, 0 if nothing is seen.
+        doubtful_px: where it is least, shape (2,) [px]; None if it crosses nothing.
+    """
+
+    points: np.ndarray
+    confidence: float
+    doubtful_px: np.ndarray | None
 
 
 def find_centreline(
@@ -93,19 +116,53 @@ def find_centreline(
     Returns:
         Vertices from the tail on, shape (m, 2) [px], m = 1 if no thread is seen.
     """
+    return _followed(picture, needle, max_length, centre, wall).points
+
+
+def follow_thread(
+    picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
+) -> FollowedThread:
+    """Follow the thread as `find_centreline` does, and judge where it may have gone on along another way.
+
+    At each vertex the arc ahead that was taken is held against the best other one that lies on a ridge too: a thread
+    that crosses, or an own loop. The confidence is the least of all vertices, see `least_confidence`: it falls with the
+    strength of the other way and rises with the bend that the other needs more.
+
+    Args:
+        picture: see `find_centreline`.
+        needle: see there.
+        max_length: see there.
+        centre: see there.
+        wall: see there.
+    """
+    walk = _followed(picture, needle, max_length, centre, wall)
+    if walk.ridge is None or len(walk.path) < MIN_CENTRED:
+        return FollowedThread(walk.points, 1.0 if len(walk.points) > 1 else 0.0, None)
+    ridge, path = walk.ridge, walk.path
+    confidence, vertex = least_confidence(
+        ridge.strength, ridge.hidden, ridge.factor, ridge.noise, ridge.faintest, ridge.stiffness, path
+    )
+    if vertex < 0:
+        return FollowedThread(walk.points, 1.0, None)
+    share = path[vertex, 5] / path[-1, 5]
+    at = points_at(walk.points, np.array([share * arc_lengths(walk.points)[-1]]))[0]
+    return FollowedThread(walk.points, float(confidence), np.asarray(at))
+
+
+def _followed(
+    picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
+) -> _Walk:
+    """Return the walk that shows the thread best; see `find_centreline`."""
     reach = wall - WALL_PX
     search = _Search(picture, needle, max_length, centre, reach)
     dark = search.dark()
     enough = ENOUGH * max_length
-    strong = _is_strong(dark, enough)
-    if strong and not search.is_edge(dark):
-        return dark.points
-    wide = search.wide()
-    if wide.shown > SURE_SHARE * enough and search.is_edge(wide):
-        return wide.points
-    if strong:
-        return dark.points
-    return _best_of(dark, search.faint(), enough).points
+    best = dark if _is_strong(dark, enough) else _best_of(dark, search.faint(), enough)
+    if len(best.points) >= MIN_CENTRED and search.is_edge(best):
+        wide = search.wide()
+        if wide.shown > WIDE_SHOWN * best.shown:
+            return wide
+    return best
 
 
 def _is_strong(dark: _Walk, enough: float) -> bool:
@@ -190,7 +247,9 @@ class _Search:
             difference, deviation = darker_than_around(small)
             for pale in (False, True):
                 # A pale thread may be as bright as the lamp's reflection.
-                hidden, factor = shrunk_hidden(self._covered if pale else self._hidden, self._picture.factor, small, scale)
+                hidden, factor = shrunk_hidden(
+                    self._covered if pale else self._hidden, self._picture.factor, small, scale
+                )
                 ridge = faint_ridge(difference, deviation, hidden, factor, scale, pale=pale)
                 self._clear_shade(ridge, shade * LEVELS / deviation)
                 self._clear_wall(ridge)
@@ -208,7 +267,7 @@ class _Search:
 
     @cached_property
     def _coarse(self) -> np.ndarray:
-        """How much darker each colour of the image, shrunk by `COARSE`, is than around, shape (rows, columns, 1 or 3)."""
+        """How much darker than around each colour of the shrunk image is, shape (rows, columns, 1 or 3)."""
         small = shrunk(self._picture.image[self._box], COARSE)
         around = cv2.medianBlur(small, COARSE_MEDIAN)
         return cv2.subtract(around, small, dtype=cv2.CV_32F).reshape(*small.shape[:2], -1)
@@ -218,29 +277,47 @@ class _Search:
 
         What is wide keeps its contrast in a shrunk image, what is thin loses it.
         """
-        contrast = np.linalg.norm(self._coarse, axis=2)
+        contrast = None
+        for layer in (self._picture.darkest, self._picture.brightest):
+            small = shrunk(layer.pixels[self._box], COARSE)
+            factor = self._picture.factor
+            box = tuple(slice(side.start // factor, -(-side.stop // factor)) for side in self._box)
+            floor = cv2.resize(layer.floor[box], small.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            differs = cv2.absdiff(small, floor)
+            contrast = differs if contrast is None else cv2.max(contrast, differs)
         near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
-        return self._median_along(walk.points, near, COARSE) > WIDE_SHARE * walk.strength
+        usual = middle(near[::3, ::3])
+        return self._median_along(walk.points, near, COARSE) - usual > WIDE_SHARE * walk.strength
 
     def wide(self) -> _Walk:
         """Return the walk along what is wide and differs from around in colour as it does where it begins.
 
-            r = d . c - |d - (d . c) c|
+            r = d . c - k |d - (d . c) c|
 
-        with the difference d in colour of a pixel from what is around it, and the colour c of what leaves the tail, by
-        a walk along |d| before.
+        with the difference d in colour of a pixel from what is around it, and the colour c of what leaves the tail:
+        first right behind it, then along a walk there.
         """
         difference = cv2.GaussianBlur(self._coarse, (0, 0), INNER_PX).reshape(self._coarse.shape)
-        contrast = np.linalg.norm(difference, axis=2)
-        walk = self._along(contrast)
+        walk = self._along(self._same_colour(difference, self._beginning(difference)))
         if len(walk.points) < MIN_CENTRED:
             return walk
         at = ((walk.points[2:BEGINNING] - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(np.float32)
         begun = cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR).reshape(len(at), -1)
-        colour = np.median(begun, axis=0)
-        colour /= max(1e-6, float(np.linalg.norm(colour)))
+        return self._along(self._same_colour(difference, np.median(begun, axis=0)))
+
+    def _beginning(self, difference: np.ndarray) -> np.ndarray:
+        """Return the difference in colour right behind the tail."""
+        behind = (self._needle.tail_px - self._origin - 0.5 * (COARSE - 1)) / COARSE - self._needle.direction_px
+        rows, columns = difference.shape[:2]
+        u, v = np.clip(np.round(behind).astype(int), 0, (columns - 1, rows - 1))
+        return np.asarray(difference[v, u])
+
+    @staticmethod
+    def _same_colour(difference: np.ndarray, colour: np.ndarray) -> np.ndarray:
+        """Return how much of a colour each pixel has, less what it has of others."""
+        colour = colour / max(1e-6, float(np.linalg.norm(colour)))
         same = difference @ colour
-        return self._along(same - np.linalg.norm(difference - same[..., None] * colour, axis=2))
+        return np.asarray(same - OTHER_COLOUR * np.linalg.norm(difference - same[..., None] * colour, axis=2))
 
     def _along(self, contrast: np.ndarray) -> _Walk:
         """Return the walk along a contrast in the image that is shrunk by `COARSE`."""
@@ -253,7 +330,7 @@ class _Search:
         window = strength
         hidden, factor = shrunk_hidden(self._covered, self._picture.factor, window, COARSE)
         faintest = max(WIDE_FAINTEST * COARSE_LEVELS, gain * FAINT_DEVIATIONS * noise)
-        ridge = Ridge(strength, hidden, factor, COARSE, ZERO, faintest, faintest, signed=True)
+        ridge = Ridge(strength, hidden, factor, COARSE, ZERO, faintest, faintest, signed=True, stiffness=WIDE_STIFFNESS)
         ridge.strength[(hidden > 0) & (ridge.strength > ZERO)] = ZERO
         self._clear_wall(ridge)
         walk = self._walked(ridge)
@@ -299,6 +376,7 @@ class _Search:
             ridge.noise,
             ridge.faintest,
             ridge.single,
+            ridge.stiffness,
             np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
             (dish[0], dish[1], dish[2]),
             max_length,
@@ -320,7 +398,7 @@ class _Search:
         for _ in range(FAINT_ROUNDS if ridge.signed else 1):
             refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
         strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
-        return _Walk(points * scale + shift + origin, shown * scale, strength)
+        return _Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy())
 
     def _clear_wall(self, ridge: Ridge) -> None:
         """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""

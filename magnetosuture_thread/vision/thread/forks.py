@@ -38,7 +38,9 @@ def worth(path, strong, count):
 
 
 @compiled
-def follow(ridge, hidden, factor, noise, faintest, single, start, dish, max_length, max_hidden, simple, path, strong):
+def follow(
+    ridge, hidden, factor, noise, faintest, single, stiffness, start, dish, max_length, max_hidden, simple, path, strong
+):
     """Walk along the ridge from the tail to its end, along the way out that shows most of the thread.
 
     Args:
@@ -48,6 +50,7 @@ def follow(ridge, hidden, factor, noise, faintest, single, start, dish, max_leng
         noise: the ridge's strength where nothing is.
         faintest: a strength above noise that is no noise.
         single: see `ways_out`.
+        stiffness: see `walk_on`.
         start: the tail (u, v) and the needle's direction there [px, px, rad].
         dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk, a little longer than the thread [px].
@@ -60,14 +63,14 @@ def follow(ridge, hidden, factor, noise, faintest, single, start, dish, max_leng
         The number of vertices, and how much thread they show [px]; see `worth`.
     """
     ways = np.empty((MAX_WAYS, 6))
-    found = ways_out(ridge, hidden, factor, noise, faintest, single, start, max_hidden, simple, ways)
+    found = ways_out(ridge, hidden, factor, noise, faintest, start, max_hidden, simple, ways, single)
     path[0, :2], strong[0] = start[:2], False
     best, best_value, enough = 1, 0.0, SUFFICIENT_SHARE * max_length
     other, other_strong = np.empty_like(path), np.empty_like(strong)
     for index in range(found):
         count = begin_path(ridge, noise, start, ways[index], faintest, other, other_strong)
         count, value = _follow(
-            ridge, hidden, factor, noise, faintest, dish, max_length, other, other_strong, count, enough
+            ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, other, other_strong, count, enough
         )
         if value > WAY_GAIN * best_value + (MIN_GAIN_PX if index > 0 else 0.0):
             best, best_value = count, value
@@ -78,7 +81,7 @@ def follow(ridge, hidden, factor, noise, faintest, single, start, dish, max_leng
 
 
 @compiled
-def _follow(ridge, hidden, factor, noise, faintest, dish, max_length, path, strong, begun, enough):
+def _follow(ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, path, strong, begun, enough):
     """Walk on from a path's last vertex; where much less of the thread is seen than there is, try forks.
 
     Returns:
@@ -86,7 +89,7 @@ def _follow(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
     """
     forks = np.empty((MAX_FORKS, 3))
     count, fork_count = walk_on(
-        ridge, hidden, factor, noise, faintest, dish, max_length, path, strong, begun, 9.0, forks
+        ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, path, strong, begun, 9.0, forks
     )
     value = worth(path, strong, count)
     if value > enough or fork_count == 0:
@@ -113,6 +116,7 @@ def _follow(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
                 factor,
                 noise,
                 faintest,
+                stiffness,
                 dish,
                 max_length,
                 other,

@@ -26,7 +26,7 @@ APART_PX = 8.0  # that two ways end from each other
 
 
 @compiled
-def ways_out(ridge, hidden, factor, noise, faintest, single, tail, max_hidden, simple, ways):
+def ways_out(ridge, hidden, factor, noise, faintest, tail, max_hidden, simple, ways, single=-1.0):
     """Find the arcs along which a thread may leave the tail.
 
     Args:
@@ -35,16 +35,19 @@ def ways_out(ridge, hidden, factor, noise, faintest, single, tail, max_hidden, s
         factor: see `hidden`.
         noise: the ridge's strength where nothing is.
         faintest: a strength above noise that is no noise.
-        single: the same of a single point on a way that is strong enough in the mean.
         tail: u, v and the needle's direction there [px, px, rad].
         max_hidden: of a way, at most [px].
         simple: whether sharp bends and ways along the needle are not tried.
         ways: filled with angle, curvature, length up to where it can be seen, strength, score and greatest turn, the
             best first, shape (most, 6).
+        single: the strength above noise of a single point on a way that is strong enough in the mean; `faintest` if
+            it is below 0.
 
     Returns:
         How many there are.
     """
+    if single < 0.0:
+        single = faintest
     count = 0
     ends = [(0.0, 0.0)] * len(ways)
     for index in range(WAYS):
@@ -60,7 +63,9 @@ def ways_out(ridge, hidden, factor, noise, faintest, single, tail, max_hidden, s
                     if simple:
                         continue
                     arc = (angle, side * bend, turn)
-                    count = _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count)
+                    count = _try(
+                        ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count
+                    )
     for index in range(0 if simple else BELOW_WAYS):
         for bend in BELOW_BENDS:
             arc = (tail[2] + BELOW * (2.0 * index / (BELOW_WAYS - 1) - 1.0), bend, math.pi)

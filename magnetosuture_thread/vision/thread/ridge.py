@@ -40,6 +40,7 @@ class Ridge:
         faintest: a strength above noise that is no noise.
         single: the same of a single point among others that are stronger in the mean.
         signed: whether strengths below `noise` tell of the opposite: brighter instead of darker.
+        stiffness: of the thread that is followed; see `walk_on`.
     """
 
     strength: np.ndarray
@@ -50,6 +51,7 @@ class Ridge:
     faintest: float
     single: float
     signed: bool
+    stiffness: float = 1.0
 
 
 def shrunk_hidden(hidden: np.ndarray, factor: int, window: np.ndarray, scale: int) -> tuple[np.ndarray, int]:

@@ -27,6 +27,7 @@ ASIDE_PX, ACROSS = 0.5, 9  # between samples across a ridge, and how many
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
 FORK = 0.75  # of the usual strength, at least, along the other way
 END, END_FAINTEST = 0.5, 1.2  # of the usual strength, and of the faintest, that a faint thread shows to its end
+TELLING_BEND = 0.06  # 1/px; a way that bends more by this is less likely by a factor e
 FORCED = 4  # steps that a walk is held to the other way
 
 
@@ -66,14 +67,14 @@ def arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, sco
 
 
 @compiled
-def best_arcs(ridge, hidden, factor, noise, faintest, usual, state, bends, scores):
+def best_arcs(ridge, hidden, factor, noise, faintest, usual, stiffness, state, bends, scores):
     """Return the curvature of the arc ahead that follows the ridge best, and of another, with its score.
 
     The other's score is -1 if there is none: it must be the best of its neighbours, apart from the first, and
     lie on a ridge by itself.
     """
     bend = state[3]
-    bend_cost = BEND_COST * (1.0 + NOISE_COST * (faintest / usual) ** 2)
+    bend_cost = stiffness * BEND_COST * (1.0 + NOISE_COST * (faintest / usual) ** 2)
     for index in range(BENDS):
         part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
         bends[index] = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
@@ -108,7 +109,9 @@ def centred(ridge, noise, u, v, angle, max_shift):
 
 
 @compiled
-def walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, strong, count, bend_first, forks):
+def walk_on(
+    ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, path, strong, count, bend_first, forks
+):
     """Walk along the ridge from a path's last vertex to the ridge's end.
 
     Args:
@@ -117,6 +120,7 @@ def walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
         factor: see `hidden`.
         noise: the ridge's strength where nothing is.
         faintest: a strength above noise that is no noise.
+        stiffness: of the thread; so much higher is the price of a change of curvature.
         dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk [px].
         path: u, v, angle, bend, usual strength and length at each vertex, shape (most, 6); filled in.
@@ -138,7 +142,7 @@ def walk_on(ridge, hidden, factor, noise, faintest, dish, max_length, path, stro
             bend_ahead, forced = bend_first, forced - 1
         else:
             bend_ahead, other, score = best_arcs(
-                ridge, hidden, factor, noise, faintest, usual, (u, v, angle, bend), bends, scores
+                ridge, hidden, factor, noise, faintest, usual, stiffness, (u, v, angle, bend), bends, scores
             )
             if score > 0.0 and fork_count < len(forks):
                 forks[fork_count, 0], forks[fork_count, 1], forks[fork_count, 2] = count, other, score
@@ -191,6 +195,35 @@ def count_to_end(ridge, hidden, factor, noise, faintest, path, count):
         if total >= greatest:
             greatest, kept = total, index + 1
     return kept
+
+
+@compiled
+def least_confidence(ridge, hidden, factor, noise, faintest, stiffness, path):
+    """Return the least confidence of all places where a path could have gone another way, and the vertex there.
+
+        1 - min(1, s_other / s_taken) exp(-(|k_other - k| - |k_taken - k|) / TELLING_BEND)
+
+    with the mean strength s of the ridge along the two arcs ahead, and by how much each changes the curvature k.
+
+    Returns:
+        The confidence, 1 if there is no such place, and the vertex, -1 then.
+    """
+    bends, scores = np.empty(BENDS), np.empty(BENDS)
+    least, vertex = 1.0, -1
+    for index in range(1, len(path) - AHEAD):
+        u, v, angle, bend, usual, _ = path[index]
+        first, second, other = best_arcs(
+            ridge, hidden, factor, noise, faintest, usual, stiffness, (u, v, angle, bend), bends, scores
+        )
+        if other <= 0.0:
+            continue
+        bend_cost = stiffness * BEND_COST * (1.0 + NOISE_COST * (faintest / usual) ** 2)
+        taken = scores.max() + bend_cost * abs(first - bend)
+        sharper = max(0.0, abs(second - bend) - abs(first - bend))
+        confidence = 1.0 - min(1.0, other / max(taken, 1e-9)) * math.exp(-sharper / TELLING_BEND)
+        if confidence < least:
+            least, vertex = confidence, index
+    return least, vertex
 
 
 @compiled

@@ -12,7 +12,7 @@ from magnetosuture_thread.vision.images import prepare
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.centreline import WALL_PX, find_centreline
+from magnetosuture_thread.vision.thread.centreline import WALL_PX, FollowedThread, find_centreline, follow_thread
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
 
@@ -32,6 +32,11 @@ def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 1
 def walk(image: np.ndarray, max_length: float = 400.0, reach: float = 230.0) -> np.ndarray:
     """Follow the thread."""
     return find_centreline(prepare(image, 2), NEEDLE, max_length, (320.0, 240.0), reach + WALL_PX)
+
+
+def follow(image: np.ndarray) -> FollowedThread:
+    """Follow the thread, with a confidence."""
+    return follow_thread(prepare(image, 2), NEEDLE, 400.0, (320.0, 240.0), 230.0 + WALL_PX)
 
 
 def wave(length: float = 150.0) -> np.ndarray:
@@ -154,3 +159,33 @@ def test_the_thread_is_followed_through_a_hot_spot_and_up_to_the_wall():
     assert 0.0175 - 6.0 * PIXEL < reach.max() < 0.0175
     mean, _ = line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))
     assert mean < 1.0
+
+
+def test_a_crossing_is_doubtful_where_another_way_is_as_smooth():
+    line = wave()
+    middle, way = line[150], line[170] - line[150]
+    alone = follow(drawn(line)).confidence
+    found = {}
+    for angle in (35.0, 60.0, 90.0):
+        turn = np.radians(angle)
+        turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ way
+        ends = [np.round(middle + side * 70.0 * turned / np.linalg.norm(way)).astype(int) for side in (-1.0, 1.0)]
+        image = drawn(line)
+        cv2.line(image, ends[0].tolist(), ends[1].tolist(), 140, 1, cv2.LINE_AA)
+        found[angle] = follow(image)
+    assert found[35.0].confidence < found[60.0].confidence < found[90.0].confidence <= alone
+    assert found[35.0].doubtful_px is not None
+    assert np.linalg.norm(found[35.0].doubtful_px - middle) < 15.0
+
+
+def test_without_a_thread_there_is_no_confidence():
+    nothing = follow(drawn(np.array([[0.0, 0.0], [5.0, 5.0]])))
+    assert (len(nothing.points), nothing.confidence, nothing.doubtful_px) == (1, 0.0, None)
+
+
+@pytest.mark.parametrize("level", [218, 232])
+def test_a_thread_a_few_grey_levels_from_the_floor_is_followed(level: int):
+    found = walk(drawn(wave(), noise=1.5, level=level, width=2), max_length=180.0)
+    mean, share = line_error(found, wave())
+    assert mean < 1.0
+    assert share > 0.9
