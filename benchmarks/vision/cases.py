@@ -20,6 +20,7 @@ from benchmarks.vision.frames import (
     dark_field,
     distorted,
     drawn_path,
+    lens_with,
     tilted,
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
@@ -304,8 +305,10 @@ def _drawn_path(random: Random) -> Case:
     return replace(_usual(random), finish=(drawn_path(line, bgr, int(random.integers(1, 4))),))
 
 
-def _distorted(random: Random) -> Case:
-    return replace(_usual(random), finish=(distorted(random.uniform(-0.06, 0.06)),))
+def _distorted(told: bool, random: Random) -> Case:
+    strength, case = random.uniform(-0.06, 0.06), _usual(random)
+    lens = lens_with(strength, case.size) if told else None
+    return replace(case, finish=(distorted(strength),), lens=lens)
 
 
 def _cut_dish(random: Random) -> Case:
@@ -353,7 +356,13 @@ def _classes() -> dict[str, MakeCase]:
     classes |= {"second_needle": _second_needle, "decoy_needle": partial(_second_needle, glare=True)}
     classes |= {f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)}
     classes |= {"saturated": _saturated, "dark_field": _dark_field, "blunt_rod": _blunt_rod}
-    classes |= {"drawn_path": _drawn_path, "distortion": _distorted, "cut_dish": _cut_dish, "hand": _hand}
+    classes |= {
+        "drawn_path": _drawn_path,
+        "distortion": partial(_distorted, True),
+        "cut_dish": _cut_dish,
+        "hand": _hand,
+    }
+    classes |= {"distortion_untold": partial(_distorted, False)}
     return classes
 
 

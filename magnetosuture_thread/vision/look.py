@@ -12,8 +12,8 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
-from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.dish.ellipse import find_ellipse
+from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.dish.tilt import MIN_ANGLE, Tilt, find_tilt, tilt_of, unseen_tilt_covariance
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.body import MeasuredNeedle
