@@ -311,11 +311,13 @@ def _distorted(told: bool, random: Random) -> Case:
     return replace(case, finish=(distorted(strength),), lens=lens)
 
 
-def _cut_dish(random: Random) -> Case:
+def _cut_dish(least: float, greatest: float, random: Random) -> Case:
     """Return a dish of which the frame shows a part, with all of needle and thread."""
     for _ in range(MAX_TRIES):
         case = _usual(random)
-        shift = random.uniform(0.1, 0.55) * DISH_RADIUS / SCALE * _unit(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+        shift = (
+            random.uniform(least, greatest) * DISH_RADIUS / SCALE * _unit(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+        )
         moved = replace(case, shift=(float(shift[0]), float(shift[1])))
         ends = case.needle.axis(np.linspace(0.0, 1.0, 9))[0]
         at = moved.view.to_pixels(np.vstack([ends, case.thread]))
@@ -359,9 +361,10 @@ def _classes() -> dict[str, MakeCase]:
     classes |= {
         "drawn_path": _drawn_path,
         "distortion": partial(_distorted, True),
-        "cut_dish": _cut_dish,
+        "cut_dish": partial(_cut_dish, 0.1, 0.55),
         "hand": _hand,
     }
+    classes |= {"cut_dish_far": partial(_cut_dish, 0.55, 0.9)}
     classes |= {"distortion_untold": partial(_distorted, False)}
     return classes
 
