@@ -20,6 +20,7 @@ from benchmarks.vision.frames import (
     dark_field,
     distorted,
     drawn_path,
+    lens_with,
     tilted,
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
@@ -305,15 +306,19 @@ def _drawn_path(random: Random) -> Case:
     return replace(_usual(random), finish=(drawn_path(line, bgr, int(random.integers(1, 4))),))
 
 
-def _distorted(random: Random) -> Case:
-    return replace(_usual(random), finish=(distorted(random.uniform(-0.06, 0.06)),))
+def _distorted(told: bool, random: Random) -> Case:
+    strength, case = random.uniform(-0.06, 0.06), _usual(random)
+    lens = lens_with(strength, case.size) if told else None
+    return replace(case, finish=(distorted(strength),), lens=lens)
 
 
-def _cut_dish(random: Random) -> Case:
+def _cut_dish(least: float, greatest: float, random: Random) -> Case:
     """Return a dish of which the frame shows a part, with all of needle and thread."""
     for _ in range(MAX_TRIES):
         case = _usual(random)
-        shift = random.uniform(0.1, 0.55) * DISH_RADIUS / SCALE * _unit(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+        shift = (
+            random.uniform(least, greatest) * DISH_RADIUS / SCALE * _unit(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+        )
         moved = replace(case, shift=(float(shift[0]), float(shift[1])))
         ends = case.needle.axis(np.linspace(0.0, 1.0, 9))[0]
         at = moved.view.to_pixels(np.vstack([ends, case.thread]))
@@ -396,7 +401,14 @@ def _classes() -> dict[str, MakeCase]:
     classes |= {"second_needle": _second_needle, "decoy_needle": partial(_second_needle, glare=True)}
     classes |= {f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)}
     classes |= {"saturated": _saturated, "dark_field": _dark_field, "blunt_rod": _blunt_rod}
-    classes |= {"drawn_path": _drawn_path, "distortion": _distorted, "cut_dish": _cut_dish, "hand": _hand}
+    classes |= {
+        "drawn_path": _drawn_path,
+        "distortion": partial(_distorted, True),
+        "cut_dish": partial(_cut_dish, 0.1, 0.55),
+        "hand": _hand,
+    }
+    classes |= {"cut_dish_far": partial(_cut_dish, 0.55, 0.9)}
+    classes |= {"distortion_untold": partial(_distorted, False)}
     classes |= {f"length_off_{percent}": partial(_length_off, 0.01 * percent) for percent in (2, 5, 10)}
     classes |= {"rod_in_path": _rod_in_path, "suture_needle": _suture_needle, "instrument_beside": _instrument_beside}
     return classes

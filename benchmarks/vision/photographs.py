@@ -102,7 +102,7 @@ def _ground(random: np.random.Generator, kind: str, x: Plane, y: Plane) -> Plane
 
 
 def _ring(away: Plane, radius: float, width: float) -> Plane:
-    return np.exp(-(((away - radius) / width) ** 2)).astype(np.float32)
+    return np.asarray(np.exp(-(((away - radius) / width) ** 2)), np.float32)
 
 
 def _step(away: Plane, radius: float, soft: float) -> Plane:

@@ -22,11 +22,12 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.interface import CAMERA, STORAGE_SUFFIXES
+from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
 from magnetosuture_thread.thread_observation import ThreadPiece
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.image_header import image_header
 from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -71,6 +72,7 @@ class FrameSource:
         notes: what a bag's writer says of it.
         doubts: on a bag, a line each: what is damaged, or why damage may not have been noticed.
         unverified: why any frame of a bag may be wrong; empty if nothing speaks against them.
+        lens: of a bag's camera, by the last camera_info before the frame; None if there is none that can be used.
 
     Raises:
         BagError: a path does not exist, a folder holds no pictures, or a bag cannot be used.
@@ -79,6 +81,8 @@ class FrameSource:
     def __init__(self, paths: Sequence[Path], *, remap: Mapping[str, str] | None = None) -> None:
         self._files: list[Path] = []
         self._turned = 0  # frames that have an orientation
+        self.lens: Lens | None = None
+        self._lens_problems: Counter[str] = Counter()
         self._recording: Recording | None = None
         self._channel = CAMERA["raw"]
         self.notes: dict[str, str] = {}
@@ -98,6 +102,7 @@ class FrameSource:
         """Return why frames of a bag could not be taken, and what else to know, once all have been gone through."""
         reasons = self._recording.refused if self._recording is not None else {}
         lines = [f"{reason}: {pluralize(count, 'frame')} left out" for reason, count in reasons.items()]
+        lines += [f"{problem}: frames are taken as they are" for problem in self._lens_problems]
         if self._turned:
             lines.append(f"{pluralize(self._turned, 'frame')} with an EXIF orientation, read as stored: it is ignored")
         return lines
@@ -136,8 +141,12 @@ class FrameSource:
         if self._recording is not None:
             self._recording.refused.clear()
             self._turned = 0
-            for record in self._recording.records([self._channel]):
-                yield self._recorded(record)
+            wanted = [c for c in (CAMERA_INFO, self._channel) if self._recording.counts.get(c.recorded)]
+            for record in self._recording.records(wanted):
+                if record.topic == CAMERA_INFO.recorded:
+                    self._take_lens(record)
+                else:
+                    yield self._recorded(record)
             return
         for name, file in zip(self.names, self._files, strict=True):
             try:
@@ -148,6 +157,13 @@ class FrameSource:
                 yield FrameFile(name, None, f"cannot be read: {error.strerror}")
             except InvalidInputError as error:
                 yield FrameFile(name, None, str(error))
+
+    def _take_lens(self, record: RecordedMessage) -> None:
+        try:
+            self.lens = lens_of(record.decode())
+        except (BagError, InvalidInputError) as error:
+            self.lens = None
+            self._lens_problems[str(error)] += 1
 
     def _note_orientation(self, data: bytes | memoryview) -> None:
         header = image_header(data)
@@ -298,6 +314,7 @@ def track(
     *,
     overlay: Path | None = None,
     remap: Mapping[str, str] | None = None,
+    lens: Lens | None = None,
     log: Callable[[str], None] = lambda text: None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[TrackedFrame]:
@@ -309,6 +326,7 @@ def track(
         scene: in which.
         overlay: folder or video to draw into.
         remap: new name of a bag's topic by its recorded name.
+        lens: of the camera; None: a bag's own, and none of pictures.
         log: called with a line for a person on what of a bag is damaged or not checked.
         progress: called with the share done, 0 to 1.
 
@@ -325,11 +343,16 @@ def track(
     files = numbered([Path(name.replace("/", "_")).stem for name in source.names], "{}_{}")
     with OverlayWriter(overlay, source.rate()) if overlay is not None else nullcontext() as writer:
         for index, frame in enumerate(source):
+            own = lens or source.lens
+            tracker.set_lens(own)
             result = _look(tracker, frame, source.is_sequence)
             results.append(replace(result, unverified=source.unverified))
             if writer is not None and frame.image is not None:
                 name = f"frame_{index:06d}" if source.is_sequence else files[index]
-                writer.write(name, _drawn(frame.image, result, settings, scene))
+                picture = frame.image
+                if own is not None and own.problem_with(picture.shape) is None:
+                    picture = own.undistorted(picture)
+                writer.write(name, _drawn(picture, result, settings, scene))
             progress((index + 1) / max(source.count, 1))
     for line in source.refused:
         log(line)

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.interface import CAMERA
@@ -25,6 +25,7 @@ from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.look import State, no_pose
 from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -58,6 +59,7 @@ class VisionTrackerNode(PackageNode):
         self._scene = SceneFollower(self, self.health, scene, self.on_scene)
         self._camera = CAMERA[settings.image_transport].name
         self._words = "nothing seen"
+        self._lens: Lens | None = None
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._last_frame = self._arrival()
@@ -70,6 +72,7 @@ class VisionTrackerNode(PackageNode):
             topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
         else:
             topics.IMAGE.subscribe(self, self.on_image)
+        topics.CAMERA_INFO.subscribe(self, self.on_camera_info)
         self.create_timer(0.5 * SILENCE, self.on_watch, clock=self._steady)
         self.health.warn("no camera frame yet" if scene is not None else NO_SCENE)
         self.get_logger().info(f"ready: frames from {self.resolve_topic_name(self._camera)}")
@@ -78,6 +81,7 @@ class VisionTrackerNode(PackageNode):
         """Look for the needle in another scene."""
         if self._session is None:
             self._session = TrackerSession(self._settings, scene)
+            self._session.set_lens(self._lens)
         else:
             self._session.set_scene(scene)
 
@@ -95,6 +99,16 @@ class VisionTrackerNode(PackageNode):
             message,
             lambda: unpack_image(message.data, message.height, message.width, message.step, message.encoding),
         )
+
+    def on_camera_info(self, message: CameraInfo) -> None:
+        """Undo the distortion of the camera's lens; frames are taken as they are where its parameters are invalid."""
+        try:
+            self._lens = lens_of(message)
+        except InvalidInputError as error:
+            self.health.refuse(error)
+            self._lens = None
+        if self._session is not None:
+            self._session.set_lens(self._lens)
 
     def on_watch(self) -> None:
         """Report when no frame has come for too long."""

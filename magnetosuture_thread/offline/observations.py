@@ -17,6 +17,7 @@ from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import (
+    CAMERA_INFO,
     COMPRESSED_IMAGE,
     GROUND_TRUTH_THREAD,
     MEASURED_THREAD,
@@ -32,6 +33,7 @@ from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.lens import lens_of
 from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
 from magnetosuture_thread.vision.warm_up import warm_up
 
@@ -87,7 +89,9 @@ class ObservationReader(Iterator[Observation]):
         self._recording = recording
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
-        sources = (recording.camera,) if source == "camera" else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
+        sources = (
+            (recording.camera, CAMERA_INFO) if source == "camera" else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
+        )
         given = (GROUND_TRUTH_THREAD, *CHANGING, *sources)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
         records = recording.records(channels, start=start, duration=duration)
@@ -133,6 +137,8 @@ class ObservationReader(Iterator[Observation]):
             elif record.topic in _CHANGING:
                 self._follow(record)
                 waiting.append(record)
+            elif record.topic == CAMERA_INFO.recorded:
+                self._take_lens(record)
             else:
                 waiting.append(self._pose(record) if self.source == "poses" else self._frame(record))
             while waiting and (
@@ -155,6 +161,16 @@ class ObservationReader(Iterator[Observation]):
         except MagnetosutureError:
             return  # counted and reported where the model takes it
         self._scene = scene
+
+    def _take_lens(self, record: RecordedMessage) -> None:
+        """Undo the distortion of a recorded lens from here on, as `vision_tracker` does."""
+        assert self._tracker is not None
+        try:
+            lens = lens_of(record.decode())
+        except MagnetosutureError as error:
+            self.refused[f"{record.topic}: {error}"] += 1
+            lens = None
+        self._tracker.set_lens(lens)
 
     def _next(self, head: Observation | RecordedMessage, parts: dict[str, dict[int, Any]]) -> Iterator[Observation]:
         if isinstance(head, RecordedMessage):

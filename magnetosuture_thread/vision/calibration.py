@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +18,12 @@ from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, the camera is not overhead
+MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, they are not where they should be
+STRAIGHT_RATIO = (
+    2.0  # of the residuals of a similarity and a homography; beyond, and beyond `STRAIGHT_PX`, it is tilted
+)
+STRAIGHT_PX = 0.3
+MAX_TILT = math.radians(35.0)
 MAX_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
 CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))  # of a square, clockwise as seen from the top left
 SHARE_WITH_DISH = 0.5  # of the frames must show the dish
@@ -32,6 +39,7 @@ class Calibration:
         residual_px: root of the mean square of the markers' corners' errors; 0 without markers [px].
         scatter_px: root of the mean square by which the frames differ from one another [px].
         dish_diameter: inner diameter of the dish [m].
+        homography: from a tilted camera's frame to the one in which the view holds, shape (3, 3); None if straight.
     """
 
     view: DishView
@@ -39,14 +47,17 @@ class Calibration:
     residual_px: float
     scatter_px: float
     dish_diameter: float
+    homography: np.ndarray | None = None
 
     def to_yaml(self) -> str:
         """Return a section of a ROS 2 parameter file for the vision tracker."""
-        values = {
+        values: dict[str, Any] = {
             "dish_centre_px": [round(float(value), 3) for value in self.view.centre_px],
             "metres_per_pixel": float(f"{self.view.metres_per_pixel:.7g}"),
             "camera_rotation": round(float(self.view.rotation), 6),
         }
+        if self.homography is not None:
+            values["straightening"] = [float(f"{value:.12g}") for value in self.homography.ravel()]
         key = f"{EVERY_NODE}/{VisionTrackerSettings.GROUP}"
         return yaml.safe_dump({key: {"ros__parameters": values}}, sort_keys=False)
 
@@ -77,13 +88,15 @@ def calibrate_by_dish(images: Sequence[np.ndarray], dish_diameter: float) -> Cal
 def calibrate_by_markers(
     images: Sequence[np.ndarray], dish_diameter: float, spacing: float, side: float
 ) -> Calibration:
-    """Fit a similarity to four ArUco markers (4x4_50, ids 0 to 3) around the dish.
+    """Fit a similarity, or of a tilted camera a homography, to four ArUco markers (4x4_50, ids 0 to 3) around the dish.
 
     Their centres are the corners of a square around the dish's centre: id 0 at the top left in the dish
     frame (x < 0, y > 0), then clockwise; all upright, their tops towards positive y. Least squares over
     their 16 corners p in the dish frame and w in pixels:
 
         u = u_0 + a x - b y,    v = v_0 - b x - a y,    a = cos(r) / s,    b = sin(r) / s
+
+    A tilted camera sees (u, v, 1) ~ H (x, y, 1). Centre, scale and rotation are then those of H at the dish's centre.
 
     Args:
         images: of one size, BGR or grey, uint8.
@@ -114,10 +127,14 @@ def calibrate_by_markers(
     square = np.array(CORNERS, dtype=float)
     points = np.vstack([0.5 * spacing * centre + 0.5 * side * square for centre in square])
     view, residual = _similarity(points, pixels)
+    homography = None
+    tilted = _homography(points, pixels) if residual > STRAIGHT_PX else None
+    if tilted is not None and tilted[2] < residual / STRAIGHT_RATIO:
+        view, homography, residual = tilted
     if residual > MAX_RESIDUAL_PX:
-        expected = f"at most {MAX_RESIDUAL_PX} px, from a camera straight above markers at these distances"
+        expected = f"at most {MAX_RESIDUAL_PX} px, from a camera above markers at these distances"
         raise InvalidInputError("frames", f"marker corners off by {residual:.2f} px", expected)
-    return Calibration(view, len(grays), residual, scatter, dish_diameter)
+    return Calibration(view, len(grays), residual, scatter, dish_diameter, homography)
 
 
 def _check_scatter(what: str, scatter_px: float) -> None:
@@ -146,6 +163,31 @@ def _similarity(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, float
     u, v, a, b = (float(value) for value in values)
     view = DishView((u, v), 1.0 / float(np.hypot(a, b)), float(np.arctan2(b, a)))
     return view, float(np.sqrt(np.mean(np.sum((view.to_pixels(points) - pixels) ** 2, axis=1))))
+
+
+def _homography(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, np.ndarray, float] | None:
+    """Return the view at the dish's centre, what straightens a frame, and the root of the mean square error [px].
+
+    None where the camera would be tilted by more than `MAX_TILT`, by the ratio of the scales at the centre.
+    """
+    seen, _ = cv2.findHomography(points / np.abs(points).max(), pixels)
+    if seen is None or abs(seen[2, 2]) < 1e-9:
+        return None
+    seen = seen @ np.diag([1.0 / np.abs(points).max(), 1.0 / np.abs(points).max(), 1.0])
+    centre = seen[:2, 2] / seen[2, 2]
+    slope = (seen[:2, :2] - np.outer(centre, seen[2, :2])) / seen[2, 2]
+    u, scales, v = np.linalg.svd(slope * ((1.0,), (-1.0,)))  # image v goes down
+    turn = u @ v
+    if np.linalg.det(turn) < 0.0 or scales[1] < math.cos(MAX_TILT) * scales[0]:
+        return None
+    rotation = math.atan2(turn[1, 0], turn[0, 0])
+    view = DishView((float(centre[0]), float(centre[1])), 1.0 / math.sqrt(scales[0] * scales[1]), rotation)
+    a, b = math.cos(rotation) / view.metres_per_pixel, math.sin(rotation) / view.metres_per_pixel
+    straight = np.array([[a, -b, centre[0]], [-b, -a, centre[1]], [0.0, 0.0, 1.0]])
+    found = np.column_stack([points, np.ones(len(points))]) @ seen.T
+    residual = float(np.sqrt(np.mean(np.sum((found[:, :2] / found[:, 2:] - pixels) ** 2, axis=1))))
+    homography = straight @ np.linalg.inv(seen)
+    return view, homography / homography[2, 2], residual
 
 
 def _grays(images: Sequence[np.ndarray]) -> list[np.ndarray]:

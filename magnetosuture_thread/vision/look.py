@@ -101,6 +101,7 @@ class FoundDish:
         scale_error: standard deviation of the view's scale, as a share; 0 where the scale is given.
         unseen_tilt: angle of a tilt that the rim would not tell [rad].
         remark: what a user should know of the view; empty if nothing.
+        homography: from the frame to the one in which the view holds, shape (3, 3); None where they are the same.
     """
 
     view: DishView
@@ -109,6 +110,7 @@ class FoundDish:
     scale_error: float = 0.0
     unseen_tilt: float = 0.0
     remark: str = ""
+    homography: np.ndarray | None = None
 
     def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
         """Return what the view leaves unknown of a tail and a heading in a dish, shape (3, 3) [m, m, rad]."""
@@ -129,6 +131,9 @@ class FoundDish:
         """Return a frame with a bright floor and a round dish."""
         if self.dark_field:
             image = 255 - image
+        if self.homography is not None:
+            size = image.shape[1::-1]
+            return np.asarray(cv2.warpPerspective(image, self.homography, size, borderMode=cv2.BORDER_REPLICATE))
         return image if self.tilt is None else self.tilt.corrected(image, self.view)
 
 
@@ -145,7 +150,8 @@ def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float
     if fixed is not None:
         # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
         dark = middle(gray[::8, ::8]) < DARK_FLOOR and _found_view(gray, settings, diameter) is None
-        return FoundDish(fixed, dark and _found_view(255 - gray, settings, diameter) is not None)
+        dark = dark and _found_view(255 - gray, settings, diameter) is not None
+        return FoundDish(fixed, dark, homography=settings.homography())
     for dark_field in (False, True):
         if dark_field:
             gray = 255 - gray

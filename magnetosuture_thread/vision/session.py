@@ -9,6 +9,7 @@ import numpy as np
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.scene.scene import Scene
+from magnetosuture_thread.vision.lens import Lens
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -64,6 +65,10 @@ class TrackerSession:
     def set_scene(self, scene: Scene) -> None:
         """Take another scene; see `VisionTracker.set_scene`."""
         self._tracker.set_scene(scene)
+
+    def set_lens(self, lens: Lens | None) -> None:
+        """Take the camera's lens; see `VisionTracker.set_lens`."""
+        self._tracker.set_lens(lens)
 
     def on_image(self, time_s: float, image: np.ndarray) -> FrameMeasurement:
         """Look at the next frame, taken at a time [s]; see `VisionTracker.track`."""

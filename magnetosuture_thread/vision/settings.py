@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
+
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.camera import DishView
@@ -47,6 +49,13 @@ class VisionTrackerSettings(Configuration):
         minimum=-math.pi,
         maximum=math.pi,
     )
+    straightening: tuple[float, ...] = quantity(
+        (),
+        "homography, nine numbers by rows, from a tilted camera's frame to the one in which the view holds",
+        minimum=-1e9,
+        maximum=1e9,
+        multiple=9,
+    )
     max_needle_speed: float = quantity(
         0.05, "maximum speed of the needle; what is faster is not it", unit="m/s", minimum=1e-4, maximum=1.0
     )
@@ -65,9 +74,19 @@ class VisionTrackerSettings(Configuration):
         if len(self.dish_centre_px) > 2:
             name = f"{self.GROUP}.dish_centre_px"
             raise ConfigurationError(name, self.dish_centre_px, "u and v [px], or no entries to find the dish")
+        if self.straightening:
+            name, matrix = f"{self.GROUP}.straightening", self.homography()
+            if len(self.straightening) > 9 or matrix is None or abs(np.linalg.det(matrix)) < 1e-12:
+                raise ConfigurationError(name, self.straightening, "a homography by calibrate-camera, or no entries")
+            if self.fixed_view() is None:
+                raise ConfigurationError(name, self.straightening, "dish_centre_px and metres_per_pixel beside it")
         if 0.0 < self.metres_per_pixel < MIN_SCALE:
             name = f"{self.GROUP}.metres_per_pixel"
             raise ConfigurationError(name, self.metres_per_pixel, f"at least {MIN_SCALE:g} m, or 0 to find it")
+
+    def homography(self) -> np.ndarray | None:
+        """Return the homography that straightens a frame, shape (3, 3); None if none is given."""
+        return np.array(self.straightening[:9]).reshape(3, 3) if len(self.straightening) >= 9 else None
 
     def fixed_view(self) -> DishView | None:
         """Return the view if all of it is given; None if the dish must be found."""
@@ -92,4 +111,15 @@ class VisionTrackerSettings(Configuration):
             return self
         shift = 0.5 * (factor - 1.0)
         centre = tuple(max(0.0, (value - shift) / factor) for value in self.dish_centre_px)  # the frame's corner is 0
-        return replace(self, dish_centre_px=centre, metres_per_pixel=self.metres_per_pixel * factor)
+        matrix = self.homography()
+        if matrix is not None:
+            small = np.array(
+                [[1.0 / factor, 0.0, -shift / factor], [0.0, 1.0 / factor, -shift / factor], [0.0, 0.0, 1.0]]
+            )
+            matrix = small @ matrix @ np.linalg.inv(small)
+        return replace(
+            self,
+            dish_centre_px=centre,
+            metres_per_pixel=self.metres_per_pixel * factor,
+            straightening=tuple(float(value) for value in matrix.ravel()) if matrix is not None else (),
+        )

@@ -17,6 +17,7 @@ from magnetosuture_thread.vision.images import (
     check_image,
     shrunk,
 )
+from magnetosuture_thread.vision.lens import Lens
 from magnetosuture_thread.vision.look import (
     State,
     Track,
@@ -78,6 +79,7 @@ class VisionTracker:
         self._settings = settings  # in shrunk frames
         self._scene = scene
         self._dish = DishWatch(settings, scene.dish.diameter)
+        self._lens: Lens | None = None
         self._masks: dict[tuple[DishView, tuple[int, ...]], SceneMask | None] = {}
         self._shape: tuple[int, ...] = ()
         self.reset()
@@ -89,6 +91,33 @@ class VisionTracker:
         self._masks.clear()
         if other_dish:
             self._rescale()
+
+    def set_lens(self, lens: Lens | None) -> None:
+        """Take the camera's lens, whose distortion is undone in every frame of its size; None if it is not known.
+
+        The view is in the pixels of the frame without distortion. Another lens begins anew.
+        """
+        if lens is self._lens or (lens is not None and lens.same_as(self._lens)):
+            return
+        straight = all(each is None or each.is_straight for each in (lens, self._lens))
+        self._lens = lens
+        if not straight:
+            self._masks.clear()
+            self._rescale()
+
+    def _straight(self, image: np.ndarray, factor: int) -> np.ndarray:
+        """Return a frame shrunk, and without the lens's distortion."""
+        small = shrunk(image, factor)
+        if self._lens is None or self._lens.problem_with(image.shape) is not None:
+            return small
+        return self._lens.undistorted(small, factor)
+
+    def _with_doubt(self, track: Track, image: np.ndarray) -> Track:
+        """Return a track with a warning if the lens is not that of the frame."""
+        problem = self._lens.problem_with(image.shape) if self._lens is not None else None
+        if problem is None:
+            return track
+        return replace(track, warning="; ".join(filter(None, (track.warning, f"{problem}; it is not used"))))
 
     def _rescale(self) -> None:
         """Choose the size that frames are looked at in, and begin anew."""
@@ -123,8 +152,9 @@ class VisionTracker:
         """
         check_image(image)
         factor = self._given.working_factor(image.shape, self._scene.dish.diameter)
-        small, settings = shrunk(image, factor), self._given.shrunk(factor)
-        return _enlarged(look_once(small, settings, self._scene, lambda view: self._mask_for(small, view)), factor)
+        small, settings = self._straight(image, factor), self._given.shrunk(factor)
+        found = look_once(small, settings, self._scene, lambda view: self._mask_for(small, view))
+        return self._with_doubt(_enlarged(found, factor), image)
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame.
@@ -145,8 +175,9 @@ class VisionTracker:
         if image.shape[:2] != self._shape:
             self._shape = image.shape[:2]
             self._rescale()
-        found = self._track(shrunk(image, self._factor), time_s)
-        return replace(_enlarged(found, self._factor), needle_length=self._length.length)
+        found = self._track(self._straight(image, self._factor), time_s)
+        found = self._with_doubt(_enlarged(found, self._factor), image)
+        return replace(found, needle_length=self._length.length)
 
     def _track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame, shrunk."""

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import TrackerState
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
@@ -198,3 +199,22 @@ def test_a_frame_with_an_impossible_stamp_is_refused(graph, camera, thread_arc):
         return any(value.key == "last refusal" and "nanosec" in value.value for value in values)
 
     graph.wait(is_reported, "the refusal")
+
+
+def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_not_used(graph):
+    case, image = frame_of("distortion", 2, 31)
+    lens = case.lens
+    assert lens is not None
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
+    message = CameraInfo(width=lens.size[0], height=lens.size[1], distortion_model=lens.model)
+    message.k, message.d = lens.matrix.ravel().tolist(), lens.coefficients.tolist()
+
+    graph.publish(topics.CAMERA_INFO, message)
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
+    graph.wait(lambda: bool(poses), "a pose")
+    position = poses[-1].pose.pose.position
+    assert np.hypot(*(np.array([position.x, position.y]) - case.needle.tail)) < 0.6 * 8e-5
+    message.d = [float("nan")] * 5
+    graph.publish(topics.CAMERA_INFO, message)
+    graph.wait(lambda: any("camera_info.d" in state for state in states(diagnostics)), "a refusal")

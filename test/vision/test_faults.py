@@ -8,6 +8,7 @@ import pytest
 
 from magnetosuture_thread.rig.camera.dish_camera import Cover
 from magnetosuture_thread.vision.dish import find as dish
+from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, Pose, blob, finger, random_pose, random_thread, render
@@ -145,3 +146,75 @@ class TestGuards:
         assert dish.find_dish(bright, 0.035) is None
         monkeypatch.setattr(dish, "SATURATED_SHARE", 2.0)
         assert dish.find_dish(bright, 0.035) is not None
+
+
+def something_else(kind: str, size: tuple[int, int] = (640, 480)) -> np.ndarray:
+    """Return a picture in which there is no dish."""
+    random, (width, rows) = np.random.default_rng(3), size
+    if kind == "noise":
+        return random.integers(0, 255, (rows, width, 3)).astype(np.uint8)
+    picture = np.full((rows, width, 3), {"black": 0, "white": 255}.get(kind, 190), np.uint8)
+    if kind == "text":
+        for row in range(20, rows, 19):
+            cv2.putText(picture, "the quick brown fox jumps over it", (5, row), 0, 0.9, (20, 20, 20), 2)
+    if kind == "face":
+        cv2.ellipse(picture, (width // 2, rows // 2), (130, 180), 0, 0, 360, (140, 165, 215), -1)
+        for at in (-50, 50):
+            cv2.circle(picture, (width // 2 + at, rows // 2 - 40), 20, (250, 250, 250), -1)
+    return picture
+
+
+@pytest.mark.parametrize("kind", ["black", "white", "noise", "text", "face"])
+def test_a_video_of_something_else_is_lost_with_its_reason_and_the_needle_is_back_with_the_dish(kind: str):
+    pose = Pose(np.array([0.003, -0.002]), 0.4)
+    frame, other = render(pose, random_thread(np.random.default_rng(1), pose)), something_else(kind)
+    assert VisionTracker(VisionTrackerSettings(), SCENE).look(other).reason == "no dish in the image"
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
+    states = [tracker.track(frame, 0.02 * index).state for index in range(4)]
+    assert states[-1] is State.TRACKED
+    for index in range(4, 12):
+        seen = tracker.track(other, 0.02 * index)
+        assert (seen.state, seen.reason) == (State.LOST, "too little of the dish is seen")
+    back = tracker.track(frame, 0.24)
+    assert back.state is State.TRACKED
+    assert pose.is_right(back)
+
+
+def test_half_a_dish_gives_no_wrong_pose_and_the_whole_one_is_tracked_at_once():
+    pose = Pose(np.array([0.003, -0.002]), 0.4)
+    frame = render(pose, random_thread(np.random.default_rng(1), pose))
+    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
+    assert tracker.track(frame, 0.0).state is State.TRACKED
+    half = frame.copy()
+    half[:, 300:] = 40  # a sheet
+    for index in range(1, 5):
+        seen = tracker.track(half, 0.02 * index)
+        assert seen.state is not State.TRACKED or pose.is_right(seen)
+    assert tracker.track(frame, 0.1).state is State.TRACKED
+
+
+def test_frames_that_change_size_begin_anew_each_time():
+    pose = Pose(np.array([0.003, -0.002]), 0.4)
+    frame = render(pose)
+    large = cv2.resize(frame, (1280, 960), interpolation=cv2.INTER_CUBIC)
+    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=2), SCENE)
+    for index, image in enumerate((frame, large, frame, large)):
+        tracker.track(image, 0.04 * index)
+        seen = tracker.track(image, 0.04 * index + 0.02)
+        assert seen.state is State.TRACKED
+        assert pose.is_right(seen)
+
+
+def test_a_bumped_camera_is_tracked_again_once_its_view_and_the_needle_agree_in_three_frames_each():
+    pose = Pose(np.array([0.003, -0.002]), 0.4)
+    frame = render(pose)
+    moved = cv2.warpAffine(
+        frame, np.array([[1.0, 0.0, 9.0], [0.0, 1.0, -6.0]]), (640, 480), borderMode=cv2.BORDER_REPLICATE
+    )
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
+    for index in range(4):
+        tracker.track(frame, 0.02 * index)
+    seen = [tracker.track(moved, 0.1 + 0.02 * index) for index in range(5)]
+    assert [each.reason for each in seen[:2]] == ["the dish is not where it was"] * 2
+    assert seen[4].state is State.TRACKED
+    assert pose.is_right(seen[4])

@@ -179,7 +179,12 @@ def calibrate_camera(
     for doubt in source.doubts:
         log(f"{paths[0]} {doubt}")
     every = -(-source.count // MAX_FRAMES)
-    images = [np.asarray(f.image) for i, f in enumerate(source) if i % every == 0 and f.image is not None]
+    images = []
+    for index, frame in enumerate(source):
+        if index % every or frame.image is None:
+            continue
+        lens = source.lens if source.lens is not None and source.lens.problem_with(frame.image.shape) is None else None
+        images.append(np.asarray(frame.image) if lens is None else lens.undistorted(frame.image))
     for line in source.refused:
         log(line)
     if not images:

@@ -69,6 +69,8 @@ def add(subparsers: Subparsers) -> None:
     option("--metres-per-pixel", type=number_argument(1e-7, 1e-2), metavar="S", help=scale)
     centre = "the dish's centre [px] (default: the setup's, or found)"
     option("--centre", type=number_argument(0.0, 1e5), nargs=2, metavar=("U", "V"), help=centre)
+    lens = "the lens, as ROS's camera_calibration_parsers writes it (YAML; default: a bag's camera_info)"
+    option("--camera-info", type=Path, metavar="FILE", help=lens)
     option("--json", type=output_file, metavar="FILE", help="write what was found to a file")
     overlay = "draw it over the frames: a video (.mp4, .avi), or a folder of PNG"
     option("--overlay", type=Path, metavar="PATH", help=overlay)
@@ -174,12 +176,14 @@ def run_track(options: argparse.Namespace) -> int:
     from magnetosuture_thread import read_scene
     from magnetosuture_thread.jobs.track import settings_with, track
     from magnetosuture_thread.setups import read_setup
+    from magnetosuture_thread.vision.lens import read_lens
 
     console = make_console()
     log = make_log(console)
     setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
     settings = settings_with(setup.vision, options.metres_per_pixel, options.centre)
-    given = {"overlay": options.overlay, "remap": dict(options.remap), "log": log}
+    lens = read_lens(options.camera_info) if options.camera_info is not None else None
+    given = {"overlay": options.overlay, "remap": dict(options.remap), "lens": lens, "log": log}
     with progress(console, "track") as advance:
         frames = track(options.frames, settings, setup.scene, progress=advance, **given)
     rows = [frame.to_json() for frame in frames]

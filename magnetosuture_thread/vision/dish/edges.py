@@ -11,7 +11,7 @@ from magnetosuture_thread.vision.sampling import within
 
 
 @compiled
-def thinned(along_u, along_v, strength, minimum, edges):
+def thin_edges(along_u, along_v, strength, minimum, edges):
     """Fill in the points whose gradient is greatest along its own direction.
 
     Args:
@@ -47,7 +47,7 @@ def vote(edges, smallest, largest, origin, cell, votes):
     """Let each edge vote for the centres of the circles that it may be of: both ways along its gradient.
 
     Args:
-        edges: see `thinned`.
+        edges: see `thin_edges`.
         smallest: radius [px].
         largest: radius [px].
         origin: u and v of the first cell's corner [px].
@@ -71,7 +71,7 @@ def ring_support(edges, centre, smallest, ratio, alignment, directions):
     """Mark in which directions from a centre, and in which rings of radii, there are edges that face it.
 
     Args:
-        edges: see `thinned`.
+        edges: see `thin_edges`.
         centre: u and v [px].
         smallest: radius of the first ring [px].
         ratio: of a ring's outer radius to its inner one.

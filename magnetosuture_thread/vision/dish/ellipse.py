@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from magnetosuture_thread.vision.dish.edges import fit_harmonics, ring_support, steepest, thinned, vote
+from magnetosuture_thread.vision.dish.edges import fit_harmonics, ring_support, steepest, thin_edges, vote
 from magnetosuture_thread.vision.images import measured_channel
 
 COARSE_SIDE = 160  # rows or columns, whichever are fewer, of the image in which ellipses are looked for
@@ -27,7 +27,7 @@ BAND = 0.14  # of the radius, in which edges may be of the same ellipse
 AGREEMENT = 0.012  # of the radius, within which an edge agrees with an ellipse
 TRIES = 200
 MIN_SUPPORT = 0.6  # of the directions in the frame
-MIN_SEEN = 0.5  # of the ellipse must lie in the frame
+MIN_VISIBLE = 0.5  # of the ellipse must lie in the frame
 GOOD_SUPPORT = 0.8  # that no other stretch is tried for
 MIN_RATIO = 0.8  # of the axes: a camera tilted by 37 degrees
 INNER_RADIUS = 0.82  # of the best supported ellipse, that the wall's inner edge has at least
@@ -126,10 +126,10 @@ def _edges(image: np.ndarray) -> np.ndarray:
         )
     edges = np.empty((image.shape[0] * image.shape[1] // 2, 4))
     low = MIN_GRADIENT
-    count = thinned(along_u, along_v, strength, low, edges)
+    count = thin_edges(along_u, along_v, strength, low, edges)
     while count > MAX_EDGES:  # The weak ones are texture.
         low *= 1.3
-        count = thinned(along_u, along_v, strength, low, edges)
+        count = thin_edges(along_u, along_v, strength, low, edges)
     return edges[:count].copy()
 
 
@@ -198,7 +198,7 @@ def _around(
         if ellipse is None:
             continue
         support_of, seen = _support(_unstretched(edges, back), shape, ellipse)
-        if seen < MIN_SEEN or support_of < _needed(seen):
+        if seen < MIN_VISIBLE or support_of < _needed(seen):
             continue
         score = support_of * math.sqrt(seen) * (ellipse.major / min(shape[:2])) ** 0.25
         found.append((score, replace(ellipse, support=support_of)))

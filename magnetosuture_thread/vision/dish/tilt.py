@@ -39,7 +39,9 @@ class Tilt:
         return np.array([math.cos(angle), math.sin(angle)])
 
     def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
-        """Return what perspective leaves unknown, shape (3, 3) [m, m, rad]: an ellipse does not tell which side is nearer.
+        """Return what perspective leaves unknown, shape (3, 3) [m, m, rad].
+
+        An ellipse does not tell which side is nearer.
 
         Args:
             tail: in the dish frame, shape (2,) [m].
