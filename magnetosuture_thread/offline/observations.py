@@ -90,7 +90,9 @@ class ObservationReader(Iterator[Observation]):
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
         sources = (
-            (recording.camera, CAMERA_INFO) if source == "camera" else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
+            (recording.camera, CAMERA_INFO)
+            if source == "camera"
+            else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
         )
         given = (GROUND_TRUTH_THREAD, *CHANGING, *sources)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]

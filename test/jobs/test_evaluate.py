@@ -22,7 +22,15 @@ from magnetosuture_thread.evaluation.frames import WorstFrame
 from magnetosuture_thread.evaluation.report.pictures import ReportPicture, draw_worst_frame
 from magnetosuture_thread.evaluation.tables import TIMES, Row
 from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
-from magnetosuture_thread.interface import CURRENTS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, SCENE, Channel
+from magnetosuture_thread.interface import (
+    CURRENTS,
+    MEASURED_THREAD,
+    NEEDLE_POSE,
+    PREDICTED_THREAD,
+    SCENE,
+    THREAD_OBSERVATION,
+    Channel,
+)
 from magnetosuture_thread.jobs import evaluate_bag as job
 from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
 from magnetosuture_thread.jobs.evaluate_bag import RecordedPredictions
@@ -241,7 +249,8 @@ def test_broken_currents_cost_no_figure(tmp_path: Path, short_bag: Path):
 
 def test_why_nothing_was_predicted_is_said(tmp_path: Path, short_bag: Path):
     replay_offline(short_bag, tmp_path / "replay")
-    bag = copied(tmp_path / "replay" / "bag", tmp_path / "b", [], leave=MEASURED_THREAD.recorded)
+    half = copied(tmp_path / "replay" / "bag", tmp_path / "a", [], leave=MEASURED_THREAD.recorded)
+    bag = copied(half, tmp_path / "b", [], leave=THREAD_OBSERVATION.recorded)
     (row,) = evaluate_bags([bag], tmp_path / "out", source="poses")
     assert str(row["problem"]).endswith("had a needle; waiting for the thread to be seen")
 

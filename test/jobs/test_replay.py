@@ -30,7 +30,15 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.interface import IMAGE, MARGINS, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD, Channel
+from magnetosuture_thread.interface import (
+    IMAGE,
+    MARGINS,
+    MEASURED_THREAD,
+    NEEDLE_POSE,
+    PREDICTED_THREAD,
+    THREAD_OBSERVATION,
+    Channel,
+)
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay import replay_live
 from magnetosuture_thread.jobs.replay_offline import replay_offline
@@ -111,7 +119,7 @@ def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
 def agree(live: Path, offline: Path, predictions: int) -> None:
     """Check that both replays made the same of a bag, to the last bit; but for the times that steps took."""
     made = [content(live), content(offline)]
-    for channel in (NEEDLE_POSE, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
+    for channel in (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION, PREDICTED_THREAD, MARGINS):
         ours, theirs = ({key: what for key, what in each.items() if key[0] == channel} for each in made)
         assert ours == theirs
     assert sum(key[0] == PREDICTED_THREAD for key in made[0]) == predictions
@@ -121,7 +129,7 @@ def content(output: Path) -> dict[tuple[Channel, int], bytes]:
     """Return what a replay said of each stamp, without times and without what waited for the thread to be seen."""
     bag, store = Bag(output / "bag"), typestore()
     found = {}
-    for channel in (NEEDLE_POSE, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
+    for channel in (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION, PREDICTED_THREAD, MARGINS):
         for each in bag.records({channel.recorded}):
             message = each.decode()
             if channel == PREDICTED_THREAD:

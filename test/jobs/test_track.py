@@ -32,7 +32,7 @@ from test.bags.bags import copy_with_notes
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
 KEYS = {
     *("file", "status", "reason", "warning", "tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m"),
-    *("needle_length_m", "confidence", "time_s", "stamp_s"),
+    *("needle_length_m", "pieces", "complete", "confidence", "time_s", "stamp_s"),
 }
 
 

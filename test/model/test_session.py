@@ -18,6 +18,7 @@ from magnetosuture_thread.model.predictor import NeedlePose, Prediction
 from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.worlds import polygon, scene_with
 
 EAST = np.array([1.0, 0.0])
@@ -515,3 +516,44 @@ print(kernels() - before)
 """
     found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
     assert found.stdout.strip() == "0"
+
+
+def observed(*, complete: bool, first: PieceEnd = PieceEnd.TAIL) -> ThreadObservation:
+    """Return an observation of one piece, half of the thread unless it is complete."""
+    points = seen() if complete else seen()[: len(seen()) // 2]
+    last = PieceEnd.FREE if complete else PieceEnd.COVERED
+    piece = ThreadPiece(points, np.full(len(points), 1e-5), first, last, (0.0, 0.0))
+    return ThreadObservation((piece,), complete)
+
+
+def test_the_model_starts_from_all_of_the_thread_at_once():
+    session = ThreadSession(made(), None)
+    go(session, 1.0)
+    (outcome,) = session.on_observation(SECOND, observed(complete=True))
+    assert predicted(outcome).status == "started"
+
+
+def test_the_model_waits_for_the_rest_of_the_thread_before_it_starts_from_a_part():
+    session = ThreadSession(made(), None)
+    for k in range(10):
+        assert go(session, 1.0 + 0.1 * k).waiting
+        assert not list(session.on_observation(SECOND + k * SECOND // 10, observed(complete=False)))
+    go(session, 2.0)
+    (outcome,) = session.on_observation(2 * SECOND, observed(complete=False))
+    assert predicted(outcome).status == "started"
+    assert len(predicted(outcome).positions) == made().segments + 1  # all of it, the rest straight
+
+
+def test_the_model_starts_as_soon_as_a_part_has_become_all():
+    session = ThreadSession(made(), None)
+    assert not list(session.on_observation(SECOND, observed(complete=False)))
+    go(session, 1.1)
+    assert len(list(session.on_observation(SECOND + SECOND // 10, observed(complete=True)))) == 1
+
+
+def test_the_model_does_not_start_from_a_piece_that_is_not_at_the_needle():
+    session = ThreadSession(made(), None)
+    for stamp in (SECOND, 3 * SECOND):
+        go(session, stamp / SECOND)
+        assert not list(session.on_observation(stamp, observed(complete=False, first=PieceEnd.COVERED)))
+        assert not list(session.on_observation(stamp, ThreadObservation()))

@@ -169,6 +169,7 @@ def test_the_bags_and_the_graph_have_the_same_own_messages():
         topics.BRIDGE_STATE,
         topics.FILTER_STATE,
         topics.TRACKER_STATE,
+        topics.THREAD_OBSERVATION,
         *topics.SETTINGS,
     ):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_markers, packed_path, packed_pose
+from magnetosuture_thread.messages.packing import packed_markers, packed_observation, packed_path, packed_pose
 from magnetosuture_thread.model.margins import (
     UNKNOWN,
     BarrierMargins,
@@ -24,6 +26,7 @@ from magnetosuture_thread.model.margins import (
 )
 from magnetosuture_thread.model.predictor import Prediction
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 WHEN, STAMP = (12, 345), Time(sec=12, nanosec=345)
 
@@ -51,6 +54,88 @@ def test_a_path_is_packed_as_rclpy_makes_it(count: int):
     expected = MESSAGES.path_message(STAMP, points)
     data = packed_path(WHEN, points)
     same(data, expected)
+
+
+def observation(*counts: int, outlines: int = 2) -> ThreadObservation:
+    """Return an observation of pieces with so many points."""
+    random = np.random.default_rng(sum(counts))
+    pieces = tuple(
+        ThreadPiece(
+            random.normal(size=(count, 2)),
+            random.uniform(1e-6, 1e-4, count),
+            PieceEnd.COVERED,
+            PieceEnd.UNKNOWN,
+            (0.001, 0.002) if number % 2 else (math.nan, math.nan),
+            direction_known=bool(number % 2),
+            confidence=0.5,
+        )
+        for number, count in enumerate(counts)
+    )
+    return ThreadObservation(pieces, hidden=tuple(random.normal(size=(3 + k, 2)) for k in range(outlines)))
+
+
+@pytest.mark.parametrize("counts", [(), (2,), (3, 64), (5, 2, 7)])
+@pytest.mark.parametrize("outlines", [0, 1, 2])
+def test_an_observation_is_packed_as_rclpy_makes_it_and_read_as_it_was(counts: tuple[int, ...], outlines: int):
+    given = observation(*counts, outlines=outlines)
+    expected, data = MESSAGES.observation_message(STAMP, given), packed_observation(WHEN, given)
+    assert len(data) == len(serialize_message(expected))
+    read = reading.thread_observation(deserialize_message(data, type(expected)))
+    for found in (read, reading.thread_observation(expected)):
+        assert len(found.pieces) == len(given.pieces)
+        for one, other in zip(found.pieces, given.pieces, strict=True):
+            np.testing.assert_array_equal(one.points, other.points)
+            np.testing.assert_array_equal(one.deviation, other.deviation)
+            np.testing.assert_array_equal(one.arc_length, other.arc_length)
+            assert (one.first_end, one.last_end) == (other.first_end, other.last_end)
+            assert (one.direction_known, one.confidence) == (other.direction_known, other.confidence)
+        for outline, shape in zip(found.hidden, given.hidden, strict=True):
+            np.testing.assert_array_equal(outline, shape)
+
+
+def _broken(message: Any, name: str) -> None:
+    """Make a message one that is refused."""
+    piece = message.pieces[0]
+    if name == "few points":
+        piece.points = piece.points[:1]
+    elif name == "other deviations":
+        piece.deviation = piece.deviation[:-1]
+    elif name == "a point that is none":
+        piece.points[1].x = math.nan
+    elif name == "a negative deviation":
+        piece.deviation[0] = -1.0
+    elif name == "an end that is none":
+        piece.last_end = 9
+    elif name == "an interval out of order":
+        piece.arc_length_min, piece.arc_length_max = 0.003, 0.002
+    elif name == "half an interval":
+        piece.arc_length_min, piece.arc_length_max = 0.003, math.nan
+    elif name == "no confidence":
+        piece.confidence = math.nan
+    elif name == "complete in two pieces":
+        message.complete = True
+    elif name == "too many pieces":
+        message.pieces = [piece] * (reading.MAX_PIECES + 1)
+    elif name == "an outline that is none":
+        message.hidden[0].corners = message.hidden[0].corners[:2]
+    else:
+        message.header.frame_id = "camera"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("few points", "other deviations", "a point that is none", "a negative deviation", "an end that is none"),
+        *("an interval out of order", "half an interval", "no confidence", "complete in two pieces"),
+        *("too many pieces", "an outline that is none", "another frame"),
+    ],
+)
+def test_an_observation_that_is_not_valid_is_refused(name: str):
+    message = MESSAGES.observation_message(STAMP, observation(4, 5))
+    reading.thread_observation(message)
+    _broken(message, name)
+    with pytest.raises(InvalidInputError, match="thread/observation"):
+        reading.thread_observation(message)
 
 
 def marker(number: int, kind: int, scale: Vector3, friction: Friction, points: np.ndarray) -> Marker:

@@ -22,6 +22,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.examples import FOLDER
 from test.model.worlds import polygon, scene_with
 
@@ -138,6 +139,28 @@ def test_poses_that_come_before_the_centreline_of_their_frame_are_not_lost(graph
     graph.publish(topics.MEASURED_THREAD, seen(1.1))  # the first frame's centreline was lost
     graph.wait(lambda: len(predicted) == 3, "three predictions")
     assert [p.header.stamp for p in predicted] == [pose(1.0 + 0.1 * k).header.stamp for k in (1, 2, 3)]
+
+
+def test_half_of_a_thread_is_not_started_from_where_observations_come(graph):
+    graph.add(ThreadModelNode)
+    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+    whole = np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)])
+
+    def observed(seconds: float, count: int, last: PieceEnd) -> ThreadObservation:
+        piece = ThreadPiece(whole[:count], np.full(count, 1e-5), PieceEnd.TAIL, last, (0.0, 0.0))
+        seen_now = ThreadObservation((piece,), complete=last is PieceEnd.FREE)
+        return MESSAGES.observation_message(stamp(seconds), seen_now)
+
+    graph.publish(topics.THREAD_OBSERVATION, observed(1.0, 30, PieceEnd.COVERED))
+    graph.publish(topics.NEEDLE_POSE, pose(1.0))
+    graph.wait(lambda: len(margins) == 1, "that it waits")
+    graph.publish(topics.MEASURED_THREAD, seen(1.1))  # for viewers
+    graph.publish(topics.NEEDLE_POSE, pose(1.1))
+    graph.wait(lambda: len(margins) == 2, "that it still waits")
+    assert not predicted
+    graph.publish(topics.THREAD_OBSERVATION, observed(1.2, 60, PieceEnd.FREE))
+    graph.publish(topics.NEEDLE_POSE, pose(1.2))
+    graph.wait(lambda: len(predicted) == 1, "the start")
 
 
 def test_it_can_start_straight_without_a_camera(graph):

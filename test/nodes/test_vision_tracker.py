@@ -7,15 +7,18 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import TrackerState
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from benchmarks.vision.measurements import frame_of
+from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import Dish, Scene
+from magnetosuture_thread.thread_observation import PieceEnd
 from magnetosuture_thread.vision.look import UNKNOWN_HEADING
 from test.nodes.scenes import scene_told
 from test.vision.scenes import Pose, render
@@ -56,6 +59,34 @@ def test_a_frame_becomes_a_pose_and_a_centreline_with_its_stamp(graph, camera, t
     assert 1e-12 < covariance[0, 0] < 1e-8
     assert 1e-8 < covariance[5, 5] < 1e-3
     assert covariance[2, 2] == 0.0
+
+
+def test_a_tracked_frame_becomes_an_observation_of_all_of_the_thread(graph, camera, thread_arc):
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    observations, threads = graph.listen(topics.THREAD_OBSERVATION), graph.listen(topics.MEASURED_THREAD)
+    stamp = graph.now()
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), stamp))
+    graph.wait(lambda: bool(observations and threads), "observation and centreline")
+    assert observations[0].header.stamp == stamp
+    assert observations[0].header.frame_id == "dish"
+    read = reading.thread_observation(observations[0])
+    assert read.complete
+    (piece,) = read.pieces
+    assert (piece.first_end, piece.last_end) == (PieceEnd.TAIL, PieceEnd.FREE)
+    first = threads[0].poses[0].pose.position
+    np.testing.assert_allclose(piece.points[0], (first.x, first.y), atol=1e-9)
+    assert piece.length == pytest.approx(0.019, rel=0.03)
+
+
+def test_a_tracked_frame_without_a_thread_becomes_an_empty_observation(graph, camera):
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    observations, threads = graph.listen(topics.THREAD_OBSERVATION), graph.listen(topics.MEASURED_THREAD)
+    nowhere = np.array([[0.5, 0.5], [0.51, 0.5]])
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(camera.render(TAIL, 0.4, nowhere), graph.now()))
+    graph.wait(lambda: bool(observations), "an observation")
+    assert not observations[0].pieces
+    assert not observations[0].complete
+    assert not threads
 
 
 def test_every_frame_gets_a_state_and_a_pose_comes_once_three_agree(graph, camera, thread_arc):

@@ -71,10 +71,15 @@ def tangents_of(points: Points) -> Points:
 
 def sampled(image: NDArray[np.uint8] | NDArray[np.float32], points: Points) -> NDArray[np.float32]:
     """Return an image at points of shape (..., 2), bilinear; outside, at the nearest point of its border."""
+    return sampled_colours(image, points)[..., 0]
+
+
+def sampled_colours(image: NDArray[np.uint8] | NDArray[np.float32], points: Points) -> NDArray[np.float32]:
+    """Return each colour of an image at points of shape (..., 2), shape (..., colours); see `sampled`."""
     flat = np.ascontiguousarray(points.reshape(-1, 2), dtype=np.float32)
     u, v = flat[:, None, 0], flat[:, None, 1]
     values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float32).reshape(points.shape[:-1])
+    return np.asarray(values, dtype=np.float32).reshape(*points.shape[:-1], -1)
 
 
 def across(points: Points, aside: Values) -> Points:

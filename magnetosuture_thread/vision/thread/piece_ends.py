@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from magnetosuture_thread.thread_observation import PieceEnd
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
-from magnetosuture_thread.vision.thread.appearance import FAINTEST, Appearance, across, sampled
+from magnetosuture_thread.vision.thread.appearance import FAINTEST, Appearance, across, sampled, sampled_colours
 from magnetosuture_thread.vision.thread.hiding import Hiding
 from magnetosuture_thread.vision.thread.order import end_direction
 from magnetosuture_thread.vision.thread.strands import SPACING_PX, Strand, below_needle
 
 NEAR_PX = 7.0  # from an end up to which something hides the thread that goes on there
 AHEAD_PX, AHEAD = (3.0, 5.0, 7.0, 9.0, 11.0), math.radians(50.0)  # beyond an end, where floor must be seen
-BARE_STEP, BARE_CHANGE = 0.016, 0.06  # of the floor's light: off a straight line from beside an end to beyond; in all
+BARE_STEP, BARE_CHANGE = 0.025, 0.06  # of the floor's light: off a straight line from beside an end to beyond; in all
+BARE_COLOUR, FAR_RINGS = 0.03, 3  # of it, by which colours may change apart, on average over the farthest rings
 GOES_ON = 0.5  # of its strength, with which a thread would go on beyond an end
 SURE_STRENGTH = 2.0  # of the faintest that is seen, that a thread must have where it is seen to end
 
@@ -68,17 +69,15 @@ def is_bare_beyond(
         return False
     aside = thread.beside_px + np.array([0.5, 1.5, 2.5])
     beside = across(strand.points, np.concatenate([-aside, aside]))[-6:]
-    along = np.concatenate([SPACING_PX * np.arange(-5, 1), reach])
-    trend = np.vander(along, 2)
-    for layer in (picture.darkest, picture.brightest):
-        pixels = gray if layer is picture.darkest else layer.pixels
-        floor, beyond = np.median(sampled(pixels, beside), axis=1), sampled(pixels, ahead)
-        light = np.concatenate([floor, np.median(beyond, axis=1)]) / max(float(np.median(floor)), 1.0)
-        line = trend @ np.linalg.lstsq(trend, light, rcond=None)[0]
-        if np.abs(light - line).max() > BARE_STEP or np.abs(light - 1.0).max() > BARE_CHANGE:
-            return False
-        if layer is picture.darkest:
-            off = beyond[1:] - np.median(floor) if thread.pale else np.median(floor) - beyond[1:]
-            if float(off.max()) > max(GOES_ON * usual, FAINTEST + 3.0 * thread.noise):
-                return False
-    return True
+    floor, beyond = np.median(sampled(gray, beside)), sampled(gray, ahead)
+    off = beyond[1:] - floor if thread.pale else floor - beyond[1:]
+    if float(off.max()) > max(GOES_ON * usual, FAINTEST + 3.0 * thread.noise):
+        return False
+    colours = picture.colours if picture.colours is not None else picture.darkest.pixels
+    light = np.vstack([np.median(sampled_colours(colours, at), axis=1) for at in (beside, ahead)])
+    light /= np.maximum(np.median(light[: len(beside)], axis=0), 1.0)
+    along = np.vander(np.concatenate([SPACING_PX * np.arange(1 - len(beside), 1), reach]), 2)
+    mean = light.mean(axis=1)
+    step = np.abs(mean - along @ np.linalg.lstsq(along, mean, rcond=None)[0]).max()
+    even = step < BARE_STEP and np.abs(mean - 1.0).max() < BARE_CHANGE
+    return bool(even and np.ptp(light[-FAR_RINGS:].mean(axis=0)) < BARE_COLOUR)

@@ -1,0 +1,163 @@
+"""Pieces of a thread that something hides in part, in rendered frames."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.vision.frames import DISH_RADIUS
+from benchmarks.vision.measurements import Row, frame_of, measure, row_of
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.polyline import arc_lengths
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.thread_observation import PieceEnd
+from magnetosuture_thread.vision.images import Wall
+from magnetosuture_thread.vision.look import Track
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.thread.hiding import Hiding
+from magnetosuture_thread.vision.thread.order import Piece, find_order
+from magnetosuture_thread.vision.tracker import VisionTracker
+
+SEED = 4712
+FRAMES = 6
+SCENE = Scene(dish=Dish(2.0 * DISH_RADIUS))
+COVERS = ["cover_1.5mm", "cover_3mm", "cover_6mm", "cover_10mm", "two_covers", "hand_instrument"]
+SCALE = 8e-5
+
+
+@cache
+def row(name: str) -> Row:
+    """Return what the tracker makes of some frames of a class."""
+    return row_of(name, [measure(*frame_of(name, index, SEED)) for index in range(FRAMES)])
+
+
+def tracker_of(name: str, index: int) -> tuple[VisionTracker, np.ndarray, float]:
+    """Return a tracker for a frame, the frame, and the thread's length [m]."""
+    case, image = frame_of(name, index, SEED)
+    length = float(arc_lengths(case.thread)[-1])
+    return VisionTracker(VisionTrackerSettings(thread_length=length), SCENE), image, length
+
+
+def look(name: str, index: int) -> Track:
+    """Return what a tracker makes of a frame."""
+    tracker, image, _ = tracker_of(name, index)
+    return tracker.look(image)
+
+
+@pytest.mark.parametrize("name", COVERS)
+def test_the_thread_is_found_on_both_sides_of_what_covers_it(name: str):
+    assert row(name).pieces >= 0.9
+    assert (row(name).wrong_pieces or 0.0) < 0.01
+
+
+@pytest.mark.parametrize("name", [*COVERS, "cover_end", "cover_crossing", "glare_thread"])
+def test_no_piece_is_said_to_lie_where_it_does_not_and_no_part_is_taken_for_all(name: str):
+    assert (row(name).misplaced, row(name).incomplete, row(name).not_free) == (0, 0, 0)
+
+
+def test_a_thread_in_sight_is_complete():
+    assert (row("usual").complete, row("usual").incomplete) == (FRAMES, 0)
+
+
+def test_a_covered_end_is_neither_free_nor_is_the_thread_complete():
+    assert (row("cover_end").complete, row("cover_end").free) == (0, 0)
+    for index in range(FRAMES):
+        assert PieceEnd.COVERED in {piece.last_end for piece in look("cover_end", index).observation.pieces}
+
+
+@pytest.mark.parametrize("name", ["usual", "cover_6mm", "crossing_needle"])
+def test_standard_deviations_are_honest(name: str):
+    assert 0.6 < (row(name).normalised or 0.0) < 1.4
+
+
+def test_pieces_beyond_a_cover_are_joined_with_an_interval_of_arc_length():
+    joined = [look("two_covers", index).observation for index in range(FRAMES)]
+    placed = [[piece for piece in each.pieces if np.isfinite(piece.arc_length[0])] for each in joined]
+    assert sum(len(each) == 3 for each in placed) >= FRAMES - 2
+    for pieces in placed:
+        lows = [piece.arc_length[0] for piece in pieces]
+        assert lows == sorted(lows)
+        for piece in pieces:
+            assert piece.arc_length[0] <= piece.arc_length[1]
+            assert len(piece.deviation) == len(piece.points)
+
+
+def test_drawn_paths_are_no_pieces():
+    assert row("drawn_path").found >= FRAMES - 1
+    assert (row("drawn_path").wrong_pieces or 0.0) < 0.01
+
+
+def test_over_time_pieces_are_found_outside_of_the_region_too():
+    tracker, image, _ = tracker_of("cover_10mm", 1)
+    alone = tracker.look(image).observation
+    seen = [tracker.track(image, 1.0 + 0.03 * k) for k in range(5)]
+    assert len(alone.pieces) > 1
+    assert len(seen[-1].observation.pieces) == len(alone.pieces)
+    assert seen[-1].observation.pieces[-1].length == pytest.approx(alone.pieces[-1].length, rel=0.02)
+
+
+def test_with_a_wrong_length_no_frame_is_complete_and_no_end_is_free():
+    _, image, length = tracker_of("usual", 0)
+    for wrong in (0.7 * length, 1.5 * length):
+        track = VisionTracker(VisionTrackerSettings(thread_length=wrong), SCENE).look(image)
+        assert not track.observation.complete
+        assert PieceEnd.FREE not in {piece.last_end for piece in track.observation.pieces}
+
+
+def bare_dish(size: int = 400) -> Hiding:
+    """Return a dish in whose middle a square hides all."""
+    solid = np.zeros((size, size), np.uint8)
+    solid[150:250, 150:250] = 255
+    wall = Wall((0.5 * size, 0.5 * size), 0.5 * size)
+    return Hiding(solid, (solid > 0).astype(np.int32), np.full(solid.shape, 200.0, np.float32), wall)
+
+
+def line(start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
+    """Return points along a straight line [px]."""
+    return np.linspace(start, end, 40)
+
+
+def test_the_straight_way_below_a_cover_is_taken_and_a_piece_beside_is_left():
+    tail = Piece(line((80.0, 200.0), (149.0, 200.0)), (0, 1))
+    beyond = Piece(line((330.0, 200.0), (251.0, 200.0)), (0, 1))
+    order = find_order([tail, beyond], bare_dish(), (240.0, 260.0), SCALE)
+    assert [(placed.index, placed.turned) for placed in order.placed] == [(0, False), (1, True)]
+    low, high = order.placed[1].arc_length
+    assert low == pytest.approx(69.0 + 102.0)
+    assert low <= high <= 260.0 - 79.0 + 1e-9
+
+
+def test_where_two_ways_are_as_good_none_is_taken():
+    tail = Piece(line((80.0, 200.0), (149.0, 200.0)), (0, 1))
+    left = Piece(line((251.0, 180.0), (330.0, 160.0)), (1, 0))
+    right = Piece(line((251.0, 220.0), (330.0, 240.0)), (1, 0))
+    order = find_order([tail, left, right], bare_dish(), (400.0, 420.0), SCALE)
+    assert [placed.index for placed in order.placed] == [0]
+    assert order.wide == ()
+
+
+def test_a_thread_too_short_for_a_way_does_not_take_it():
+    tail = Piece(line((80.0, 200.0), (149.0, 200.0)), (0, 1))
+    beyond = Piece(line((251.0, 200.0), (330.0, 200.0)), (1, 0))
+    order = find_order([tail, beyond], bare_dish(), (190.0, 200.0), SCALE)
+    assert [placed.index for placed in order.placed] == [0]
+
+
+def test_a_gap_on_bare_floor_is_no_reason_to_join():
+    tail = Piece(line((80.0, 100.0), (149.0, 100.0)), (0, 0))
+    beyond = Piece(line((170.0, 100.0), (260.0, 100.0)), (0, 0))
+    assert len(find_order([tail, beyond], bare_dish(), (150.0, 260.0), SCALE).placed) == 1
+
+
+def test_hidden_outlines_surround_what_covers_the_thread():
+    case, image = frame_of("cover_10mm", 1, SEED)
+    tracker, _, _ = tracker_of("cover_10mm", 1)
+    track = tracker.look(image)
+    assert isinstance(track.view, DishView)
+    middle = case.hidden_by[0].outline.mean(axis=0)
+    boxes = [(outline.min(axis=0), outline.max(axis=0)) for outline in track.observation.hidden]
+    near = case.thread[len(case.thread) // 2] if np.linalg.norm(middle) > DISH_RADIUS else middle
+    assert any((low <= near).all() and (near <= high).all() for low, high in boxes)
