@@ -42,7 +42,7 @@ BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can 
 ENOUGH = 0.85  # of the greatest length: so much thread seen, dark and strong, needs no other search
 FAINT = 25.0  # grey levels; a black-hat fainter than this may be a pale thread's shadow
 STRONG_SHARE = 0.08  # of enough, that a strong dark thread must show to be the thread: the rest of it is covered
-SCALES = (1, 2, 4)  # how much smaller the image is in which a faint, a pale or a wide thread is looked for
+SCALES = (1, 2)  # how much smaller the image is in which a faint, a pale or a wide thread is looked for
 RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
 THIN_SHARE = 0.5  # of its strength among larger pixels, that a thin thread shows at full size
 FAINT_ROUNDS, FAINT_HALF = 3, 3  # how often a faint walk is centred, and over how many vertices to both sides
@@ -55,6 +55,8 @@ WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the midd
 OTHER_COLOUR = 0.5  # weight of what a pixel has of another colour, against it
 BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
 MIN_CENTRED = 4  # vertices
+FAINT_SHARE = 0.8  # of enough, that a faint or pale thread must show: less may be another thread, or glare
+LEAVING_STEPS, BEGINNING_SHARE = 8, 0.4  # vertices at the beginning, and their share of the walk's usual strength
 SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
 WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
 
@@ -76,6 +78,13 @@ class _Walk:
     strength: float
     ridge: Ridge | None
     path: np.ndarray
+
+    @property
+    def begins_alike(self) -> bool:
+        """Whether it is as strong where it leaves the needle as further on: else it has gone over to something else."""
+        strengths = self.path[1:, 4]
+        beginning = strengths[:LEAVING_STEPS]
+        return bool(len(beginning) and beginning.min() > BEGINNING_SHARE * np.median(strengths))
 
 
 @dataclass(frozen=True)
@@ -160,7 +169,7 @@ def _followed(
     best = dark if _is_strong(dark, enough) else _best_of(dark, search.faint(), enough)
     if len(best.points) >= MIN_CENTRED and search.is_edge(best):
         wide = search.wide()
-        if wide.shown > WIDE_SHOWN * best.shown:
+        if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
             return wide
     return best
 
@@ -171,7 +180,7 @@ def _is_strong(dark: _Walk, enough: float) -> bool:
 
 
 def _best_of(dark: _Walk, faint: list[_Walk], enough: float) -> _Walk:
-    sure = [walk for walk in faint if walk.shown > SURE_SHARE * enough]
+    sure = [walk for walk in faint if walk.shown > FAINT_SHARE * enough and walk.begins_alike]
     if not sure:
         return dark
     return max(sure, key=lambda walk: walk.shown * walk.strength)
