@@ -203,6 +203,9 @@ def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: 
     inside = np.zeros(gray.shape, np.uint8)
     points, _ = ellipse.points(60)
     cv2.fillPoly(inside, [np.round(points).astype(np.int32)], 1)
+    cut = not ((points > 0.0) & (points < np.array(gray.shape[::-1]) - 1.0)).all()
+    if cut and tilt_of(ellipse, 0.0) is not None:  # The part that is seen does not determine a tilt.
+        return None
     dark_field = middle(gray[::4, ::4][inside[::4, ::4] > 0]) < DARK_ELLIPSE
     tilt = tilt_of(ellipse, view.rotation) if not settings.dish_centre_px and not settings.metres_per_pixel else None
     return FoundDish(view, dark_field, tilt, ELLIPSE_ERROR, 0.0 if tilt is not None else MIN_ANGLE, remark)

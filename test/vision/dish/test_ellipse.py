@@ -23,7 +23,6 @@ CLASSES = (
     "photo_blood",
     "photo_tilted",
     "photo_hand",
-    "photo_cut_40",
 )
 
 
