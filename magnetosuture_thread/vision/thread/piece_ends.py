@@ -73,8 +73,7 @@ def is_bare_beyond(
     off = beyond[1:] - floor if thread.pale else floor - beyond[1:]
     if float(off.max()) > max(GOES_ON * usual, FAINTEST + 3.0 * thread.noise):
         return False
-    colours = picture.colours if picture.colours is not None else picture.darkest.pixels
-    light = np.vstack([np.median(sampled_colours(colours, at), axis=1) for at in (beside, ahead)])
+    light = np.vstack([np.median(sampled_colours(picture.image, at), axis=1) for at in (beside, ahead)])
     light /= np.maximum(np.median(light[: len(beside)], axis=0), 1.0)
     along = np.vander(np.concatenate([SPACING_PX * np.arange(1 - len(beside), 1), reach]), 2)
     mean = light.mean(axis=1)

@@ -135,7 +135,7 @@ def _traced(
         path, strong = np.zeros((int(max_length) + 16, 6)), np.zeros(int(max_length) + 16, np.bool_)
         path[0, :5] = seed[0], seed[1], seed[2] + turn, 0.0, max(strength, faintest)
         forks = np.empty((0, 3))
-        count, _ = walk_on(ridge, hidden, 1, noise, faintest, dish, max_length, path, strong, 1, 9.0, forks)
+        count, _ = walk_on(ridge, hidden, 1, noise, faintest, 1.0, dish, max_length, path, strong, 1, 9.0, forks)
         halves.append(path[:count, :2].copy())
     line = np.vstack([halves[0][::-1], halves[1][1:]])
     return line if len(line) > 1 else np.vstack([line, line + 1e-3])
