@@ -129,7 +129,9 @@ class Wall:
     def distances(self, box: tuple[slice, slice]) -> np.ndarray:
         """Return how far the pixels of some rows and columns are from the centre [px]."""
         rows, columns = np.ogrid[box]
-        return np.asarray(np.hypot(columns - self.centre[0], rows - self.centre[1]), dtype=np.float32)
+        across = (columns - self.centre[0]).astype(np.float32)
+        down = (rows - self.centre[1]).astype(np.float32)
+        return np.asarray(np.sqrt(across * across + down * down))
 
     def floor(self, channel: Layer, factor: int, box: tuple[slice, slice]) -> np.ndarray:
         """Return how bright the floor is in some rows and columns, `FLOOR_DEPTH_PX` inside of the wall and beyond.

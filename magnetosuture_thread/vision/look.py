@@ -361,15 +361,17 @@ def look_once(
 def tilted(track: Track, dish: FoundDish, radius: float) -> Track:
     """Return a track with what scale and tilt of the camera leave unknown, and a warning of it."""
     covariance = track.covariance + dish.covariance(track.tail, track.heading, radius)
-    pieces = tuple(_less_sure(piece, dish, radius) for piece in track.observation.pieces)
-    observation = replace(track.observation, pieces=pieces)
+    observation = track.observation
+    if dish.tilt is not None:  # What a straight camera's view leaves unknown moves the needle and all points alike.
+        pieces = tuple(_less_sure(piece, dish.tilt, radius) for piece in observation.pieces)
+        observation = replace(observation, pieces=pieces)
     return replace(track, covariance=covariance, warning=dish.warning, observation=observation)
 
 
-def _less_sure(piece: ThreadPiece, dish: FoundDish, radius: float) -> ThreadPiece:
-    """Return a piece with what the view leaves unknown of where it is, as far out as it reaches."""
+def _less_sure(piece: ThreadPiece, tilt: Tilt, radius: float) -> ThreadPiece:
+    """Return a piece with what a tilt leaves unknown of where it is, as far out as it reaches."""
     farthest = piece.points[np.argmax(np.hypot(*piece.points.T))]
-    view = dish.covariance(farthest, np.array([1.0, 0.0]), radius)[:2, :2]
+    view = tilt.covariance(farthest, np.array([1.0, 0.0]), radius)[:2, :2]
     return replace(piece, deviation=np.sqrt(piece.deviation**2 + np.linalg.eigvalsh(view)[-1]))
 
 

@@ -52,6 +52,8 @@ def _erase(pixels, floor, factor, start, shape, box):
                 turned = math.atan2(curvature * s, 1.0 - curvature * d)
                 d = (1.0 - math.hypot(curvature * s, 1.0 - curvature * d)) / curvature
                 s = turned / curvature
+            if abs(d) > half + BESIDE_PX or not -BESIDE_PX < s < length + BESIDE_PX:
+                continue  # Four edges for each pixel of the box would take longer than all else.
             part = min(max((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0), 1.0)
             own = half * (1.0 - (1.0 - THIN) * part)
             share = (edge(own - d) - edge(-own - d)) * edge(s) * edge(length - s)

@@ -21,6 +21,7 @@ FAINTEST = 3.0  # grey levels; less is noise
 SMOOTHED_PX = 9.0  # along the thread, over which its darkness is averaged
 LOCAL_PX = 4.0  # along the thread, over which its middle is averaged
 MIN_DEVIATION_PX = 0.12  # of a middle: by pixels, compression, and the evening out of bends
+MIN_POINTS, ENOUGH_POINTS = 8, 32  # of a thread, that its look is measured on
 BEND = 0.004  # 1 / px; standard deviation of the curvature of a thread that isn't visible
 
 Values = NDArray[np.float64]
@@ -98,9 +99,10 @@ def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, vis
         points: along the thread, shape (m, 2) [px].
         visible: where it is visible for sure, shape (m,), or nowhere for all of it.
     """
-    chosen = points[visible] if visible.sum() >= MIN_POINTS else points
-    aside = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-    at = across(chosen, aside) if visible.sum() < MIN_POINTS else across(points, aside)[visible]
+    shown = np.flatnonzero(visible) if visible.sum() >= MIN_POINTS else np.arange(len(points))
+    shown = shown[:: max(1, len(shown) // ENOUGH_POINTS)]
+    chosen, aside = points[shown], np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
+    at = across(points, aside)[shown]
     profiles = sampled(gray, at)
     beside = np.abs(aside) > 0.5 * REACH_PX
     usual = np.median(profiles - np.median(profiles[:, beside], axis=1, keepdims=True), axis=0)
@@ -120,9 +122,6 @@ def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, vis
     half = 0.5 * width + BESIDE_PX
     darkness = np.array([np.median(_integrals(picture, layer, chosen, half, pale)) for layer in (0, 1)])
     return Appearance(pale, width, darkness, max(float(usual[peak]), FAINTEST), max(noise, 0.5))
-
-
-MIN_POINTS = 8  # of a thread, that it is measured on
 
 
 def _integrals(picture: Picture, layer: int, points: Points, half: float, pale: bool) -> Values:

@@ -22,10 +22,11 @@ from magnetosuture_thread.vision.images import Picture, Wall, glare_mask
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 
-HALF = 2  # the search for objects is at half the size
-SLENDER_CELLS = 7  # side of the median window there: wider than twice a needle, narrower than an object
+SHRUNK = 3  # how much smaller the image is in which objects are looked for
+SLENDER_CELLS = 5  # side of the median window there: wider than twice a needle, narrower than an object
 FIT_CELL_PX = 8  # the floor's light is fitted to means of cells of this size
 ROUNDS, TUKEY = 8, 4.0  # of the robust fit, and standard deviations beyond which a cell counts nothing
+SETTLED = 0.1  # grey levels; weights that change by less in a round are the fit's
 MIN_CONTRAST, MIN_COLOUR = 0.05, 0.03  # of the floor's light, by which an object differs in brightness, in colour
 CONTRAST_DEVIATIONS = 3.5  # and in both by so many standard deviations of the floor
 MIN_AREA = 1e-6  # m^2; of an object
@@ -44,12 +45,14 @@ class Hiding:
     Attributes:
         solid: 255 there, shape (rows, columns), uint8.
         areas: number of the connected area at each pixel, 0 for bare floor, shape (rows, columns), int32.
+        inside: whether a pixel is farther than `WALL_PX` from the wall, shape (rows, columns).
         floor: brightness of the bare floor in the darkest colour, shape (rows, columns), float32 [grey levels].
         wall: of the dish; beyond it, less `WALL_PX`, nothing is told.
     """
 
     solid: Mask
     areas: NDArray[np.int32]
+    inside: NDArray[np.bool_]
     floor: NDArray[np.float32]
     wall: Wall
 
@@ -83,7 +86,8 @@ def find_hiding(picture: Picture, needle: MeasuredNeedle, wall: Wall, metres_per
     rows, columns = picture.shape
     glare = cv2.morphologyEx(glare_mask(picture), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     solid = cv2.resize(glare, (columns, rows), interpolation=cv2.INTER_NEAREST)
-    solid[wall.distances((slice(0, rows), slice(0, columns))) > wall.radius - WALL_PX] = 0
+    inside = wall.distances((slice(0, rows), slice(0, columns))) < wall.radius - WALL_PX
+    solid[~inside] = 0
     objects, floor = _objects(picture, wall, MIN_AREA / metres_per_pixel**2)
     cv2.bitwise_or(solid, objects, solid)
     if picture.mask is not None:
@@ -92,13 +96,13 @@ def find_hiding(picture: Picture, needle: MeasuredNeedle, wall: Wall, metres_per
     at = np.round(axis * 16.0).astype(np.int32)
     cv2.polylines(solid, [at], False, 255, max(1, round(needle.width_px + 2.0 * NEEDLE_PX)), cv2.LINE_8, 4)
     _, areas = cv2.connectedComponents(solid, connectivity=8, ltype=cv2.CV_32S)
-    return Hiding(solid, np.asarray(areas, dtype=np.int32), floor, wall)
+    return Hiding(solid, np.asarray(areas, dtype=np.int32), inside, floor, wall)
 
 
 def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Mask, NDArray[np.float32]]:
     """Return where objects are, and the floor's brightness in the darkest colour."""
     rows, columns = picture.shape
-    size = (-(-columns // HALF), -(-rows // HALF))
+    size = (-(-columns // SHRUNK), -(-rows // SHRUNK))
     small = cv2.medianBlur(cv2.resize(picture.image, size, interpolation=cv2.INTER_AREA), SLENDER_CELLS)
     cells = (max(4, columns // FIT_CELL_PX), max(4, rows // FIT_CELL_PX))
     near = Wall(wall.centre, wall.radius - WALL_PX)
@@ -120,10 +124,10 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Mask, NDArr
     if len(seen) > 1:
         most, least = cv2.max(cv2.max(*seen[:2]), seen[2]), cv2.min(cv2.min(*seen[:2]), seen[2])
         found |= most - least > _bound(np.ptp(ratios, axis=1), MIN_COLOUR)
-    found &= near.distances((slice(0, rows, HALF), slice(0, columns, HALF)))[: size[1], : size[0]] < near.radius
+    found &= near.distances((slice(0, rows, SHRUNK), slice(0, columns, SHRUNK)))[: size[1], : size[0]] < near.radius
     opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] * HALF**2 >= min_area
+    large = stats[:, cv2.CC_STAT_AREA] * SHRUNK**2 >= min_area
     large[0] = False
     objects = cv2.resize(np.where(large, 255, 0).astype(np.uint8)[labels], (columns, rows))
     objects = cv2.dilate(objects, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
@@ -150,7 +154,9 @@ def _fitted(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[
         bound = TUKEY * max(0.5, 1.4826 * middle(np.abs(residuals)))
         share = np.maximum(1.0 - (residuals / bound) ** 2, 0.0)[:, None] ** 2
         normal = basis.T @ (share * basis) + 1e-6 * np.eye(len(weights))
-        weights = np.linalg.solve(normal, basis.T @ (share[:, 0] * values))
+        before, weights = weights, np.linalg.solve(normal, basis.T @ (share[:, 0] * values))
+        if np.abs(weights - before).max() < SETTLED:
+            break
     return weights
 
 

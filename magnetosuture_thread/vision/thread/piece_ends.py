@@ -17,10 +17,20 @@ from magnetosuture_thread.vision.thread.strands import SPACING_PX, Strand, below
 
 NEAR_PX = 7.0  # from an end up to which something hides the thread that goes on there
 AHEAD_PX, AHEAD = (3.0, 5.0, 7.0, 9.0, 11.0), math.radians(50.0)  # beyond an end, where floor must be seen
+BESIDE_POINTS = 6  # last vertices of a piece, beside which its floor is measured
 BARE_STEP, BARE_CHANGE = 0.025, 0.06  # of the floor's light: off a straight line from beside an end to beyond; in all
 BARE_COLOUR, FAR_RINGS = 0.03, 3  # of it, by which colours may change apart, on average over the farthest rings
 GOES_ON = 0.5  # of its strength, with which a thread would go on beyond an end
 SURE_STRENGTH = 2.0  # of the faintest that is seen, that a thread must have where it is seen to end
+
+
+def _off_line() -> NDArray[np.float64]:
+    """Return the matrix that takes light at the vertices and ahead to what it is off a straight line fitted to it."""
+    line = np.vander(np.concatenate([SPACING_PX * np.arange(1 - BESIDE_POINTS, 1), AHEAD_PX]), 2)
+    return np.asarray(np.eye(len(line)) - line @ np.linalg.pinv(line))
+
+
+OFF_LINE = _off_line()
 
 
 def why_it_ends(
@@ -52,9 +62,9 @@ def is_bare_beyond(
     picture: Picture, gray: NDArray[np.uint8], thread: Appearance, strand: Strand, needle: MeasuredNeedle
 ) -> bool:
     """Say whether there is nothing but floor beyond a piece's last point, like that beside it, where it is strong."""
-    if len(strand.points) < 6:
+    if len(strand.points) < BESIDE_POINTS:
         return False
-    usual = float(np.median(strand.strength[-6:]))
+    usual = float(np.median(strand.strength[-BESIDE_POINTS:]))
     if usual < max(SURE_STRENGTH * FAINTEST, 2.0 * SURE_STRENGTH * thread.noise):
         return False
     point, way = strand.points[-1], end_direction(strand.points)
@@ -68,15 +78,14 @@ def is_bare_beyond(
     if below_needle(needle, ahead.reshape(-1, 2)).any():
         return False
     aside = thread.beside_px + np.array([0.5, 1.5, 2.5])
-    beside = across(strand.points, np.concatenate([-aside, aside]))[-6:]
+    beside = across(strand.points, np.concatenate([-aside, aside]))[-BESIDE_POINTS:]
     floor, beyond = np.median(sampled(gray, beside)), sampled(gray, ahead)
     off = beyond[1:] - floor if thread.pale else floor - beyond[1:]
     if float(off.max()) > max(GOES_ON * usual, FAINTEST + 3.0 * thread.noise):
         return False
     light = np.vstack([np.median(sampled_colours(picture.image, at), axis=1) for at in (beside, ahead)])
     light /= np.maximum(np.median(light[: len(beside)], axis=0), 1.0)
-    along = np.vander(np.concatenate([SPACING_PX * np.arange(1 - len(beside), 1), reach]), 2)
     mean = light.mean(axis=1)
-    step = np.abs(mean - along @ np.linalg.lstsq(along, mean, rcond=None)[0]).max()
+    step = np.abs(OFF_LINE @ mean).max()
     even = step < BARE_STEP and np.abs(mean - 1.0).max() < BARE_CHANGE
     return bool(even and np.ptp(light[-FAR_RINGS:].mean(axis=0)) < BARE_COLOUR)

@@ -76,10 +76,9 @@ def find_pieces(
     """
     ridge = two_sided_ridge(gray, thread, hiding)
     (u, v), reach = hiding.wall.centre, hiding.wall.radius - WALL_PX
-    rows, columns = ridge.shape
-    away = hiding.wall.distances((slice(0, rows), slice(0, columns)))
-    ridge[away > reach] = 0
-    noise = middle(ridge[::5, ::5][away[::5, ::5] < reach]) if (away[::5, ::5] < reach).any() else 0.0
+    ridge[~hiding.inside] = 0
+    inside = hiding.inside[::5, ::5]
+    noise = middle(ridge[::5, ::5][inside]) if inside.any() else 0.0
     faintest = max(FAINTEST, NOISES * noise)
     begin = max(noise + faintest, BEGIN_SHARE * thread.strength)
     fresh = (ridge > begin).astype(np.uint8)
@@ -102,15 +101,17 @@ def find_pieces(
 
 def _seed(fresh: NDArray[np.uint8], ridge: Ridge) -> tuple[float, float, float] | None:
     """Return place and direction of the largest ridge that no walk has begun at yet: u, v, angle."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(fresh, connectivity=8)
-    stats[0] = 0
-    extents = np.hypot(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
-    largest = int(np.argmax(extents))
-    if extents[largest] < MIN_SEED_PX:
+    outlines, _ = cv2.findContours(fresh, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    boxes = [cv2.boundingRect(outline) for outline in outlines]
+    extents = [math.hypot(width, height) for _, _, width, height in boxes]
+    if not extents or max(extents) < MIN_SEED_PX:
         return None
-    left, top, width, height = stats[largest, :4]
+    largest = int(np.argmax(extents))
+    left, top, width, height = boxes[largest]
+    own = np.zeros((height, width), np.uint8)
+    cv2.drawContours(own, outlines, largest, 1, -1, cv2.LINE_8, offset=(-left, -top))
     box = slice(top, top + height), slice(left, left + width)
-    own = labels[box] == largest
+    own &= fresh[box]
     v, u = np.unravel_index(int(np.argmax(np.where(own, ridge[box], 0))), own.shape)
     at_v, at_u = np.nonzero(own)
     near = np.hypot(at_u - u, at_v - v) < NEAR_PX

@@ -112,7 +112,8 @@ def bare_dish(size: int = 400) -> Hiding:
     solid = np.zeros((size, size), np.uint8)
     solid[150:250, 150:250] = 255
     wall = Wall((0.5 * size, 0.5 * size), 0.5 * size)
-    return Hiding(solid, (solid > 0).astype(np.int32), np.full(solid.shape, 200.0, np.float32), wall)
+    inside = np.ones(solid.shape, np.bool_)
+    return Hiding(solid, (solid > 0).astype(np.int32), inside, np.full(solid.shape, 200.0, np.float32), wall)
 
 
 def line(start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
