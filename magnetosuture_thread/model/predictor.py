@@ -216,6 +216,31 @@ class ThreadPredictor:
         """Whether the thread has a shape."""
         return self._state is not None
 
+    @property
+    def formulation(self) -> Formulation:
+        """What steps the thread."""
+        return self._formulation
+
+    @property
+    def state(self) -> ThreadState | None:
+        """The thread at the last pose; None before the start."""
+        return self._state
+
+    @property
+    def pose(self) -> NeedlePose | None:
+        """The last pose; None before the start."""
+        return self._pose
+
+    @property
+    def fixed_nodes(self) -> tuple[int, ...]:
+        """Nodes that stay where they are."""
+        return self._fixed
+
+    def continue_from(self, pose: NeedlePose, state: ThreadState) -> Prediction:
+        """Continue from another state at a pose: what was estimated, or a moment in the past."""
+        self._pose, self._state = pose, state
+        return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0), True)
+
     def warm_up(self) -> None:
         """Step a straight thread, so that no kernel is compiled in the first callback."""
         dimension = self._formulation.dimension

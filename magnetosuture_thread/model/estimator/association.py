@@ -1,0 +1,166 @@
+"""Association: at which arc length of the thread each measured point lies.
+
+A piece is as long as the stretch of thread that it shows, so that all of its points follow from one number, the arc
+length at which it begins: that is given, or searched for along the prior. Each point is then projected onto the
+prior next to where its arc length says, in order along the piece.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Points
+
+Vector = NDArray[np.float64]
+
+MAX_SKIPPED = 8  # points in a row that may be outliers
+PATH_ERROR = 0.05  # of a piece's measured length, by which the points' noise makes it too long
+SEARCH_POINTS = 24  # of a piece, which the search for its beginning compares
+
+
+@compiled
+def path_without_outliers(points: Points, penalty: float, kept: NDArray[np.bool_]) -> None:
+    """Mark the points of a piece that lie on its path.
+
+    The path is the shortest one through the points in their order when each point left out costs `penalty`: a point
+    far aside costs two ways, one on the path next to nothing.
+
+    Args:
+        points: shape (m, 2).
+        penalty: more than what noise adds to the path, less than twice the distance of an outlier; same unit.
+        kept: written, shape (m,).
+    """
+    count = len(points)
+    cost, before = np.empty(count), np.empty(count, dtype=np.int64)
+    best, last = np.inf, 0
+    for i in range(count):
+        cost[i], before[i] = penalty * i, -1
+        for j in range(max(0, i - MAX_SKIPPED), i):
+            step = np.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            value = cost[j] + step + penalty * (i - j - 1)
+            if value < cost[i]:
+                cost[i], before[i] = value, j
+        if cost[i] + penalty * (count - 1 - i) < best:
+            best, last = cost[i] + penalty * (count - 1 - i), i
+    kept[:] = False
+    while last >= 0:
+        kept[last] = True
+        last = before[last]
+
+
+@compiled
+def mean_square_at(nodes: Points, points: Points, arcs: Vector, start: float, cap: float) -> float:
+    """Return the mean squared distance of points from the thread at their arc lengths, each at most `cap`.
+
+    Args:
+        nodes: of the thread, shape (n + 1, 2) [D].
+        points: shape (m, 2) [D].
+        arcs: of the points from the first, shape (m,) [D].
+        start: arc length of the first [D].
+        cap: [D^2]
+    """
+    total, last = 0.0, len(nodes) - 1
+    for p in range(len(points)):
+        at = min(max(start + arcs[p], 0.0), float(last))
+        i = min(int(at), last - 1)
+        part = at - i
+        dx = (1.0 - part) * nodes[i, 0] + part * nodes[i + 1, 0] - points[p, 0]
+        dy = (1.0 - part) * nodes[i, 1] + part * nodes[i + 1, 1] - points[p, 1]
+        total += min(dx * dx + dy * dy, cap)
+    return total / len(points)
+
+
+@compiled
+def search_start(
+    nodes: Points, points: Points, arcs: Vector, low: float, high: float, cap: float
+) -> tuple[float, float]:
+    """Return the arc length at which a piece best begins, between two bounds, and its mean squared distance there.
+
+    Args:
+        nodes: see `mean_square_at`, as are the others.
+        points: shape (m, 2) [D].
+        arcs: shape (m,) [D].
+        low: [D]
+        high: [D]
+        cap: [D^2]
+    """
+    stride = max(1, len(points) // SEARCH_POINTS)
+    some, at = points[::stride].copy(), arcs[::stride].copy()
+    steps = max(1, int(np.ceil(2.0 * (high - low))))
+    best, found = np.inf, low
+    for k in range(steps + 1):
+        start = low + (high - low) * k / steps
+        value = mean_square_at(nodes, some, at, start, cap)
+        if value < best:
+            best, found = value, start
+    return found, best
+
+
+@compiled
+def project(
+    nodes: Points,
+    points: Points,
+    arcs: Vector,
+    start: float,
+    reach: float,
+    place: Vector,
+    innovation: Vector,
+) -> None:
+    """Project a piece's points onto the thread, in order along it.
+
+        place_p = i + t,    innovation_p = m_i . (y_p - (1 - t) x_i - t x_{i+1} + t (1 - t) (c_i + c_{i+1}) / 4)
+
+    with m_i the normal of segment i and c_i = x_{i+1} - 2 x_i + x_{i-1}: the thread is an arc over its chord.
+
+    Args:
+        nodes: of the thread, shape (n + 1, 2) [D].
+        points: shape (m, 2) [D].
+        arcs: of the points from the first, shape (m,) [D].
+        start: arc length of the first [D].
+        reach: how far from its arc length a point may lie at the beginning of the piece [D].
+        place: written: arc length of each point, nan of one that lies beyond an end, shape (m,) [D].
+        innovation: written, shape (m,) [D].
+    """
+    segments = len(nodes) - 1
+    shift, last = 0.0, -1.0  # how far the points before lay from their arc lengths
+    for p in range(len(points)):
+        guess = start + arcs[p] + shift
+        slack = reach + PATH_ERROR * arcs[p]
+        first = int(max(0.0, np.floor(max(guess - reach, start + arcs[p] - slack, last - 0.5))))
+        final = int(min(segments - 1.0, np.floor(min(guess + reach, start + arcs[p] + slack))))
+        best, found, part = np.inf, -1, 0.0
+        for i in range(first, final + 1):
+            ex, ey = nodes[i + 1, 0] - nodes[i, 0], nodes[i + 1, 1] - nodes[i, 1]
+            dx, dy = points[p, 0] - nodes[i, 0], points[p, 1] - nodes[i, 1]
+            t = (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12)
+            inside = min(max(t, 0.0), 1.0)
+            rx, ry = dx - inside * ex, dy - inside * ey
+            square = rx * rx + ry * ry
+            if square < best:
+                best, found, part = square, i, t
+        place[p] = np.nan
+        if found < 0:
+            continue
+        if found + part > segments + 0.5 or part < -0.5 or (part > 1.5 and found < segments - 1):
+            continue  # beyond an end
+        if found == segments - 1 and part > 1.0:
+            part = 1.0
+        part = min(max(part, 0.0), 1.0)
+        place[p] = found + part
+        last = place[p]
+        shift = place[p] - start - arcs[p]
+        ex, ey = nodes[found + 1, 0] - nodes[found, 0], nodes[found + 1, 1] - nodes[found, 1]
+        size = np.hypot(ex, ey)
+        mx, my = -ey / size, ex / size
+        sag = 0.25 * part * (1.0 - part)
+        value = mx * (points[p, 0] - nodes[found, 0]) + my * (points[p, 1] - nodes[found, 1])
+        for k in range(found, found + 2):
+            if 0 < k < segments:
+                cx = nodes[k + 1, 0] - 2.0 * nodes[k, 0] + nodes[k - 1, 0]
+                cy = nodes[k + 1, 1] - 2.0 * nodes[k, 1] + nodes[k - 1, 1]
+                turn = cx * cx + cy * cy
+                if turn < 1.0:
+                    value += sag * (mx * cx + my * cy)
+        innovation[p] = value

@@ -1,0 +1,207 @@
+"""From an observation to points on the thread: each piece checked, placed along the thread, or refused with a reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator.association import (
+    PATH_ERROR,
+    Vector,
+    path_without_outliers,
+    project,
+    search_start,
+)
+from magnetosuture_thread.model.estimator.options import EstimatorOptions
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+
+MAX_POINTS = 4  # of a piece, for each segment that it could cover; of more, every so many is taken
+MAX_PIECES = 64  # of an observation
+MAX_COORDINATE = 10.0  # m
+DETOUR = 8.0  # standard deviations that noise may lengthen the path by at a point
+GATE = 4.0  # standard deviations; a piece of unknown arc length that is farther from the prior is another thread's
+OVERLAP = 0.5  # of a piece; if so much of it lies where another one does already, it is that one again or not ours
+FRESH_POINTS = 2  # of a piece, at the least
+
+
+@dataclass(frozen=True)
+class PlacedPiece:
+    """A piece on the thread, in units of the segment length D.
+
+    Attributes:
+        points: that are no outliers, shape (m, 2) [D].
+        variance: across the thread, shape (m,) [D^2].
+        share: of its information that is a point's own, shape (m,).
+        arcs: from the first point, shape (m,) [D].
+        start: arc length of the first point [D].
+        reach: how far from it the points may lie [D].
+        attached: whether it begins at the needle's tail.
+        free_end: whether it ends where the thread ends.
+        square: mean squared distance from the prior [D^2].
+    """
+
+    points: Points
+    variance: Vector
+    share: Vector
+    arcs: Vector
+    start: float
+    reach: float
+    attached: bool
+    free_end: bool
+    square: float
+
+    def projected(self, nodes: Points) -> tuple[Vector, Vector]:
+        """Return arc length and innovation of each point on a thread, nan where it lies beyond an end."""
+        place, innovation = np.full(len(self.points), np.nan), np.zeros(len(self.points))
+        project(nodes, self.points, self.arcs, self.start, self.reach, place, innovation)
+        return place, innovation
+
+
+def place_pieces(
+    observation: ThreadObservation,
+    nodes: Points,
+    variance: Vector,
+    unit: float,
+    options: EstimatorOptions,
+    problems: list[str],
+) -> list[PlacedPiece]:
+    """Return the pieces that are of this thread.
+
+    Args:
+        observation: from the camera.
+        nodes: of the predicted thread, shape (n + 1, 2) [D].
+        variance: of each across the thread, shape (n + 1,) [D^2].
+        unit: D [m].
+        options: of the estimator.
+        problems: gets the reason for each piece that is refused.
+    """
+    segments = len(nodes) - 1
+    covered = np.zeros(segments, dtype=np.bool_)
+    placed = []
+    if len(observation.pieces) > MAX_PIECES:
+        problems.append(f"{len(observation.pieces)} pieces, more than {MAX_PIECES}; the others are ignored")
+    # What is known to be where it is comes first, whatever the order in which it was given.
+    order = sorted(observation.pieces[:MAX_PIECES], key=lambda piece: (*_rank(piece), _first_arc(piece)))
+    for piece in order:
+        found = _place(piece, nodes, variance, unit, options)
+        if isinstance(found, str):
+            problems.append(found)
+            continue
+        low, high = max(int(found.start), 0), min(math.ceil(found.start + found.arcs[-1]), segments)
+        if high > low and covered[low:high].mean() > OVERLAP:
+            problems.append("a piece lies where another one shows the thread already")
+            continue
+        covered[low:high] = True
+        placed.append(found)
+    return placed
+
+
+def _rank(piece: ThreadPiece) -> tuple[bool, bool]:
+    return piece.first_end is not PieceEnd.TAIL, not _known(piece)
+
+
+def _first_arc(piece: ThreadPiece) -> float:
+    return piece.arc_length[0] if _known(piece) else math.inf
+
+
+def _known(piece: ThreadPiece) -> bool:
+    return all(math.isfinite(value) for value in piece.arc_length)
+
+
+def _place(
+    piece: ThreadPiece, nodes: Points, variance: Vector, unit: float, options: EstimatorOptions
+) -> PlacedPiece | str:
+    """Return a piece on the thread, or why it is none of it."""
+    points, segments = np.asarray(piece.points, dtype=np.float64), len(nodes) - 1
+    deviation = np.asarray(piece.deviation, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
+        return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
+    good = np.all(np.abs(points) <= MAX_COORDINATE, axis=1) & np.isfinite(deviation) & (deviation >= 0.0)
+    if good.sum() < FRESH_POINTS:
+        return "a piece has fewer than two finite points"
+    points, deviation = points[good] / unit, np.maximum(deviation[good], options.min_deviation) / unit
+    stride = math.ceil(len(points) / (MAX_POINTS * segments))
+    if stride > 1:
+        points, deviation = points[::stride], deviation[::stride]
+    kept = np.zeros(len(points), dtype=np.bool_)
+    path_without_outliers(points, max(DETOUR * float(np.median(deviation)), 0.5), kept)
+    points, deviation = np.ascontiguousarray(points[kept]), deviation[kept]
+    if len(points) < FRESH_POINTS:
+        return "a piece has fewer than two points on a path"
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    arcs = np.concatenate([[0.0], np.cumsum(steps)])
+    if not arcs[-1] > 0.0:
+        return "a piece has no length"
+    if arcs[-1] * (1.0 - PATH_ERROR) > segments + 2.0:
+        return f"a piece {arcs[-1] * unit * 1e3:.1f} mm long, longer than the thread"
+    own = np.empty(len(points))  # of the path's length, that a point stands for
+    own[0], own[-1] = steps[0], steps[-1]
+    own[1:-1] = 0.5 * (steps[1:] + steps[:-1])
+    share = np.minimum(1.0, own * unit / options.point_correlation)
+    low, high = (value / unit for value in piece.arc_length)
+    attached = piece.first_end is PieceEnd.TAIL
+    known = _known(piece) or attached
+    if attached and not _known(piece):
+        low = high = 0.0
+    elif not known:
+        low, high = 0.0, max(segments - arcs[-1], 0.0)
+    low, high = min(low, high), max(low, high)
+    cap = (0.25 * segments) ** 2
+    best, turned = search_start(nodes, points, arcs, low, high, cap), False
+    if not piece.direction_known:
+        other = search_start(nodes, np.ascontiguousarray(points[::-1]), arcs[-1] - arcs[::-1], low, high, cap)
+        if other[1] < best[1]:
+            best, turned = other, True
+    ends = (piece.first_end, piece.last_end)
+    if turned:
+        points, arcs = np.ascontiguousarray(points[::-1]), np.ascontiguousarray(arcs[-1] - arcs[::-1])
+        deviation, share, ends = deviation[::-1], share[::-1], ends[::-1]
+    reach = 2.0 + 0.5 * (high - low if _known(piece) else 0.0) + 2.0 * math.sqrt(float(variance.max()))
+    found = PlacedPiece(
+        points,
+        np.ascontiguousarray(deviation**2),
+        np.ascontiguousarray(share),
+        arcs,
+        best[0],
+        min(reach, 0.25 * segments),
+        attached,
+        ends[1] is PieceEnd.FREE,
+        best[1],
+    )
+    if not known and (problem := _not_ours(found, nodes, variance)):
+        return problem
+    return found
+
+
+def _not_ours(piece: PlacedPiece, nodes: Points, variance: Vector) -> str:
+    """Return why a piece of unknown arc length cannot be of this thread, or nothing."""
+    place, innovation = piece.projected(nodes)
+    on = np.isfinite(place)
+    if on.sum() < max(FRESH_POINTS, 0.5 * len(place)):
+        return "a piece lies beyond the thread's ends"
+    prior = np.interp(place[on], np.arange(len(nodes)), variance)
+    # Whether as much of it as could be is in the gate: one or two far points are outliers.
+    off = innovation[on] ** 2 / (prior + piece.variance[on])
+    if float(np.median(off)) > GATE**2 or float((off > GATE**2).mean()) > 0.3:
+        return "a piece lies too far from the predicted thread: it is of another one"
+    return ""
+
+
+def through_obstacle(start: Points, points: Points, workspace: Workspace, margin: float) -> np.ndarray:
+    """Return which points an obstacle parts from where they would belong, shape (m,).
+
+    Args:
+        start: on the thread, shape (m, 2) [m].
+        points: measured, shape (m, 2) [m].
+        workspace: the obstacles.
+        margin: how deep the way between must lead into one [m].
+    """
+    parted = np.zeros(len(points), dtype=np.bool_)
+    for part in (0.25, 0.5, 0.75):
+        near = workspace.near(start + part * (points - start))
+        parted[near.node[near.distance < -margin]] = True
+    return parted
