@@ -16,7 +16,7 @@ from magnetosuture_thread.geometry.polyline import Points
 Vector = NDArray[np.float64]
 
 MAX_SKIPPED = 8  # points in a row that may be outliers
-PATH_ERROR = 0.05  # of a piece's measured length, by which the points' noise makes it too long
+PATH_ERROR = 0.005  # of an arc length that is measured along a piece
 SEARCH_POINTS = 24  # of a piece, which the search for its beginning compares
 
 
@@ -29,7 +29,7 @@ def path_without_outliers(points: Points, penalty: float, kept: NDArray[np.bool_
 
     Args:
         points: shape (m, 2).
-        penalty: more than what noise adds to the path, less than twice the distance of an outlier; same unit.
+        penalty: more than what noise adds to the path, and than the points' spacing, less than twice the distance of an outlier; same unit.
         kept: written, shape (m,).
     """
     count = len(points)
@@ -95,7 +95,41 @@ def search_start(
         value = mean_square_at(nodes, some, at, start, cap)
         if value < best:
             best, found = value, start
+    step = (high - low) / steps
+    middle = found
+    for k in range(-5, 6):
+        start = middle + 0.1 * k * step
+        if step > 0.0 and low <= start <= high:
+            value = mean_square_at(nodes, some, at, start, cap)
+            if value < best:
+                best, found = value, start
     return found, best
+
+
+@compiled
+def path_lengths(points: Points, spacing: float, arcs: Vector) -> None:
+    """Write the arc length of each point of a noisy path.
+
+    It is measured over steps of at least `spacing`, in which noise adds little; between their ends it is shared out.
+
+    Args:
+        points: shape (m, 2).
+        spacing: same unit.
+        arcs: written, shape (m,).
+    """
+    count, last = len(points), 0
+    arcs[0] = 0.0
+    for p in range(1, count):
+        step = np.hypot(points[p, 0] - points[last, 0], points[p, 1] - points[last, 1])
+        if step < spacing and p < count - 1:
+            continue
+        total = 0.0
+        for k in range(last + 1, p + 1):
+            total += np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
+        for k in range(last + 1, p + 1):
+            part = np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
+            arcs[k] = arcs[k - 1] + (step * part / total if total > 0.0 else 0.0)
+        last = p
 
 
 @compiled
@@ -104,63 +138,53 @@ def project(
     points: Points,
     arcs: Vector,
     start: float,
-    reach: float,
+    slack: float,
     place: Vector,
     innovation: Vector,
 ) -> None:
-    """Project a piece's points onto the thread, in order along it.
+    """Project a piece's points onto the thread, each next to where its arc length says.
 
         place_p = i + t,    innovation_p = m_i . (y_p - (1 - t) x_i - t x_{i+1} + t (1 - t) (c_i + c_{i+1}) / 4)
 
     with m_i the normal of segment i and c_i = x_{i+1} - 2 x_i + x_{i-1}: the thread is an arc over its chord.
+    Of a bend that lies elsewhere than predicted, the nearest place on the prediction would tell too little.
 
     Args:
         nodes: of the thread, shape (n + 1, 2) [D].
         points: shape (m, 2) [D].
         arcs: of the points from the first, shape (m,) [D].
         start: arc length of the first [D].
-        reach: how far from its arc length a point may lie at the beginning of the piece [D].
+        slack: how far from its arc length the first point may lie; those after by `PATH_ERROR` more [D].
         place: written: arc length of each point, nan of one that lies beyond an end, shape (m,) [D].
         innovation: written, shape (m,) [D].
     """
     segments = len(nodes) - 1
-    shift, last = 0.0, -1.0  # how far the points before lay from their arc lengths
     for p in range(len(points)):
-        guess = start + arcs[p] + shift
-        slack = reach + PATH_ERROR * arcs[p]
-        first = int(max(0.0, np.floor(max(guess - reach, start + arcs[p] - slack, last - 0.5))))
-        final = int(min(segments - 1.0, np.floor(min(guess + reach, start + arcs[p] + slack))))
-        best, found, part = np.inf, -1, 0.0
-        for i in range(first, final + 1):
+        low, high = start + arcs[p] * (1.0 - PATH_ERROR) - slack, start + arcs[p] * (1.0 + PATH_ERROR) + slack
+        place[p] = np.nan
+        if high < 0.0 or low > segments:
+            continue
+        low, high = max(low, 0.0), min(high, float(segments))
+        best, found = np.inf, -1
+        for i in range(min(int(low), segments - 1), min(int(high), segments - 1) + 1):
             ex, ey = nodes[i + 1, 0] - nodes[i, 0], nodes[i + 1, 1] - nodes[i, 1]
             dx, dy = points[p, 0] - nodes[i, 0], points[p, 1] - nodes[i, 1]
             t = (dx * ex + dy * ey) / max(ex * ex + ey * ey, 1e-12)
-            inside = min(max(t, 0.0), 1.0)
+            inside = min(max(t, max(low - i, 0.0)), min(high - i, 1.0))
             rx, ry = dx - inside * ex, dy - inside * ey
             square = rx * rx + ry * ry
             if square < best:
-                best, found, part = square, i, t
-        place[p] = np.nan
-        if found < 0:
-            continue
-        if found + part > segments + 0.5 or part < -0.5 or (part > 1.5 and found < segments - 1):
-            continue  # beyond an end
-        if found == segments - 1 and part > 1.0:
-            part = 1.0
-        part = min(max(part, 0.0), 1.0)
-        place[p] = found + part
-        last = place[p]
-        shift = place[p] - start - arcs[p]
+                best, found = square, i
+                place[p] = i + inside
+        t = place[p] - found
         ex, ey = nodes[found + 1, 0] - nodes[found, 0], nodes[found + 1, 1] - nodes[found, 1]
         size = np.hypot(ex, ey)
         mx, my = -ey / size, ex / size
-        sag = 0.25 * part * (1.0 - part)
         value = mx * (points[p, 0] - nodes[found, 0]) + my * (points[p, 1] - nodes[found, 1])
         for k in range(found, found + 2):
             if 0 < k < segments:
                 cx = nodes[k + 1, 0] - 2.0 * nodes[k, 0] + nodes[k - 1, 0]
                 cy = nodes[k + 1, 1] - 2.0 * nodes[k, 1] + nodes[k - 1, 1]
-                turn = cx * cx + cy * cy
-                if turn < 1.0:
-                    value += sag * (mx * cx + my * cy)
+                if cx * cx + cy * cy < 1.0:
+                    value += 0.25 * t * (1.0 - t) * (mx * cx + my * cy)
         innovation[p] = value

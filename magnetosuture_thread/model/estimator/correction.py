@@ -35,9 +35,11 @@ from magnetosuture_thread.model.solvers import banded
 
 Vector = NDArray[np.float64]
 
-MAX_SOLVES = 6  # of a correction
+MAX_SOLVES = 8  # of a correction
+MAX_REWEIGHTED = 3  # of them with new robust weights
 FREEDOM = 4.0  # degrees of freedom of Student's distribution of a point's error
 ALONG = 1e-6  # information along the thread over that across it; the chords hold it there
+RIGID = 10.0  # information on the thread's longest bending wave over that of the points; more changes nothing
 CHANGED = 0.1  # of a robust weight, from which on the program is solved again
 
 
@@ -109,6 +111,7 @@ def prior_information(
         buffers: written: blocks, couplings, linear.
     """
     nodes = len(density)
+    stiffest = RIGID * (nodes / np.pi) ** 4
     blocks, couplings = buffers.blocks, buffers.couplings
     buffers.linear[:], couplings[:] = 0.0, 0.0
     for i in range(nodes):
@@ -124,7 +127,7 @@ def prior_information(
             blocks[i + 1, a, a] += weight
         couplings[0, i] -= weight
     for i in range(0 if clamped else 1, nodes - 1):
-        weight = 2.0 * stiffness / (scale * noise[i])
+        weight = min(2.0 * stiffness / (scale * noise[i]), stiffest)
         before, here, after = (1.0, -2.0, 1.0) if i > 0 else (0.0, -2.0, 2.0)
         weight *= 1.0 if i > 0 else 0.5
         for a in range(2):
@@ -364,7 +367,7 @@ def correct(
             size = np.hypot(ex, ey)
             dx, dy = (1.0 - t) * u[i, 0] + t * u[i + 1, 0], (1.0 - t) * u[i, 1] + t * u[i + 1, 1]
             residual[p] = points.innovation[p] - (-ey * dx + ex * dy) / size
-        change = robust_weights(points, residual, points.variance, weights)
+        change = robust_weights(points, residual, points.variance, weights) if solves < MAX_REWEIGHTED else 0.0
     selected_inverse(6, 2 * nodes, solver_buffers.band, memory.inverse)
     for i in range(nodes):
         for a in range(2):

@@ -32,7 +32,7 @@ from magnetosuture_thread.model.estimator.noise import (
     spread_to_nodes,
 )
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
-from magnetosuture_thread.model.estimator.pieces import PlacedPiece, place_pieces, through_obstacle
+from magnetosuture_thread.model.estimator.pieces import PlacedPiece, place_pieces, smoothed, through_obstacle
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
@@ -42,9 +42,12 @@ from magnetosuture_thread.thread_observation import ThreadObservation
 Vector = NDArray[np.float64]
 
 ONE_SIDED_99 = 2.3263478740408408
-RESIDUAL_TOLERANCE = 1e-6  # of a correction's program
+RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselves are checked at its end point
 LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
+SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
+SURE = 3.0  # standard deviations
+MIN_INTERVAL = 1e-3  # s; between measurements, in which noise can be at work
 MIN_VARIANCE = 1e-12  # D^2
 
 
@@ -258,6 +261,14 @@ class ThreadEstimator:
         self._set_variance(variance)
         return self._estimate(())
 
+    def start_observed(self, pose: NeedlePose, observation: ThreadObservation) -> Estimate:
+        """Set the thread's shape from a first observation: along the piece that leaves the needle, and on from there.
+
+        Without such a piece the thread lies straight behind the needle, and nothing is known of it.
+        """
+        self.start(pose)
+        return self.correct(observation)
+
     def step(self, pose: NeedlePose, observation: ThreadObservation | None = None) -> Estimate:
         """Follow the needle to its next pose, and correct the thread by what the frame of that pose shows of it.
 
@@ -305,16 +316,18 @@ class ThreadEstimator:
         At once where the estimate is known to be as bad as that, else when a second frame says so too. What the piece
         does not show goes on as it lay.
         """
-        if not piece.attached or piece.square < LARGE_ERROR**2:
+        fresh = not math.isfinite(self._measured_at)
+        if not piece.attached or (not fresh and piece.square < LARGE_ERROR**2):
             self._gross = 0
             return None
         self._gross += 1
         end = piece.start + piece.arcs[-1]
-        if self._gross < 2 and not piece.square < 9.0 * float(np.interp(0.5 * end, np.arange(len(self._variance)), self._variance)):
+        prior = float(np.interp(0.5 * end, np.arange(len(self._variance)), self._variance))
+        if not fresh and self._gross < 2 and piece.square > 9.0 * prior:
             return None
         self._gross = 0
         unit, segments = self._unit, self.thread.segments
-        path = np.vstack([pose.tail, piece.points[1:] * unit])
+        path = np.vstack([pose.tail, smoothed(piece.points, piece.arcs, SMOOTHING * self.options.point_correlation / unit)[1:] * unit])
         path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 0.0])]
         at = int(min(end, segments - 1.0))
         if at < segments - 1 and len(path) >= 2:
@@ -386,7 +399,7 @@ class ThreadEstimator:
         elapsed = pose.stamp - self._measured_at
         innovations, window = self._learn(points, weights, prior, elapsed if math.isfinite(elapsed) else 0.0)
         noise = np.empty(segments + 1)
-        spread_to_nodes(self._bank.intensity, segments + 1, noise)
+        spread_to_nodes(self._intensity, segments + 1, noise)
         noise /= unit**2
         prior = np.interp(points.place, index, self._variance)
         robust_weights(points, points.innovation, points.variance + prior, weights)
@@ -476,10 +489,14 @@ class ThreadEstimator:
         variance[seen] = (spread[seen] + known) * unit**2
         before = self._bank.intensity.copy()
         learn(self._bank, GRID, mean * unit, spread * unit**2, elapsed, self.options.memory)
-        risen = np.maximum(self._bank.intensity, before)
-        spread_to_nodes(risen, segments + 1, self._added)
+        # Where the bank knows of an error that the last correction left, the noise was too low: as if it came at once.
+        left = (self._bank.weight * self._bank.error).sum(axis=1)
+        doubt = (self._bank.weight * self._bank.variance).sum(axis=1)
+        excess = np.where(seen, np.maximum(left**2 - SURE**2 * doubt, 0.0), 0.0)
+        self._intensity = self._bank.intensity + excess / max(elapsed, MIN_INTERVAL)
+        spread_to_nodes(np.maximum(self._intensity, before), segments + 1, self._added)
         spread_to_nodes(before, segments + 1, self._work)
-        extra = np.maximum(self._added - self._work, 0.0) * (elapsed / unit**2)
+        extra = np.maximum(self._added - self._work, 0.0) * (max(elapsed, MIN_INTERVAL) / unit**2)
         extra[0] = 0.0
         self._variance = self._variance + extra
         self._density = self._density + 2.0 * self._length * extra

@@ -10,8 +10,8 @@ import numpy as np
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.association import (
-    PATH_ERROR,
     Vector,
+    path_lengths,
     path_without_outliers,
     project,
     search_start,
@@ -23,6 +23,8 @@ MAX_POINTS = 4  # of a piece, for each segment that it could cover; of more, eve
 MAX_PIECES = 64  # of an observation
 MAX_COORDINATE = 10.0  # m
 DETOUR = 8.0  # standard deviations that noise may lengthen the path by at a point
+STEP = 20.0  # standard deviations; steps of a path over which its length is measured
+WHOLE = 0.05  # of the length, by which a piece from the tail to the free end may differ and still be the thread
 GATE = 4.0  # standard deviations; a piece of unknown arc length that is farther from the prior is another thread's
 OVERLAP = 0.5  # of a piece; if so much of it lies where another one does already, it is that one again or not ours
 FRESH_POINTS = 2  # of a piece, at the least
@@ -38,7 +40,7 @@ class PlacedPiece:
         share: of its information that is a point's own, shape (m,).
         arcs: from the first point, shape (m,) [D].
         start: arc length of the first point [D].
-        reach: how far from it the points may lie [D].
+        slack: how far from its arc length the first point may lie [D].
         attached: whether it begins at the needle's tail.
         free_end: whether it ends where the thread ends.
         square: mean squared distance from the prior [D^2].
@@ -49,7 +51,7 @@ class PlacedPiece:
     share: Vector
     arcs: Vector
     start: float
-    reach: float
+    slack: float
     attached: bool
     free_end: bool
     square: float
@@ -57,7 +59,7 @@ class PlacedPiece:
     def projected(self, nodes: Points) -> tuple[Vector, Vector]:
         """Return arc length and innovation of each point on a thread, nan where it lies beyond an end."""
         place, innovation = np.full(len(self.points), np.nan), np.zeros(len(self.points))
-        project(nodes, self.points, self.arcs, self.start, self.reach, place, innovation)
+        project(nodes, self.points, self.arcs, self.start, self.slack, place, innovation)
         return place, innovation
 
 
@@ -128,16 +130,22 @@ def _place(
     if stride > 1:
         points, deviation = points[::stride], deviation[::stride]
     kept = np.zeros(len(points), dtype=np.bool_)
-    path_without_outliers(points, max(DETOUR * float(np.median(deviation)), 0.5), kept)
+    spacing = float(np.median(np.hypot(*np.diff(points, axis=0).T)))
+    # More than a point's own stretch of the path, or the shortest one would end early.
+    path_without_outliers(points, max(DETOUR * float(np.median(deviation)), 2.0 * spacing), kept)
     points, deviation = np.ascontiguousarray(points[kept]), deviation[kept]
     if len(points) < FRESH_POINTS:
         return "a piece has fewer than two points on a path"
-    steps = np.hypot(*np.diff(points, axis=0).T)
-    arcs = np.concatenate([[0.0], np.cumsum(steps)])
+    arcs = np.empty(len(points))
+    path_lengths(points, STEP * float(np.median(deviation)), arcs)
+    steps = np.diff(arcs)
     if not arcs[-1] > 0.0:
         return "a piece has no length"
-    if arcs[-1] * (1.0 - PATH_ERROR) > segments + 2.0:
+    if arcs[-1] * (1.0 - WHOLE) > segments:
         return f"a piece {arcs[-1] * unit * 1e3:.1f} mm long, longer than the thread"
+    ends = (piece.first_end, piece.last_end)
+    if set(ends) == {PieceEnd.TAIL, PieceEnd.FREE} and abs(arcs[-1] / segments - 1.0) < WHOLE:
+        arcs *= segments / arcs[-1]
     own = np.empty(len(points))  # of the path's length, that a point stands for
     own[0], own[-1] = steps[0], steps[-1]
     own[1:-1] = 0.5 * (steps[1:] + steps[:-1])
@@ -156,18 +164,18 @@ def _place(
         other = search_start(nodes, np.ascontiguousarray(points[::-1]), arcs[-1] - arcs[::-1], low, high, cap)
         if other[1] < best[1]:
             best, turned = other, True
-    ends = (piece.first_end, piece.last_end)
     if turned:
         points, arcs = np.ascontiguousarray(points[::-1]), np.ascontiguousarray(arcs[-1] - arcs[::-1])
         deviation, share, ends = deviation[::-1], share[::-1], ends[::-1]
-    reach = 2.0 + 0.5 * (high - low if _known(piece) else 0.0) + 2.0 * math.sqrt(float(variance.max()))
+    # A place that was searched for is as good as the prior lets it be.
+    slack = 2.0 * float(np.median(deviation)) + (0.25 if high > low else 0.0)
     found = PlacedPiece(
         points,
         np.ascontiguousarray(deviation**2),
         np.ascontiguousarray(share),
         arcs,
         best[0],
-        min(reach, 0.25 * segments),
+        slack,
         attached,
         ends[1] is PieceEnd.FREE,
         best[1],
@@ -189,6 +197,15 @@ def _not_ours(piece: PlacedPiece, nodes: Points, variance: Vector) -> str:
     if float(np.median(off)) > GATE**2 or float((off > GATE**2).mean()) > 0.3:
         return "a piece lies too far from the predicted thread: it is of another one"
     return ""
+
+
+def smoothed(points: Points, arcs: Vector, length: float) -> Points:
+    """Return a path averaged over a length along it, by a normal distribution of that standard deviation."""
+    weights = np.exp(-0.5 * ((arcs[:, None] - arcs[None, :]) / length) ** 2)
+    # Towards an end the average is taken over less, evenly to both sides, so that the end stays where it is.
+    room = np.minimum(arcs, arcs[-1] - arcs)
+    weights *= np.abs(arcs[:, None] - arcs[None, :]) <= room[:, None] + 1e-12
+    return np.asarray(weights @ points / weights.sum(axis=1, keepdims=True))
 
 
 def through_obstacle(start: Points, points: Points, workspace: Workspace, margin: float) -> np.ndarray:
