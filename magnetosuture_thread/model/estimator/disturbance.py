@@ -62,3 +62,37 @@ def force_density(
     bend = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
     turn[1:-1] = np.einsum("ij,ij->i", bend, normal[1:-1]) / unit
     return np.asarray(unit * drag_across * np.einsum("ij,ij->i", normal, rate) - tensions * turn)
+
+
+def strongest(force: Vector, positions: Points, unit: float, significance: float, since: float) -> Disturbance:
+    """Return the stretch of thread with the greatest force to one side.
+
+    Args:
+        force: on each node along its normal, shape (n + 1,) [N].
+        positions: shape (n + 1, 2) [m].
+        unit: D [m].
+        significance: [standard deviations]
+        since: [s]
+    """
+    # Stretches of one sign; the needle itself, node 0, carries what acts on it.
+    signs = np.sign(force[1:])
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(signs)) + 1, [len(signs)]])
+    sums = np.add.reduceat(force[1:], starts[:-1])
+    k = int(np.abs(sums).argmax())
+    nodes = np.arange(starts[k], starts[k + 1]) + 1
+    share = force[nodes] / sums[k] if sums[k] != 0.0 else np.full(len(nodes), 1.0 / len(nodes))
+    middle = float(share @ nodes)
+    along = np.gradient(positions, axis=0)
+    at = int(round(middle))
+    tangent = along[at] / max(float(np.hypot(*along[at])), 1e-12)
+    place = np.array([np.interp(middle, np.arange(len(positions)), positions[:, axis]) for axis in range(2)])
+    side = 1.0 if sums[k] >= 0.0 else -1.0
+    return Disturbance(
+        arc_length=middle * unit,
+        extent=len(nodes) * unit,
+        position=place,
+        direction=side * np.array([-tangent[1], tangent[0]]),
+        force=abs(float(sums[k])),
+        significance=significance,
+        since=since,
+    )

@@ -22,7 +22,7 @@ from magnetosuture_thread.model.estimator.correction import (
     propagate,
     robust_weights,
 )
-from magnetosuture_thread.model.estimator.disturbance import Disturbance, force_density
+from magnetosuture_thread.model.estimator.disturbance import Disturbance, force_density, strongest
 from magnetosuture_thread.model.estimator.noise import (
     GRID,
     WINDOWS,
@@ -46,6 +46,10 @@ RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselv
 LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
+SCALE_MEMORY = 5.0  # s; over which the scale of the points' variance is learned
+MIN_SCALE, MAX_SCALE = 0.25, 16.0
+FOUND, LOST = 5.0, 3.0  # standard deviations at which a disturbance begins and ends
+CONFIRMED = 0.5  # of `disturbance_time`, for which it must last
 SURE = 3.0  # standard deviations
 MIN_INTERVAL = 1e-3  # s; between measurements, in which noise can be at work
 MIN_VARIANCE = 1e-12  # D^2
@@ -157,6 +161,10 @@ class FilterState:
     rate_time: float
     gross: int
     since: float
+    scale: float
+    last_mean: Vector
+    last_variance: Vector
+    significance: Vector
 
 
 class ThreadEstimator:
@@ -211,6 +219,9 @@ class ThreadEstimator:
         self._rate, self._rate_time = np.zeros((nodes, 2)), 0.0
         self._gross = 0
         self._since = math.nan
+        self._scale = 1.0
+        self._last_mean, self._last_variance = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)
+        self._significance = np.zeros(WINDOWS)
 
     @property
     def started(self) -> bool:
@@ -367,7 +378,8 @@ class ThreadEstimator:
                     problems.append(f"{int(parted.sum())} points lie beyond an obstacle")
                     good[np.flatnonzero(far)[parted]] = False
             if good.any():
-                found.append((place[good], innovation[good], piece.variance[good], piece.share[good]))
+                variance = self._scale * piece.variance[good]
+                found.append((place[good], innovation[good], variance, piece.share[good]))
         if not found:
             return None
         return MeasuredPoints(*(np.ascontiguousarray(np.concatenate(each)) for each in zip(*found, strict=True)))
@@ -448,6 +460,7 @@ class ThreadEstimator:
         )
         shift_errors(self._bank, applied * unit)
         self._rate += moved * (unit / self.options.disturbance_time)
+        self._test(np.einsum("ia,ia->i", normals, self._rate), innovations, pose.stamp)
         positions = self._memory.about * unit
         corrected = ThreadState(positions, state.velocities, state.interval)
         status = self._prediction
@@ -488,6 +501,7 @@ class ThreadEstimator:
         known = np.bincount(window, precision * prior, WINDOWS)[seen] / total[seen]
         variance[seen] = (spread[seen] + known) * unit**2
         before = self._bank.intensity.copy()
+        self._learn_scale(mean * unit, spread * unit**2 / self._scale, seen, elapsed)
         learn(self._bank, GRID, mean * unit, spread * unit**2, elapsed, self.options.memory)
         # Where the bank knows of an error that the last correction left, the noise was too low: as if it came at once.
         left = (self._bank.weight * self._bank.error).sum(axis=1)
@@ -502,6 +516,19 @@ class ThreadEstimator:
         self._density = self._density + 2.0 * self._length * extra
         mean[~seen] = np.nan
         return Innovations(mean * unit, variance), window
+
+    def _learn_scale(self, mean: Vector, variance: Vector, seen: NDArray[np.bool_], elapsed: float) -> None:
+        """Learn by how much the points' variance is larger than told, from what changes between two frames.
+
+            E (nu_k - nu_{k-1})^2 = 2 s r,    as errors of the model last, and those of two frames are independent
+        """
+        both = seen & np.isfinite(self._last_mean)
+        if both.any():
+            change = (mean - self._last_mean)[both] ** 2
+            ratio = float(np.minimum(change / (variance + self._last_variance)[both], MAX_SCALE).mean())
+            share = 1.0 - math.exp(-elapsed / SCALE_MEMORY)
+            self._scale = min(max(self._scale + share * (ratio - self._scale), MIN_SCALE), MAX_SCALE)
+        self._last_mean, self._last_variance = np.where(seen, mean, np.nan), variance
 
     def _decay_rate(self, interval: float) -> None:
         share = math.exp(-interval / self.options.disturbance_time)
@@ -557,8 +584,41 @@ class ThreadEstimator:
             compute_rows=compute_rows,
         )
 
+    def _test(self, across: Vector, innovations: Innovations, stamp: float) -> None:
+        """Test what the camera moved the thread by in the last moments, in each window.
+
+            z = |sum of corrections| / (2 S)^(1/2),    S the variance of one innovation
+
+        Corrections of a right model are a difference of two errors of the estimate; those that go on in one direction
+        are of something that the model does not know.
+        """
+        segments = self.thread.segments
+        window = np.minimum(np.arange(1, segments + 1) * WINDOWS // (segments + 1), WINDOWS - 1)
+        mean = np.bincount(window, across[1:], WINDOWS) / np.maximum(np.bincount(window, minlength=WINDOWS), 1)
+        moved = self.options.disturbance_time * np.abs(mean)
+        seen = np.isfinite(innovations.variance)
+        self._significance = np.where(seen, moved / np.sqrt(2.0 * np.where(seen, innovations.variance, 1.0)), 0.0)
+        if self._significance.max() > FOUND:
+            self._since = stamp if math.isnan(self._since) else self._since
+        elif self._significance.max() < LOST:
+            self._since = math.nan
+
     def _disturbances(self) -> tuple[Disturbance, ...]:
-        return ()
+        """Return the forces that explain what the camera moves the thread by, if it does so for long."""
+        state, pose = self.predictor.state, self.predictor.pose
+        assert state is not None and pose is not None
+        if not pose.stamp - self._since >= CONFIRMED * self.options.disturbance_time:
+            return ()
+        medium = self.thread.medium
+        return (
+            strongest(
+                force_density(self._rate, state.positions, medium.drag_across, medium.drag_along),
+                state.positions,
+                self._unit,
+                float(self._significance.max()),
+                self._since,
+            ),
+        )
 
     def snapshot(self) -> FilterState | None:
         """Return everything that the next step depends on; None before the start."""
@@ -577,6 +637,10 @@ class ThreadEstimator:
             self._rate_time,
             self._gross,
             self._since,
+            self._scale,
+            self._last_mean,
+            self._last_variance,
+            self._significance,
         )
 
     def restore(self, kept: FilterState) -> None:
@@ -586,4 +650,6 @@ class ThreadEstimator:
         self._density, self._variance = kept.density.copy(), kept.variance.copy()
         self._bank, self._measured_at = kept.bank.copied(), kept.measured_at
         self._rate, self._rate_time = kept.rate.copy(), kept.rate_time
-        self._gross, self._since = kept.gross, kept.since
+        self._gross, self._since, self._scale = kept.gross, kept.since, kept.scale
+        self._last_mean, self._last_variance = kept.last_mean, kept.last_variance
+        self._significance = kept.significance
