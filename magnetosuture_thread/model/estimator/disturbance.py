@@ -36,11 +36,12 @@ class Disturbance:
 
 
 def force_density(
-    rate: Points, positions: Points, drag_across: float, drag_along: float, tension: float = 0.0
+    rate: Points, positions: Points, drag_across: float, drag_along: float, bending: float = 0.0
 ) -> Vector:
     """Return the normal force on each node that explains a velocity that the model does not predict [N].
 
-        f_i = D zeta_perp n_i . r_i + T_i kappa_i,    T_i = T_n + sum_{j > i} D zeta_par t_j . r_j
+        f_i = D zeta_perp n_i . r_i + (dt EI / D^3) n_i . (second differences of c(r))_i + T_i kappa_i
+        T_i = -sum_{j > i} D zeta_par t_j . r_j,    c(r)_i = r_{i+1} - 2 r_i + r_{i-1}
 
     The force of what touches the thread is across it; along it the tension alone balances the drag.
 
@@ -49,7 +50,7 @@ def force_density(
         positions: shape (n + 1, 2) [m].
         drag_across: zeta_perp [Pa s].
         drag_along: zeta_par [Pa s].
-        tension: T_n at the free end [N].
+        bending: dt EI, the stiffness times the interval over which r was averaged [N m^2 s].
     """
     along = np.gradient(positions, axis=0)
     size = np.maximum(np.hypot(*along.T), 1e-12)
@@ -57,11 +58,17 @@ def force_density(
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     unit = float(size.mean())
     pull = unit * drag_along * np.einsum("ij,ij->i", tangent, rate)
-    tensions = tension - (np.cumsum(pull[::-1])[::-1] - pull)
+    tensions = -(np.cumsum(pull[::-1])[::-1] - pull)
     turn = np.zeros(len(positions))
     bend = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
     turn[1:-1] = np.einsum("ij,ij->i", bend, normal[1:-1]) / unit
-    return np.asarray(unit * drag_across * np.einsum("ij,ij->i", normal, rate) - tensions * turn)
+    curved = np.zeros_like(rate)
+    curved[1:-1] = rate[2:] - 2.0 * rate[1:-1] + rate[:-2]
+    bent = -2.0 * curved
+    bent[1:] += curved[:-1]
+    bent[:-1] += curved[1:]
+    force = unit * drag_across * rate + bending / unit**3 * bent
+    return np.asarray(np.einsum("ij,ij->i", normal, force) - tensions * turn)
 
 
 def strongest(force: Vector, positions: Points, unit: float, significance: float, since: float) -> Disturbance:

@@ -47,9 +47,10 @@ LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farthe
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
 SCALE_MEMORY = 5.0  # s; over which the scale of the points' variance is learned
+SCALE_PRIOR = 0.2  # s; that what the camera tells of its variance is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
-FOUND, LOST = 5.0, 3.0  # standard deviations at which a disturbance begins and ends
-CONFIRMED = 0.5  # of `disturbance_time`, for which it must last
+FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
+CONFIRMED = 0.25  # of `disturbance_time`, for which it must last
 SURE = 3.0  # standard deviations
 MIN_INTERVAL = 1e-3  # s; between measurements, in which noise can be at work
 MIN_VARIANCE = 1e-12  # D^2
@@ -161,7 +162,7 @@ class FilterState:
     rate_time: float
     gross: int
     since: float
-    scale: float
+    scale: tuple[float, float, float]
     last_mean: Vector
     last_variance: Vector
     significance: Vector
@@ -219,7 +220,7 @@ class ThreadEstimator:
         self._rate, self._rate_time = np.zeros((nodes, 2)), 0.0
         self._gross = 0
         self._since = math.nan
-        self._scale = 1.0
+        self._scale, self._elapsed, self._scaled = 1.0, 0.0, 0.0
         self._last_mean, self._last_variance = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)
         self._significance = np.zeros(WINDOWS)
 
@@ -473,6 +474,7 @@ class ThreadEstimator:
             residual=max(status.residual, *residuals),
             converged=status.converged,
         )
+        self._elapsed = elapsed if math.isfinite(elapsed) else 0.0
         self._measured_at = pose.stamp
         seen = np.zeros(segments, dtype=np.bool_)
         seen[low] = True
@@ -526,7 +528,8 @@ class ThreadEstimator:
         if both.any():
             change = (mean - self._last_mean)[both] ** 2
             ratio = float(np.minimum(change / (variance + self._last_variance)[both], MAX_SCALE).mean())
-            share = 1.0 - math.exp(-elapsed / SCALE_MEMORY)
+            self._scaled = min(self._scaled + elapsed, SCALE_MEMORY)
+            share = min(elapsed / (self._scaled + SCALE_PRIOR), 1.0)
             self._scale = min(max(self._scale + share * (ratio - self._scale), MIN_SCALE), MAX_SCALE)
         self._last_mean, self._last_variance = np.where(seen, mean, np.nan), variance
 
@@ -612,7 +615,13 @@ class ThreadEstimator:
         medium = self.thread.medium
         return (
             strongest(
-                force_density(self._rate, state.positions, medium.drag_across, medium.drag_along),
+                force_density(
+                    self._rate,
+                    state.positions,
+                    medium.drag_across,
+                    medium.drag_along,
+                    self.thread.bending_stiffness * self._elapsed,
+                ),
                 state.positions,
                 self._unit,
                 float(self._significance.max()),
@@ -637,7 +646,7 @@ class ThreadEstimator:
             self._rate_time,
             self._gross,
             self._since,
-            self._scale,
+            (self._scale, self._elapsed, self._scaled),
             self._last_mean,
             self._last_variance,
             self._significance,
@@ -650,6 +659,7 @@ class ThreadEstimator:
         self._density, self._variance = kept.density.copy(), kept.variance.copy()
         self._bank, self._measured_at = kept.bank.copied(), kept.measured_at
         self._rate, self._rate_time = kept.rate.copy(), kept.rate_time
-        self._gross, self._since, self._scale = kept.gross, kept.since, kept.scale
+        self._gross, self._since = kept.gross, kept.since
+        self._scale, self._elapsed, self._scaled = kept.scale
         self._last_mean, self._last_variance = kept.last_mean, kept.last_variance
         self._significance = kept.significance
