@@ -63,6 +63,13 @@ class EstimatorSession:
         self._moments.clear()
         self._early.clear()
 
+    def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
+        """Start from a shape that is given; without it, straight behind the needle."""
+        self.reset()
+        estimate = self._estimator.start(pose, centreline)
+        self._moments.append(_Moment(pose, after=self._estimator.snapshot()))
+        return EstimationResult(estimate, estimate)
+
     def on_pose(self, pose: NeedlePose) -> EstimationResult:
         """Follow the needle to its next pose; an observation of its frame that came before it is taken with it.
 
