@@ -106,7 +106,7 @@ def post_in_the_way(material: str, attachment: str, seed: int, duration: float) 
         centre = rng.uniform(-0.011, 0.011, 2)
         gap = np.array([np.min(np.linalg.norm(thread - centre, axis=1)) for thread in run.threads[::10]]) - POST_RADIUS
         apart = float(np.min(np.linalg.norm(tails - centre, axis=1))) - POST_RADIUS
-        if gap[: third // 10].min() > 3e-4 and gap[third // 10 : third // 5].min() < -5e-4 and apart > 3e-4:
+        if gap[: third // 10].min() > 3e-4 and gap[third // 10 : third // 5].min() < -2e-4 and apart > 1e-4:
             return Disc((float(centre[0]), float(centre[1])), POST_RADIUS)
     return None
 

@@ -39,7 +39,7 @@ class Errors:
     @classmethod
     def of(cls, errors: NDArray[np.float64]) -> Errors:
         """Return both figures of errors of any shape."""
-        return cls(float(errors.mean()), float(errors.max()))
+        return cls(float(errors.mean()), float(errors.max())) if errors.size else cls(0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -198,13 +198,13 @@ def measure_case(
         prediction=Errors.of(_flat(errors["prediction"])),
         camera=Errors.of(_flat(errors["camera"])) if with_trackers else None,
         registration=Errors.of(_flat(errors["registration"])) if with_trackers else None,
-        consistent=float(np.mean(inside)),
-        innovation=float(np.mean(np.concatenate(innovations))),
+        consistent=float(np.mean(inside)) if inside else 0.0,
+        innovation=float(np.mean(np.concatenate([np.ones(1), *innovations]))),
         worse=worse,
         runs=runs,
         found=found,
         false_alarms=alarms,
-        met=met and (case.post != "unknown" or found >= 0.95 * runs),
+        met=met and runs > 0 and (case.post != "unknown" or found >= 0.95 * runs),
     )
 
 
@@ -218,7 +218,7 @@ def _off(nodes: NDArray[np.float64], truth: NDArray[np.float64], length: float) 
 
 
 def _flat(errors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    return np.concatenate([each.ravel() for each in errors])
+    return np.concatenate([np.empty(0), *(each.ravel() for each in errors)])
 
 
 def _judged(case: Case, run: Run, contact: int, segments: int) -> tuple[slice, slice]:
