@@ -160,7 +160,7 @@ class FilterState:
     measured_at: float
     rate: Points
     rate_time: float
-    gross: int
+    gross: tuple[int, bool]
     since: float
     scale: tuple[float, float, float]
     last_mean: Vector
@@ -218,7 +218,7 @@ class ThreadEstimator:
         self._bank = NoiseBank.of(WINDOWS)
         self._measured_at = -math.inf
         self._rate, self._rate_time = np.zeros((nodes, 2)), 0.0
-        self._gross = 0
+        self._gross, self._unknown = 0, True
         self._since = math.nan
         self._scale, self._elapsed, self._scaled = 1.0, 0.0, 0.0
         self._last_mean, self._last_variance = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)
@@ -271,6 +271,7 @@ class ThreadEstimator:
             known = (LAID_DEVIATION * self.options.min_deviation if deviation is None else deviation) / self._unit
             variance = known**2 + (self.options.initial_error * np.maximum(arcs - seen, 0.0)) ** 2
         self._set_variance(variance)
+        self._unknown = centreline is None
         return self._estimate(())
 
     def start_observed(self, pose: NeedlePose, observation: ThreadObservation) -> Estimate:
@@ -328,7 +329,7 @@ class ThreadEstimator:
         At once where the estimate is known to be as bad as that, else when a second frame says so too. What the piece
         does not show goes on as it lay.
         """
-        fresh = not math.isfinite(self._measured_at)
+        fresh = self._unknown
         if not piece.attached or (not fresh and piece.square < LARGE_ERROR**2):
             self._gross = 0
             return None
@@ -352,7 +353,9 @@ class ThreadEstimator:
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         chain = chain_inside(path, segments, unit, radius)
         laid = ThreadState.at_rest(chain)
-        self._prediction = self.predictor.continue_from(pose, laid)
+        self._unknown = False
+        # Whether it lies outside of obstacles is not known before it is corrected.
+        self._prediction = replace(self.predictor.continue_from(pose, laid), converged=False)
         arcs = np.arange(segments + 1.0)
         known = LAID_DEVIATION**2 * float(np.median(piece.variance))
         self._set_variance(known + (self.options.initial_error * np.maximum(arcs - end, 0.0)) ** 2)
@@ -472,8 +475,9 @@ class ThreadEstimator:
             solver=status.solver,
             status=status.status,
             residual=max(status.residual, *residuals),
-            converged=status.converged,
+            converged=True,
         )
+        self._unknown = False
         self._elapsed = elapsed if math.isfinite(elapsed) else 0.0
         self._measured_at = pose.stamp
         seen = np.zeros(segments, dtype=np.bool_)
@@ -644,7 +648,7 @@ class ThreadEstimator:
             self._measured_at,
             self._rate.copy(),
             self._rate_time,
-            self._gross,
+            (self._gross, self._unknown),
             self._since,
             (self._scale, self._elapsed, self._scaled),
             self._last_mean,
@@ -659,7 +663,7 @@ class ThreadEstimator:
         self._density, self._variance = kept.density.copy(), kept.variance.copy()
         self._bank, self._measured_at = kept.bank.copied(), kept.measured_at
         self._rate, self._rate_time = kept.rate.copy(), kept.rate_time
-        self._gross, self._since = kept.gross, kept.since
+        (self._gross, self._unknown), self._since = kept.gross, kept.since
         self._scale, self._elapsed, self._scaled = kept.scale
         self._last_mean, self._last_variance = kept.last_mean, kept.last_variance
         self._significance = kept.significance

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from threads import DEVIATION, LENGTH, error_percent, estimator_of, piece_of, poses, thread_of, true_shapes, whole
+from test.model.estimator.threads import DEVIATION, LENGTH, error_percent, estimator_of, piece_of, poses, thread_of, true_shapes, whole
 
 from magnetosuture_thread import Disc
 from magnetosuture_thread.model.estimator.association import path_lengths, path_without_outliers, search_start

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from threads import LENGTH, RATE, error_percent, estimator_of, piece_of, poses, thread_of, true_shapes, whole
+from test.model.estimator.threads import LENGTH, RATE, error_percent, estimator_of, piece_of, poses, thread_of, true_shapes, whole
 
 from magnetosuture_thread import Disc
 from magnetosuture_thread.model.estimator.correction import (
