@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.barrier import Barrier, BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
@@ -236,10 +236,13 @@ class ThreadPredictor:
         """Nodes that stay where they are."""
         return self._fixed
 
-    def continue_from(self, pose: NeedlePose, state: ThreadState) -> Prediction:
+    def continue_from(self, pose: NeedlePose, state: ThreadState) -> None:
         """Continue from another state at a pose: what was estimated, or a moment in the past."""
         self._pose, self._state = pose, state
-        return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0), True)
+
+    def margins_of(self, rows: Sequence[BarrierRows]) -> Margins:
+        """Return the margins of barriers' rows, as those of a prediction."""
+        return Margins.of(rows, self._contact_tolerance, self._scene_version)
 
     def warm_up(self) -> None:
         """Step a straight thread, so that no kernel is compiled in the first callback."""
@@ -385,7 +388,7 @@ class ThreadPredictor:
 
         def compute_margins() -> Margins:
             rows = [*formulation.margins(positions, pose.heading), *added]
-            return Margins.of(rows, self._contact_tolerance, self._scene_version)
+            return self.margins_of(rows)
 
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))

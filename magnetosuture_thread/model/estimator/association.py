@@ -51,6 +51,37 @@ def path_without_outliers(points: Points, penalty: float, kept: NDArray[np.bool_
 
 
 @compiled
+def clean_path(
+    points: Points, deviation: Vector, detour: float, step: float, correlation: float
+) -> tuple[Points, Vector, Vector, Vector]:
+    """Return the points of a piece that lie on its path, their deviations, arc lengths and shares of information.
+
+    Args:
+        points: shape (m, 2).
+        deviation: of each, shape (m,), same unit.
+        detour: deviations that noise may lengthen the path by at a point.
+        step: deviations, over which the path's length is measured.
+        correlation: length over which points err alike; those closer share one point's information.
+    """
+    count = len(points)
+    spacing = np.empty(count - 1)
+    for k in range(count - 1):
+        spacing[k] = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
+    kept = np.empty(count, dtype=np.bool_)
+    # More than a point's own stretch of the path, or the shortest one would end early.
+    path_without_outliers(points, max(detour * np.median(deviation), 2.0 * np.median(spacing)), kept)
+    points, deviation = points[kept], deviation[kept]
+    count = len(points)
+    arcs, share = np.zeros(count), np.ones(count)
+    path_lengths(points, step * np.median(deviation), arcs)
+    for k in range(count):
+        own = 0.5 * (arcs[min(k + 1, count - 1)] - arcs[max(k - 1, 0)])
+        own *= 2.0 if k in (0, count - 1) else 1.0
+        share[k] = min(1.0, own / correlation)
+    return points, deviation, arcs, share
+
+
+@compiled
 def mean_square_at(nodes: Points, points: Points, arcs: Vector, start: float, cap: float) -> float:
     """Return the mean squared distance of points from the thread at their arc lengths, each at most `cap`.
 

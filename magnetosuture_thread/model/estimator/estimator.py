@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,9 @@ from magnetosuture_thread.model.estimator.correction import (
     MeasuredPoints,
     correct,
     propagate,
-    robust_weights,
 )
 from magnetosuture_thread.model.estimator.disturbance import Disturbance, force_density, strongest
+from magnetosuture_thread.model.estimator.innovations import WindowSums, moved_apart, take_over, weigh
 from magnetosuture_thread.model.estimator.noise import (
     GRID,
     WINDOWS,
@@ -30,11 +30,13 @@ from magnetosuture_thread.model.estimator.noise import (
     learn,
     shift_errors,
     spread_to_nodes,
+    unexplained,
 )
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.pieces import PlacedPiece, place_pieces, smoothed, through_obstacle
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.model.formulations.step import StepBuffers
+from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -111,17 +113,18 @@ class Estimate:
     noise: Vector
     disturbances: tuple[Disturbance, ...]
     problems: tuple[str, ...]
-    compute_rows: Any = field(repr=False, compare=False)
+    compute_rows: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
+    make_margins: Callable[[Sequence[BarrierRows]], Margins] = field(repr=False, compare=False)
 
     @property
     def stamp(self) -> float:
         """Of the needle's pose [s]."""
         return self.prediction.stamp
 
-    @property
-    def margins(self) -> Any:
-        """Margins of the estimate; see `Prediction`."""
-        return self.prediction.margins
+    @cached_property
+    def margins(self) -> Margins:
+        """The margins of every barrier by its name, of the estimate's positions; computed at first access."""
+        return self.make_margins(self.compute_rows())
 
     @cached_property
     def clearance_bounds(self) -> dict[str, Vector]:
@@ -151,6 +154,8 @@ def _bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
 class FilterState:
     """Everything that the next step and correction depend on."""
 
+    prediction: Prediction
+    converged: bool
     pose: NeedlePose
     thread: ThreadState
     memory: tuple[Vector, Vector]
@@ -206,6 +211,8 @@ class ThreadEstimator:
         self._work = np.empty(nodes)
         self._added = np.empty(nodes)
         self._prediction: Prediction | None = None
+        self._converged = False
+        self._sums, self._applied = WindowSums.of(WINDOWS), np.zeros(WINDOWS)
         self._forget()
 
     def _use(self, buffers: StepBuffers) -> None:
@@ -263,6 +270,7 @@ class ThreadEstimator:
             InvalidInputError: see `ThreadPredictor.start`.
         """
         self._prediction = self.predictor.start(pose, centreline)
+        self._converged = self._prediction.converged
         self._forget()
         arcs = np.arange(self.thread.segments + 1.0)
         variance = (self.options.initial_error * arcs) ** 2
@@ -295,6 +303,7 @@ class ThreadEstimator:
         """
         before = self.predictor.state
         self._prediction = self.predictor.step(pose)
+        self._converged = self._prediction.converged
         state = self.predictor.state
         assert before is not None and state is not None
         spread_to_nodes(self._bank.intensity, len(self._added), self._added)
@@ -353,9 +362,9 @@ class ThreadEstimator:
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         chain = chain_inside(path, segments, unit, radius)
         laid = ThreadState.at_rest(chain)
-        self._unknown = False
         # Whether it lies outside of obstacles is not known before it is corrected.
-        self._prediction = replace(self.predictor.continue_from(pose, laid), converged=False)
+        self._unknown = self._converged = False
+        self.predictor.continue_from(pose, laid)
         arcs = np.arange(segments + 1.0)
         known = LAID_DEVIATION**2 * float(np.median(piece.variance))
         self._set_variance(known + (self.options.initial_error * np.maximum(arcs - end, 0.0)) ** 2)
@@ -408,17 +417,13 @@ class ThreadEstimator:
         problems: list[str],
     ) -> Estimate:
         unit, segments = self._unit, self.thread.segments
-        index = np.arange(segments + 1.0)
         weights = np.ones(len(points.place))
-        prior = np.interp(points.place, index, self._variance)
-        robust_weights(points, points.innovation, points.variance + prior, weights)
         elapsed = pose.stamp - self._measured_at
-        innovations, window = self._learn(points, weights, prior, elapsed if math.isfinite(elapsed) else 0.0)
+        innovations = self._learn(points, weights, elapsed if math.isfinite(elapsed) else 0.0)
         noise = np.empty(segments + 1)
         spread_to_nodes(self._intensity, segments + 1, noise)
         noise /= unit**2
-        prior = np.interp(points.place, index, self._variance)
-        robust_weights(points, points.innovation, points.variance + prior, weights)
+        weigh(points, self._variance, weights, self._sums)
         self._memory.known[:] = self._known
         density = np.maximum(self._density, MIN_VARIANCE)
         start = np.ascontiguousarray(state.positions / unit)
@@ -447,41 +452,17 @@ class ThreadEstimator:
         if code != CORRECTED or off > 1.0:
             problems.append(f"the correction was not solved: residual {max(residuals):.1e}, off by {off:.1g}")
             return self._estimate(tuple(problems), innovations=innovations, points=len(weights))
-        moved = self._memory.moved
-        precision = weights * points.share / points.variance
-        low = np.minimum(points.place.astype(np.int64), segments - 1)
-        part = points.place - low
-        gained = np.bincount(low, precision * (1.0 - part), segments + 1)
-        gained += np.bincount(low + 1, precision * part, segments + 1)
-        self._density = 1.0 / (1.0 / density + gained)
-        self._density[0] = 0.0
-        normals = self._memory.normals
-        self._variance = np.einsum("ia,iab,ib->i", normals, self._memory.covariance, normals)
-        across = np.einsum("ia,ia->i", normals, moved)
-        at_points = (1.0 - part) * across[low] + part * across[low + 1]
-        applied = np.bincount(window, precision * at_points, WINDOWS) / np.maximum(
-            np.bincount(window, precision, WINDOWS), 1e-300
-        )
-        shift_errors(self._bank, applied * unit)
-        self._rate += moved * (unit / self.options.disturbance_time)
-        self._test(np.einsum("ia,ia->i", normals, self._rate), innovations, pose.stamp)
-        positions = self._memory.about * unit
-        corrected = ThreadState(positions, state.velocities, state.interval)
-        status = self._prediction
-        self._prediction = replace(
-            self.predictor.continue_from(pose, corrected),
-            interval=status.interval,
-            substeps=status.substeps,
-            solver=status.solver,
-            status=status.status,
-            residual=max(status.residual, *residuals),
-            converged=True,
-        )
+        self._density, self._variance = density, np.empty(segments + 1)
+        hidden = take_over(points, weights, self._memory, density, self._variance, self._applied)
+        shift_errors(self._bank, self._applied * unit)
+        self._rate += self._memory.moved * (unit / self.options.disturbance_time)
+        self._test(innovations, pose.stamp)
+        corrected = ThreadState(self._memory.about * unit, state.velocities, state.interval)
+        self.predictor.continue_from(pose, corrected)
+        self._converged = True
         self._unknown = False
         self._elapsed = elapsed if math.isfinite(elapsed) else 0.0
         self._measured_at = pose.stamp
-        seen = np.zeros(segments, dtype=np.bool_)
-        seen[low] = True
         return self._estimate(
             tuple(problems),
             corrected=True,
@@ -489,39 +470,31 @@ class ThreadEstimator:
             residual=max(residuals),
             solves=solves,
             points=len(weights),
-            hidden=1.0 - float(seen.mean()),
+            hidden=hidden,
         )
 
-    def _learn(
-        self, points: MeasuredPoints, weights: Vector, prior: Vector, elapsed: float
-    ) -> tuple[Innovations, NDArray[np.int64]]:
+    def _learn(self, points: MeasuredPoints, weights: Vector, elapsed: float) -> Innovations:
         """Test the innovations of each window, learn the noise from them, and grow the prior where it rose."""
-        unit, segments = self._unit, self.thread.segments
-        window = np.minimum((points.place * (WINDOWS / segments)).astype(np.int64), WINDOWS - 1)
-        precision = weights * points.share / points.variance
-        total = np.bincount(window, precision, WINDOWS)
-        seen = total > 0.0
-        mean, spread, variance = np.zeros(WINDOWS), np.full(WINDOWS, np.inf), np.full(WINDOWS, np.nan)
-        mean[seen] = np.bincount(window, precision * points.innovation, WINDOWS)[seen] / total[seen]
-        spread[seen] = 1.0 / total[seen]
-        known = np.bincount(window, precision * prior, WINDOWS)[seen] / total[seen]
-        variance[seen] = (spread[seen] + known) * unit**2
+        unit, segments, sums = self._unit, self.thread.segments, self._sums
+        weigh(points, self._variance, weights, sums)
+        mean, spread = sums.mean * unit, sums.spread * unit**2
+        seen = np.isfinite(mean)
+        innovations = Innovations(mean, spread + sums.known * unit**2)
+        self._learn_scale(mean, spread / self._scale, seen, elapsed)
         before = self._bank.intensity.copy()
-        self._learn_scale(mean * unit, spread * unit**2 / self._scale, seen, elapsed)
-        learn(self._bank, GRID, mean * unit, spread * unit**2, elapsed, self.options.memory)
+        learn(self._bank, GRID, mean, spread, elapsed, self.options.memory)
         # Where the bank knows of an error that the last correction left, the noise was too low: as if it came at once.
-        left = (self._bank.weight * self._bank.error).sum(axis=1)
-        doubt = (self._bank.weight * self._bank.variance).sum(axis=1)
+        left, doubt = unexplained(self._bank)
         excess = np.where(seen, np.maximum(left**2 - SURE**2 * doubt, 0.0), 0.0)
-        self._intensity = self._bank.intensity + excess / max(elapsed, MIN_INTERVAL)
+        span = max(elapsed, MIN_INTERVAL)
+        self._intensity = self._bank.intensity + excess / span
         spread_to_nodes(np.maximum(self._intensity, before), segments + 1, self._added)
         spread_to_nodes(before, segments + 1, self._work)
-        extra = np.maximum(self._added - self._work, 0.0) * (max(elapsed, MIN_INTERVAL) / unit**2)
+        extra = np.maximum(self._added - self._work, 0.0) * (span / unit**2)
         extra[0] = 0.0
         self._variance = self._variance + extra
         self._density = self._density + 2.0 * self._length * extra
-        mean[~seen] = np.nan
-        return Innovations(mean * unit, variance), window
+        return innovations
 
     def _learn_scale(self, mean: Vector, variance: Vector, seen: NDArray[np.bool_], elapsed: float) -> None:
         """Learn by how much the points' variance is larger than told, from what changes between two frames.
@@ -579,7 +552,7 @@ class ThreadEstimator:
             deviation=self._unit * np.sqrt(np.maximum(self._variance, 0.0)),
             corrected=corrected,
             unmeasured_for=pose.stamp - self._measured_at,
-            converged=prediction.converged,
+            converged=self._converged,
             residual=residual,
             solves=solves,
             points=points,
@@ -589,25 +562,27 @@ class ThreadEstimator:
             disturbances=self._disturbances(),
             problems=problems,
             compute_rows=compute_rows,
+            make_margins=self.predictor.margins_of,
         )
 
-    def _test(self, across: Vector, innovations: Innovations, stamp: float) -> None:
+    def _test(self, innovations: Innovations, stamp: float) -> None:
         """Test what the camera moved the thread by in the last moments, in each window.
-
-            z = |sum of corrections| / (2 S)^(1/2),    S the variance of one innovation
 
         Corrections of a right model are a difference of two errors of the estimate; those that go on in one direction
         are of something that the model does not know.
         """
-        segments = self.thread.segments
-        window = np.minimum(np.arange(1, segments + 1) * WINDOWS // (segments + 1), WINDOWS - 1)
-        mean = np.bincount(window, across[1:], WINDOWS) / np.maximum(np.bincount(window, minlength=WINDOWS), 1)
-        moved = self.options.disturbance_time * np.abs(mean)
-        seen = np.isfinite(innovations.variance)
-        self._significance = np.where(seen, moved / np.sqrt(2.0 * np.where(seen, innovations.variance, 1.0)), 0.0)
-        if self._significance.max() > FOUND:
+        self._significance = np.empty(WINDOWS)
+        moved_apart(
+            self._rate,
+            self._memory.normals,
+            self.options.disturbance_time,
+            innovations.variance,
+            self._significance,
+        )
+        largest = float(self._significance.max())
+        if largest > FOUND:
             self._since = stamp if math.isnan(self._since) else self._since
-        elif self._significance.max() < LOST:
+        elif largest < LOST:
             self._since = math.nan
 
     def _disturbances(self) -> tuple[Disturbance, ...]:
@@ -636,9 +611,11 @@ class ThreadEstimator:
     def snapshot(self) -> FilterState | None:
         """Return everything that the next step depends on; None before the start."""
         state, pose = self.predictor.state, self.predictor.pose
-        if state is None or pose is None:
+        if state is None or pose is None or self._prediction is None:
             return None
         return FilterState(
+            self._prediction,
+            self._converged,
             pose,
             state,
             self._formulation.memory(),
@@ -658,7 +635,8 @@ class ThreadEstimator:
 
     def restore(self, kept: FilterState) -> None:
         """Go back to a snapshot; what follows is the same again to the last bit."""
-        self._prediction = self.predictor.continue_from(kept.pose, kept.thread)
+        self.predictor.continue_from(kept.pose, kept.thread)
+        self._prediction, self._converged = kept.prediction, kept.converged
         self._formulation.restore(kept.memory)
         self._density, self._variance = kept.density.copy(), kept.variance.copy()
         self._bank, self._measured_at = kept.bank.copied(), kept.measured_at

@@ -97,6 +97,11 @@ def learn(
         bank.intensity[w] = np.exp(mean)
 
 
+def unexplained(bank: NoiseBank) -> tuple[Vector, Vector]:
+    """Return the error that each window's filters expect of the estimate [m], and their variance of it [m^2]."""
+    return (bank.weight * bank.error).sum(axis=1), (bank.weight * bank.variance).sum(axis=1)
+
+
 @compiled
 def shift_errors(bank: NoiseBank, correction: Vector) -> None:
     """Take what the estimate was moved by in each window, shape (w,) [m]: it is no error any more."""

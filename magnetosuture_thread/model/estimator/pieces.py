@@ -11,8 +11,7 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.association import (
     Vector,
-    path_lengths,
-    path_without_outliers,
+    clean_path,
     project,
     search_start,
 )
@@ -122,23 +121,18 @@ def _place(
     deviation = np.asarray(piece.deviation, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
         return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
-    good = np.all(np.abs(points) <= MAX_COORDINATE, axis=1) & np.isfinite(deviation) & (deviation >= 0.0)
-    if good.sum() < FRESH_POINTS:
+    good = (np.abs(points) <= MAX_COORDINATE).all(axis=1) & (deviation >= 0.0) & (deviation <= MAX_COORDINATE)
+    if np.count_nonzero(good) < FRESH_POINTS:
         return "a piece has fewer than two finite points"
     points, deviation = points[good] / unit, np.maximum(deviation[good], options.min_deviation) / unit
     stride = math.ceil(len(points) / (MAX_POINTS * segments))
     if stride > 1:
         points, deviation = points[::stride], deviation[::stride]
-    kept = np.zeros(len(points), dtype=np.bool_)
-    spacing = float(np.median(np.hypot(*np.diff(points, axis=0).T)))
-    # More than a point's own stretch of the path, or the shortest one would end early.
-    path_without_outliers(points, max(DETOUR * float(np.median(deviation)), 2.0 * spacing), kept)
-    points, deviation = np.ascontiguousarray(points[kept]), deviation[kept]
+    points, deviation, arcs, share = clean_path(
+        np.ascontiguousarray(points), deviation, DETOUR, STEP, options.point_correlation / unit
+    )
     if len(points) < FRESH_POINTS:
         return "a piece has fewer than two points on a path"
-    arcs = np.empty(len(points))
-    path_lengths(points, STEP * float(np.median(deviation)), arcs)
-    steps = np.diff(arcs)
     if not arcs[-1] > 0.0:
         return "a piece has no length"
     if arcs[-1] * (1.0 - WHOLE) > segments:
@@ -146,10 +140,6 @@ def _place(
     ends = (piece.first_end, piece.last_end)
     if set(ends) == {PieceEnd.TAIL, PieceEnd.FREE} and abs(arcs[-1] / segments - 1.0) < WHOLE:
         arcs *= segments / arcs[-1]
-    own = np.empty(len(points))  # of the path's length, that a point stands for
-    own[0], own[-1] = steps[0], steps[-1]
-    own[1:-1] = 0.5 * (steps[1:] + steps[:-1])
-    share = np.minimum(1.0, own * unit / options.point_correlation)
     low, high = (value / unit for value in piece.arc_length)
     attached = piece.first_end is PieceEnd.TAIL
     known = _known(piece) or attached
@@ -168,7 +158,7 @@ def _place(
         points, arcs = np.ascontiguousarray(points[::-1]), np.ascontiguousarray(arcs[-1] - arcs[::-1])
         deviation, share, ends = deviation[::-1], share[::-1], ends[::-1]
     # A place that was searched for is as good as the prior lets it be.
-    slack = 2.0 * float(np.median(deviation)) + (0.25 if high > low else 0.0)
+    slack = 2.0 * float(deviation.mean()) + (0.25 if high > low else 0.0)
     found = PlacedPiece(
         points,
         np.ascontiguousarray(deviation**2),

@@ -1,0 +1,144 @@
+"""Innovations: what the points say against the prediction, by windows, and what the correction makes of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator.correction import CorrectionBuffers, MeasuredPoints, robust_weights
+
+Vector = NDArray[np.float64]
+
+
+class WindowSums(NamedTuple):
+    """Of each window of equal arc length, shape (w,).
+
+    Attributes:
+        mean: mean innovation of its points, nan where there is none [D].
+        spread: variance of it by the points' own, inf where there is none [D^2].
+        known: variance of the prior, in the points' mean [D^2].
+    """
+
+    mean: Vector
+    spread: Vector
+    known: Vector
+
+    @classmethod
+    def of(cls, windows: int) -> WindowSums:
+        """Return memory for so many windows."""
+        return cls(np.empty(windows), np.empty(windows), np.empty(windows))
+
+
+@compiled
+def _at(values: Vector, place: float) -> float:
+    low = min(int(place), len(values) - 2)
+    return (1.0 - (place - low)) * values[low] + (place - low) * values[low + 1]
+
+
+@compiled
+def weigh(points: MeasuredPoints, variance: Vector, weights: Vector, sums: WindowSums) -> None:
+    """Write the robust weights of the points against the prior, and the sums of the windows.
+
+    Args:
+        points: the points.
+        variance: of the prior at each node across the thread, shape (n + 1,) [D^2].
+        weights: written, shape (m,).
+        sums: written.
+    """
+    count, windows, segments = len(weights), len(sums.mean), len(variance) - 1
+    spread = np.empty(count)
+    for p in range(count):
+        spread[p] = points.variance[p] + _at(variance, points.place[p])
+    robust_weights(points, points.innovation, spread, weights)
+    sums.mean[:], sums.known[:], sums.spread[:] = 0.0, 0.0, 0.0
+    for p in range(count):
+        w = min(int(points.place[p] * windows / segments), windows - 1)
+        precision = weights[p] * points.share[p] / points.variance[p]
+        sums.spread[w] += precision
+        sums.mean[w] += precision * points.innovation[p]
+        sums.known[w] += precision * (spread[p] - points.variance[p])
+    for w in range(windows):
+        total = sums.spread[w]
+        sums.mean[w] = sums.mean[w] / total if total > 0.0 else np.nan
+        sums.known[w] = sums.known[w] / total if total > 0.0 else np.nan
+        sums.spread[w] = 1.0 / total if total > 0.0 else np.inf
+
+
+@compiled
+def take_over(
+    points: MeasuredPoints,
+    weights: Vector,
+    memory: CorrectionBuffers,
+    density: Vector,
+    variance: Vector,
+    applied: Vector,
+) -> float:
+    """Take over a correction: the information gained, what is left of the variance, and what each window was moved by.
+
+    Args:
+        points: the points.
+        weights: robust ones.
+        memory: of the correction.
+        density: v of each node; written [D^2].
+        variance: of each node across the thread; written [D^2].
+        applied: mean correction of the points of each window; written, shape (w,) [D].
+
+    Returns:
+        The part of the thread that no point shows.
+    """
+    segments, windows = len(density) - 1, len(applied)
+    gained, total, seen = np.zeros(segments + 1), np.zeros(windows), np.zeros(segments, dtype=np.bool_)
+    across = np.empty(segments + 1)
+    for i in range(segments + 1):
+        n, c = memory.normals[i], memory.covariance[i]
+        variance[i] = n[0] * n[0] * c[0, 0] + 2.0 * n[0] * n[1] * c[0, 1] + n[1] * n[1] * c[1, 1]
+        across[i] = n[0] * memory.moved[i, 0] + n[1] * memory.moved[i, 1]
+    applied[:] = 0.0
+    for p in range(len(weights)):
+        low = min(int(points.place[p]), segments - 1)
+        part = points.place[p] - low
+        precision = weights[p] * points.share[p] / points.variance[p]
+        gained[low] += precision * (1.0 - part)
+        gained[low + 1] += precision * part
+        w = min(int(points.place[p] * windows / segments), windows - 1)
+        total[w] += precision
+        applied[w] += precision * _at(across, points.place[p])
+        seen[low] = True
+    for w in range(windows):
+        applied[w] = applied[w] / total[w] if total[w] > 0.0 else 0.0
+    for i in range(1, segments + 1):
+        density[i] = 1.0 / (1.0 / density[i] + gained[i])
+    density[0] = 0.0
+    hidden = 0
+    for i in range(segments):
+        hidden += 0 if seen[i] else 1
+    return hidden / segments
+
+
+@compiled
+def moved_apart(rate: Points, normals: Points, time: float, variance: Vector, significance: Vector) -> None:
+    """Write how significant what the camera moved each window by is, over the last moments.
+
+        z = |sum of corrections| / (2 S)^(1/2)
+
+    Args:
+        rate: of the corrections, averaged over `time`, shape (n + 1, 2).
+        normals: shape (n + 1, 2).
+        time: [s]
+        variance: S of one innovation, nan where nothing is measured, shape (w,).
+        significance: z, written, shape (w,).
+    """
+    windows, nodes = len(variance), len(rate)
+    for w in range(windows):
+        total, count = 0.0, 0
+        for i in range(1, nodes):
+            if min(i * windows // nodes, windows - 1) == w:
+                total += normals[i, 0] * rate[i, 0] + normals[i, 1] * rate[i, 1]
+                count += 1
+        significance[w] = 0.0
+        if count > 0 and np.isfinite(variance[w]):
+            significance[w] = time * abs(total) / count / np.sqrt(2.0 * variance[w])
