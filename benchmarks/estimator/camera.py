@@ -34,7 +34,9 @@ class CameraModel:
     hidden: tuple[float, float] = (0.0, 0.0)
     hidden_time: tuple[float, float] = (0.0, 0.0)
 
-    def observe(self, nodes: Points, time: float, rng: np.random.Generator, others: tuple[Points, ...] = ()) -> ThreadObservation:
+    def observe(
+        self, nodes: Points, time: float, rng: np.random.Generator, others: tuple[Points, ...] = ()
+    ) -> ThreadObservation:
         """Return what is seen of a thread, and of other threads in the dish.
 
         Args:
@@ -55,7 +57,12 @@ class CameraModel:
             noisy = points + rng.normal(0.0, self.deviation, points.shape)
             pieces.append(
                 ThreadPiece(
-                    noisy, np.full(len(noisy), self.deviation), PieceEnd.UNKNOWN, PieceEnd.UNKNOWN, (np.nan, np.nan), False
+                    noisy,
+                    np.full(len(noisy), self.deviation),
+                    PieceEnd.UNKNOWN,
+                    PieceEnd.UNKNOWN,
+                    (np.nan, np.nan),
+                    False,
                 )
             )
         return ThreadObservation(tuple(pieces), complete=len(stretches) == 1 and stretches[0] == (0.0, length))

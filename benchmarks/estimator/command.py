@@ -33,7 +33,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the first run (default: 1)")
     parser.add_argument("--cases", nargs="+", choices=list(CASES), metavar="CASE", help="only these; default: all")
     parser.add_argument("--segments", type=int, default=25, metavar="N", help="of the model (default: 25)")
-    parser.add_argument("--trackers", action="store_true", help="compare with the camera alone and a registration tracker")
+    parser.add_argument(
+        "--trackers", action="store_true", help="compare with the camera alone and a registration tracker"
+    )
     parser.add_argument("--references", type=Path, metavar="DIR", help="also on the reference trajectories of a folder")
     parser.add_argument("--long", type=float, default=0.0, metavar="MINUTES", help="also one long run")
 

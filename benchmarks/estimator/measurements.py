@@ -1,4 +1,4 @@
-"""Plays the cases through estimator, predictor, camera alone and registration, and measures errors, consistency and time."""
+"""Plays the cases through estimator, predictor, camera and registration: errors, consistency and time."""
 
 from __future__ import annotations
 

@@ -46,10 +46,10 @@ class CoherentPointDrift:
 
         x ~ sum_m N(y_m + (G w)_m, s^2 I) and uniform outliers,    G_ij = exp(-(arc_i - arc_j)^2 / (2 beta^2))
 
-    with the penalty lambda / 2 tr(w' G w); a dozen steps of expectation and maximisation a frame. Then the nodes are moved
-    to equal distances along the registered curve, and the first one to the needle's tail.
+    with the penalty lambda / 2 tr(w' G w); a dozen steps of expectation and maximisation a frame. Then the first node
+    is moved to the needle's tail, and the others to equal distances along the registered curve.
 
-    Source: A. Myronenko, X. Song, Point Set Registration: Coherent Point Drift, 2010, and J. Xiang et al., TrackDLO, 2023.
+    Source: A. Myronenko, X. Song, Point Set Registration: Coherent Point Drift, 2010; J. Xiang et al., TrackDLO, 2023.
     Deviation: TrackDLO's visibility by depth and its geodesic proximity of hidden nodes are left out.
 
     Args:

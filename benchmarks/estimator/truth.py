@@ -67,8 +67,12 @@ def wander(seed: int, duration: float, rate: float, speed: float) -> tuple[Point
         excess = float(np.linalg.norm(ahead)) - 0.0075
         if excess > 0.0:
             away = math.atan2(-place[1], -place[0])
-            turn += min(excess / 0.003, 1.0) * 1.2 * speed / 1.5e-3 * math.copysign(
-                1.0, math.remainder(away - heading, 2.0 * math.pi)
+            turn += (
+                min(excess / 0.003, 1.0)
+                * 1.2
+                * speed
+                / 1.5e-3
+                * math.copysign(1.0, math.remainder(away - heading, 2.0 * math.pi))
             )
         heading += h * turn
         place = place + h * speed * np.array([math.cos(heading), math.sin(heading)])

@@ -3,9 +3,9 @@
     minimise over d   1/2 d' Lambda d  +  1/2 sum_p w_p (a_p' d - nu_p)^2
     subject to        the segments' chords, obstacles and wall, linearised as in a step and about its own result again
 
-in units of the segment length D. d is how far each node is moved; nu_p is a point's innovation across the thread and
-a_p' d = m_p . ((1 - t) d_i + t d_{i+1}) what the two nodes beside it make of it. Lambda is the information on the
-predicted thread, banded:
+in units of the segment length D. d is how far each node is moved; nu_p is a point's innovation across the thread
+and a_p' d = m_p . ((1 - t) d_i + t d_{i+1}) what the two nodes beside it make of it. Lambda is the information on
+the predicted thread, banded:
 
     d' Lambda d = sum_i (n_i . d_i)^2 / v_i  +  sum_i (l^2 / v_i) |d_{i+1} - d_i|^2  +  sum_i (2 k / q_i) |c_i(d)|^2
 
@@ -95,7 +95,13 @@ def robust_weights(points: MeasuredPoints, residual: Vector, spread: Vector, wei
 
 @compiled
 def prior_information(
-    density: Vector, noise: Vector, length: float, stiffness: float, scale: float, clamped: bool, normals: Points,
+    density: Vector,
+    noise: Vector,
+    length: float,
+    stiffness: float,
+    scale: float,
+    clamped: bool,
+    normals: Points,
     buffers: StepBuffers,
 ) -> None:
     """Write Lambda over a scale into the program.
@@ -143,7 +149,12 @@ def prior_information(
 
 @compiled
 def measured_rows(
-    points: MeasuredPoints, weights: Vector, scale: float, about: Points, row: int, gram: NDArray[np.float64],
+    points: MeasuredPoints,
+    weights: Vector,
+    scale: float,
+    about: Points,
+    row: int,
+    gram: NDArray[np.float64],
     buffers: StepBuffers,
 ) -> int:
     """Write the points of each segment as at most two rows, with the compliance as their variance; return the end.
@@ -346,7 +357,7 @@ def correct(
         if contacts < 0:
             return NO_ROOM, solves, off, found
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
-        if solves > 0 and (off <= 1.0 and change <= CHANGED or solves >= MAX_SOLVES):
+        if solves > 0 and ((off <= 1.0 and change <= CHANGED) or solves >= MAX_SOLVES):
             break
         prior_information(density, noise, length, stiffness, scale, rod.clamped, memory.normals, buffers)
         rows = row + contacts

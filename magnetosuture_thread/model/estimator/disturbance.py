@@ -90,7 +90,7 @@ def strongest(force: Vector, positions: Points, unit: float, significance: float
     share = force[nodes] / sums[k] if sums[k] != 0.0 else np.full(len(nodes), 1.0 / len(nodes))
     middle = float(share @ nodes)
     along = np.gradient(positions, axis=0)
-    at = int(round(middle))
+    at = round(middle)
     tangent = along[at] / max(float(np.hypot(*along[at])), 1e-12)
     place = np.array([np.interp(middle, np.arange(len(positions)), positions[:, axis]) for axis in range(2)])
     side = 1.0 if sums[k] >= 0.0 else -1.0

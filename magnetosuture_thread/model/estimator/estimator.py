@@ -39,7 +39,7 @@ from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.model.solvers import BandedSolver
-from magnetosuture_thread.thread_observation import ThreadObservation
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
 
@@ -49,7 +49,8 @@ LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farthe
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
 SCALE_MEMORY = 5.0  # s; over which the scale of the points' variance is learned
-SCALE_PRIOR = 0.2  # s; that what the camera tells of its variance is worth
+RATIO_MEMORY = 2.0  # s; over which the covariance of innovations is matched to them
+LEARNING_PRIOR = 0.2  # s of measurements, that what is assumed to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
 FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
 CONFIRMED = 0.25  # of `disturbance_time`, for which it must last
@@ -167,7 +168,7 @@ class FilterState:
     rate_time: float
     gross: tuple[int, bool]
     since: float
-    scale: tuple[float, float, float]
+    scale: tuple[float, float, float, float]
     last_mean: Vector
     last_variance: Vector
     significance: Vector
@@ -227,7 +228,7 @@ class ThreadEstimator:
         self._rate, self._rate_time = np.zeros((nodes, 2)), 0.0
         self._gross, self._unknown = 0, True
         self._since = math.nan
-        self._scale, self._elapsed, self._scaled = 1.0, 0.0, 0.0
+        self._scale, self._ratio, self._elapsed, self._learned_for = 1.0, 1.0, 0.0, 0.0
         self._last_mean, self._last_variance = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)
         self._significance = np.zeros(WINDOWS)
 
@@ -241,7 +242,6 @@ class ThreadEstimator:
         self.predictor.warm_up()
         path = np.array([[0.0, 0.0], [-self.thread.length, 0.0]])
         points = np.linspace(path[0], path[1], 50)
-        from magnetosuture_thread.thread_observation import PieceEnd, ThreadPiece
 
         piece = ThreadPiece(points, np.full(50, 1e-5), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), False)
         pose = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
@@ -255,9 +255,7 @@ class ThreadEstimator:
         self._prediction = None
         self._forget()
 
-    def start(
-        self, pose: NeedlePose, centreline: Points | None = None, deviation: float | None = None
-    ) -> Estimate:
+    def start(self, pose: NeedlePose, centreline: Points | None = None, deviation: float | None = None) -> Estimate:
         """Set the thread's shape.
 
         Args:
@@ -305,7 +303,8 @@ class ThreadEstimator:
         self._prediction = self.predictor.step(pose)
         self._converged = self._prediction.converged
         state = self.predictor.state
-        assert before is not None and state is not None
+        assert before is not None
+        assert state is not None
         spread_to_nodes(self._bank.intensity, len(self._added), self._added)
         self._added *= self._prediction.interval / self._unit**2
         self._added[0] = 0.0
@@ -320,7 +319,8 @@ class ThreadEstimator:
         state, pose = self.predictor.state, self.predictor.pose
         if state is None or pose is None:
             raise InvalidInputError("thread observation", "one before the start", "a centreline first")
-        unit, problems = self._unit, []
+        unit = self._unit
+        problems: list[str] = []
         nodes = state.positions / unit
         placed = place_pieces(observation, nodes, self._variance, unit, self.options, problems)
         if placed and (laid := self._laid_along(placed[0], pose, state)) is not None:
@@ -349,7 +349,12 @@ class ThreadEstimator:
             return None
         self._gross = 0
         unit, segments = self._unit, self.thread.segments
-        path = np.vstack([pose.tail, smoothed(piece.points, piece.arcs, SMOOTHING * self.options.point_correlation / unit)[1:] * unit])
+        path = np.vstack(
+            [
+                pose.tail,
+                smoothed(piece.points, piece.arcs, SMOOTHING * self.options.point_correlation / unit)[1:] * unit,
+            ]
+        )
         path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 0.0])]
         at = int(min(end, segments - 1.0))
         if at < segments - 1 and len(path) >= 2:
@@ -456,12 +461,13 @@ class ThreadEstimator:
         hidden = take_over(points, weights, self._memory, density, self._variance, self._applied)
         shift_errors(self._bank, self._applied * unit)
         self._rate += self._memory.moved * (unit / self.options.disturbance_time)
-        self._test(innovations, pose.stamp)
+        self._test(pose.stamp)
         corrected = ThreadState(self._memory.about * unit, state.velocities, state.interval)
         self.predictor.continue_from(pose, corrected)
         self._converged = True
         self._unknown = False
         self._elapsed = elapsed if math.isfinite(elapsed) else 0.0
+        self._learned_for += self._elapsed
         self._measured_at = pose.stamp
         return self._estimate(
             tuple(problems),
@@ -479,7 +485,10 @@ class ThreadEstimator:
         weigh(points, self._variance, weights, sums)
         mean, spread = sums.mean * unit, sums.spread * unit**2
         seen = np.isfinite(mean)
-        innovations = Innovations(mean, spread + sums.known * unit**2)
+        expected = spread + sums.known * unit**2
+        innovations = Innovations(mean, self._ratio * expected)
+        if seen.any():
+            self._ratio += self._share(elapsed, RATIO_MEMORY) * (float((mean**2 / expected)[seen].mean()) - self._ratio)
         self._learn_scale(mean, spread / self._scale, seen, elapsed)
         before = self._bank.intensity.copy()
         learn(self._bank, GRID, mean, spread, elapsed, self.options.memory)
@@ -499,16 +508,19 @@ class ThreadEstimator:
     def _learn_scale(self, mean: Vector, variance: Vector, seen: NDArray[np.bool_], elapsed: float) -> None:
         """Learn by how much the points' variance is larger than told, from what changes between two frames.
 
-            E (nu_k - nu_{k-1})^2 = 2 s r,    as errors of the model last, and those of two frames are independent
+        E (nu_k - nu_{k-1})^2 = 2 s r,    as errors of the model last, and those of two frames are independent
         """
         both = seen & np.isfinite(self._last_mean)
         if both.any():
             change = (mean - self._last_mean)[both] ** 2
             ratio = float(np.minimum(change / (variance + self._last_variance)[both], MAX_SCALE).mean())
-            self._scaled = min(self._scaled + elapsed, SCALE_MEMORY)
-            share = min(elapsed / (self._scaled + SCALE_PRIOR), 1.0)
+            share = self._share(elapsed, SCALE_MEMORY)
             self._scale = min(max(self._scale + share * (ratio - self._scale), MIN_SCALE), MAX_SCALE)
         self._last_mean, self._last_variance = np.where(seen, mean, np.nan), variance
+
+    def _share(self, elapsed: float, memory: float) -> float:
+        """Return the share of a new value in a mean: of all values so far at first, later of those in a memory."""
+        return min(elapsed / (min(self._learned_for, memory) + LEARNING_PRIOR), 1.0)
 
     def _decay_rate(self, interval: float) -> None:
         share = math.exp(-interval / self.options.disturbance_time)
@@ -532,14 +544,18 @@ class ThreadEstimator:
         hidden: float = 1.0,
     ) -> Estimate:
         prediction, pose, state = self._prediction, self.predictor.pose, self.predictor.state
-        assert prediction is not None and pose is not None and state is not None
+        assert prediction is not None
+        assert pose is not None
+        assert state is not None
         formulation, positions = self._formulation, state.positions
+        # Where innovations are larger than expected, so are the errors that are left.
+        scale = self._unit**2 * max(self._ratio, 1.0)
         if corrected:
-            covariance = self._memory.covariance * self._unit**2
+            covariance = scale * self._memory.covariance
         else:
             along = np.gradient(positions, axis=0)
             normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
-            covariance = self._unit**2 * self._variance[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            covariance = scale * self._variance[:, None, None] * normal[:, :, None] * normal[:, None, :]
         added = formulation.added.rows(positions)
 
         def compute_rows() -> list[BarrierRows]:
@@ -549,7 +565,7 @@ class ThreadEstimator:
             prediction=prediction,
             positions=positions,
             covariance=covariance,
-            deviation=self._unit * np.sqrt(np.maximum(self._variance, 0.0)),
+            deviation=np.sqrt(scale * np.maximum(self._variance, 0.0)),
             corrected=corrected,
             unmeasured_for=pose.stamp - self._measured_at,
             converged=self._converged,
@@ -565,7 +581,7 @@ class ThreadEstimator:
             make_margins=self.predictor.margins_of,
         )
 
-    def _test(self, innovations: Innovations, stamp: float) -> None:
+    def _test(self, stamp: float) -> None:
         """Test what the camera moved the thread by in the last moments, in each window.
 
         Corrections of a right model are a difference of two errors of the estimate; those that go on in one direction
@@ -576,7 +592,7 @@ class ThreadEstimator:
             self._rate,
             self._memory.normals,
             self.options.disturbance_time,
-            innovations.variance,
+            self._sums.spread * self._unit**2,
             self._significance,
         )
         largest = float(self._significance.max())
@@ -588,7 +604,8 @@ class ThreadEstimator:
     def _disturbances(self) -> tuple[Disturbance, ...]:
         """Return the forces that explain what the camera moves the thread by, if it does so for long."""
         state, pose = self.predictor.state, self.predictor.pose
-        assert state is not None and pose is not None
+        assert state is not None
+        assert pose is not None
         if not pose.stamp - self._since >= CONFIRMED * self.options.disturbance_time:
             return ()
         medium = self.thread.medium
@@ -627,7 +644,7 @@ class ThreadEstimator:
             self._rate_time,
             (self._gross, self._unknown),
             self._since,
-            (self._scale, self._elapsed, self._scaled),
+            (self._scale, self._ratio, self._elapsed, self._learned_for),
             self._last_mean,
             self._last_variance,
             self._significance,
@@ -642,6 +659,6 @@ class ThreadEstimator:
         self._bank, self._measured_at = kept.bank.copied(), kept.measured_at
         self._rate, self._rate_time = kept.rate.copy(), kept.rate_time
         (self._gross, self._unknown), self._since = kept.gross, kept.since
-        self._scale, self._elapsed, self._scaled = kept.scale
+        self._scale, self._ratio, self._elapsed, self._learned_for = kept.scale
         self._last_mean, self._last_variance = kept.last_mean, kept.last_variance
         self._significance = kept.significance

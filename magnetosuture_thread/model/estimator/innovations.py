@@ -36,7 +36,7 @@ class WindowSums(NamedTuple):
 @compiled
 def _at(values: Vector, place: float) -> float:
     low = min(int(place), len(values) - 2)
-    return (1.0 - (place - low)) * values[low] + (place - low) * values[low + 1]
+    return float((1.0 - (place - low)) * values[low] + (place - low) * values[low + 1])
 
 
 @compiled
@@ -123,13 +123,16 @@ def take_over(
 def moved_apart(rate: Points, normals: Points, time: float, variance: Vector, significance: Vector) -> None:
     """Write how significant what the camera moved each window by is, over the last moments.
 
-        z = |sum of corrections| / (2 S)^(1/2)
+        z = |sum of corrections| / (2 r)^(1/2)
+
+    Corrections of a right model are a difference of two errors of the estimate, and neither is larger than that of the
+    points alone.
 
     Args:
         rate: of the corrections, averaged over `time`, shape (n + 1, 2).
         normals: shape (n + 1, 2).
         time: [s]
-        variance: S of one innovation, nan where nothing is measured, shape (w,).
+        variance: r of the mean of a window's points, inf where nothing is measured, shape (w,).
         significance: z, written, shape (w,).
     """
     windows, nodes = len(variance), len(rate)

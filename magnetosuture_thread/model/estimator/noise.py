@@ -57,9 +57,7 @@ class NoiseBank(NamedTuple):
 
 
 @compiled
-def learn(
-    bank: NoiseBank, grid: Vector, innovation: Vector, variance: Vector, interval: float, memory: float
-) -> None:
+def learn(bank: NoiseBank, grid: Vector, innovation: Vector, variance: Vector, interval: float, memory: float) -> None:
     """Take the windows' mean innovations.
 
     Args:

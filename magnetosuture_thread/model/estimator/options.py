@@ -35,7 +35,7 @@ class EstimatorOptions:
     frame_correlation: float = 0.0
     memory: float = 1.0
     initial_error: float = 0.2
-    disturbance_time: float = 0.2
+    disturbance_time: float = 0.4
     history: float = 1.0
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""From an observation to points on the thread: each piece checked, placed along the thread, or refused with a reason."""
+"""From an observation to points on the thread: each piece is checked, and placed along it or refused with a reason."""
 
 from __future__ import annotations
 

@@ -45,8 +45,8 @@ class EstimationResult:
 class EstimatorSession:
     """Estimates the thread over one run.
 
-    A late observation is folded in at its stamp: the filter goes back to the pose of its frame and takes all later poses
-    and observations again. So the estimate is, to the last bit, the one that would have been had it come in time.
+    A late observation is folded in at its stamp: the filter goes back to the pose of its frame and takes all later
+    poses and observations again. So the estimate is, to the last bit, the one that would have been had it come in time.
 
     Args:
         estimator: warmed up.
@@ -91,8 +91,8 @@ class EstimatorSession:
     def on_observation(self, stamp: float, observation: ThreadObservation) -> EstimationResult:
         """Take what a frame shows of the thread, at the pose of that frame.
 
-        An observation of a frame whose pose has not come yet waits for it. One that is older than what is kept, of a frame
-        without a pose, or of one that was observed already, is refused.
+        An observation of a frame whose pose has not come yet waits for it. One that is older than what is kept, of a
+        frame without a pose, or of one that was observed already, is refused.
         """
         if not np.isfinite(stamp):
             return self._refused(stamp, "a finite time [s]")
@@ -122,7 +122,8 @@ class EstimatorSession:
         if before is None:
             # The oldest moment that is kept: its own step cannot be taken again, but be corrected after it.
             first = self._moments[index]
-            assert first.after is not None and first.observation is not None
+            assert first.after is not None
+            assert first.observation is not None
             self._estimator.restore(first.after)
             measured = estimate = self._estimator.correct(first.observation)
             first.after = self._estimator.snapshot()

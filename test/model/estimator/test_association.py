@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test.model.estimator.threads import DEVIATION, LENGTH, error_percent, estimator_of, piece_of, poses, thread_of, true_shapes, whole
 
 from magnetosuture_thread import Disc
 from magnetosuture_thread.model.estimator.association import path_lengths, path_without_outliers, search_start
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from test.model.estimator.threads import (
+    DEVIATION,
+    LENGTH,
+    error_percent,
+    estimator_of,
+    piece_of,
+    poses,
+    thread_of,
+    true_shapes,
+    whole,
+)
 
 NAN = (float("nan"), float("nan"))
 
@@ -39,7 +49,9 @@ def test_start_of_a_piece_is_found_along_the_thread() -> None:
     at = np.arange(0.0, 8.0, 0.25)
     along = np.concatenate([[0.0], np.hypot(*np.diff(nodes, axis=0).T).cumsum()])
     unit = nodes * 29.0 / along[-1]
-    chain = np.column_stack([np.interp(np.linspace(0.0, 29.0, 30), along * 29.0 / along[-1], unit[:, a]) for a in (0, 1)])
+    chain = np.column_stack(
+        [np.interp(np.linspace(0.0, 29.0, 30), along * 29.0 / along[-1], unit[:, a]) for a in (0, 1)]
+    )
     points = np.column_stack([np.interp(11.3 + at, np.arange(30.0), chain[:, a]) for a in (0, 1)])
     found, square = search_start(chain, points, at, 0.0, 21.0, 100.0)
     assert found == pytest.approx(11.3, abs=0.06)
@@ -104,9 +116,10 @@ def test_points_beyond_an_obstacle_are_refused() -> None:
     beyond = (piece.points[:, 0] < -0.0094) & (piece.points[:, 0] > -0.0106)
     piece.points[beyond, 1] = 0.0045
     estimate = estimator.step(way[1], ThreadObservation((piece,)))
-    assert any("obstacle" in problem or "path" in problem for problem in estimate.problems) or np.abs(
-        estimate.positions[:, 1]
-    ).max() < 1e-4
+    assert (
+        any("obstacle" in problem or "path" in problem for problem in estimate.problems)
+        or np.abs(estimate.positions[:, 1]).max() < 1e-4
+    )
     assert np.abs(estimate.positions[:, 1]).max() < 1e-4
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test.model.estimator.threads import LENGTH, RATE, error_percent, estimator_of, piece_of, poses, thread_of, true_shapes, whole
 
 from magnetosuture_thread import Disc
 from magnetosuture_thread.model.estimator.correction import (
@@ -23,6 +22,17 @@ from magnetosuture_thread.model.program import as_quadratic_program
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.model.solvers.banded import assemble_matrix, factorise
 from magnetosuture_thread.thread_observation import ThreadObservation
+from test.model.estimator.threads import (
+    LENGTH,
+    RATE,
+    error_percent,
+    estimator_of,
+    piece_of,
+    poses,
+    thread_of,
+    true_shapes,
+    whole,
+)
 
 NODES = 13
 
@@ -159,7 +169,9 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
         (0.0, np.inf),
         1e-6,
     )
-    assert code == CORRECTED and off <= 1.0 and max(residuals) < 1e-6
+    assert code == CORRECTED
+    assert off <= 1.0
+    assert max(residuals) < 1e-6
     check = StepBuffers.of(NODES, 2, 1, 2)
     prior_information(density, noise, 2.0, 0.5, 1.0, False, memory.normals, check)
     information = dense_of(check, np.zeros(NODES, dtype=np.bool_), 0)[2:, 2:][1::2, 1::2]
@@ -177,9 +189,9 @@ def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> No
     nodes = np.column_stack([-np.arange(10.0), np.zeros(10)])
     variance = np.zeros(10)
     variance[5] = 1.0
-    propagate(nodes + [1.0, 0.0], nodes, np.zeros(10), variance, np.empty(10))
+    propagate([*nodes, 1.0, 0.0], nodes, np.zeros(10), variance, np.empty(10))
     np.testing.assert_allclose(variance, np.eye(10)[6], atol=1e-12)
-    propagate(nodes + [0.0, 1.0], nodes, np.full(10, 0.1), variance, np.empty(10))
+    propagate([*nodes, 0.0, 1.0], nodes, np.full(10, 0.1), variance, np.empty(10))
     np.testing.assert_allclose(variance, np.eye(10)[6] + 0.1, atol=1e-12)
 
 
@@ -214,8 +226,14 @@ def test_constraints_hold_after_a_correction() -> None:
         assert estimate.converged
         gap = np.linalg.norm(estimate.positions - np.array(disc.centre), axis=1) - disc.radius - 0.5 * thread.diameter
         assert gap.min() > -1.5e-7
-        assert np.abs(estimator.predictor.formulation.rest_lengths(estimate.positions, pose.heading)
-                      / np.linalg.norm(np.diff(estimate.positions, axis=0), axis=1) - 1.0).max() < 1.5e-3
+        assert (
+            np.abs(
+                estimator.predictor.formulation.rest_lengths(estimate.positions, pose.heading)
+                / np.linalg.norm(np.diff(estimate.positions, axis=0), axis=1)
+                - 1.0
+            ).max()
+            < 1.5e-3
+        )
 
 
 def test_without_observations_the_estimate_is_the_prediction_to_the_last_bit() -> None:
@@ -225,7 +243,8 @@ def test_without_observations_the_estimate_is_the_prediction_to_the_last_bit() -
     alone.start(way[0])
     for pose in way[1:]:
         estimate = estimator.step(pose)
-        assert not estimate.corrected and estimate.unmeasured_for == np.inf
+        assert not estimate.corrected
+        assert estimate.unmeasured_for == np.inf
         np.testing.assert_array_equal(estimate.positions, alone.step(pose).positions)
 
 
@@ -237,7 +256,8 @@ def test_a_wrong_model_is_corrected() -> None:
     alone.start(way[0])
     for k, pose in enumerate(way[1:], 1):
         estimate, prediction = estimator.step(pose, whole(truth[k], k)), alone.step(pose)
-    assert estimate.corrected and RATE * estimate.unmeasured_for < 0.5
+    assert estimate.corrected
+    assert RATE * estimate.unmeasured_for < 0.5
     assert error_percent(estimate.positions, truth[-1]) < 0.15 < 1.0 < error_percent(prediction.positions, truth[-1])
 
 

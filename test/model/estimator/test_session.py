@@ -6,6 +6,14 @@ import math
 
 import numpy as np
 import pytest
+
+from magnetosuture_thread import Disc
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
+from magnetosuture_thread.model.estimator.session import observation_of
+from magnetosuture_thread.model.predictor import ThreadPredictor
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.estimator.threads import (
     DEVIATION,
     LENGTH,
@@ -19,14 +27,6 @@ from test.model.estimator.threads import (
     whole,
 )
 
-from magnetosuture_thread import Disc
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
-from magnetosuture_thread.model.estimator.session import observation_of
-from magnetosuture_thread.model.predictor import ThreadPredictor
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-
 
 def session_of(**options: float) -> EstimatorSession:
     return EstimatorSession(estimator_of(thread_of(), options=EstimatorOptions(**options)))
@@ -39,6 +39,7 @@ def test_late_observations_give_the_estimate_of_those_in_time() -> None:
     for k, pose in enumerate(way):
         in_time.on_observation(pose.stamp, whole(truth[k], k))
         expected = in_time.on_pose(pose).estimate
+    found = expected
     rng = np.random.default_rng(1)
     arrivals = sorted((k + rng.integers(0, 8), rng.random(), k) for k in range(60))
     for now in range(70):
@@ -52,6 +53,7 @@ def test_late_observations_give_the_estimate_of_those_in_time() -> None:
                     assert result.measured.corrected
                 found = result.estimate or found
     assert expected is not None
+    assert found is not None
     np.testing.assert_array_equal(found.positions, expected.positions)
     np.testing.assert_array_equal(found.covariance, expected.covariance)
     np.testing.assert_array_equal(found.noise, expected.noise)
@@ -84,17 +86,21 @@ def test_observations_that_cannot_be_used_are_refused() -> None:
         (way[-3].stamp + 1e-3, "kept"),
     ):
         problem = session.on_observation(stamp, whole(truth[-1], 1)).problem
-        assert problem is not None and words in str(problem)
+        assert problem is not None
+        assert words in str(problem)
     assert session.on_observation(way[-1].stamp, whole(truth[-1], 1)).problem is None
     problem = session.on_observation(way[-1].stamp, whole(truth[-1], 1)).problem
-    assert problem is not None and "second" in str(problem)
+    assert problem is not None
+    assert "second" in str(problem)
 
 
 def bad_pieces(nodes: np.ndarray) -> list[tuple[str, tuple[ThreadPiece, ...]]]:
     good = piece_of(nodes, 1)
     nan = np.full((5, 2), np.nan)
     ends = (PieceEnd.UNKNOWN, PieceEnd.UNKNOWN)
-    many = np.column_stack([np.interp(np.linspace(0, 1, 10_000), np.linspace(0, 1, len(nodes)), nodes[:, a]) for a in (0, 1)])
+    many = np.column_stack(
+        [np.interp(np.linspace(0, 1, 10_000), np.linspace(0, 1, len(nodes)), nodes[:, a]) for a in (0, 1)]
+    )
     return [
         ("two finite points", (ThreadPiece(nan, np.full(5, 1e-5), *ends, (0.0, 0.0)), good)),
         ("shapes", (ThreadPiece(np.zeros((4, 2)), np.zeros(3), *ends, (0.0, 0.0)), good)),
@@ -117,9 +123,11 @@ def test_bad_pieces_are_survived_with_the_reason(index: int) -> None:
         session.on_pose(pose)
         words, pieces = bad_pieces(truth[k])[index]
         result = session.on_observation(pose.stamp, ThreadObservation(pieces))
-        assert result.problem is None and result.estimate is not None
+        assert result.problem is None
+        assert result.estimate is not None
         assert np.isfinite(result.estimate.positions).all()
         assert any(words in problem for problem in result.estimate.problems) or not words
+    assert result.estimate is not None
     assert error_percent(result.estimate.positions, truth[-1]) < 0.2
 
 
@@ -135,7 +143,7 @@ def test_pieces_in_the_wrong_order_are_the_same() -> None:
             result = session.on_observation(pose.stamp, ThreadObservation(tuple(pieces[::-1] if turned else pieces)))
         assert result.estimate is not None
         last.append(result.estimate.positions)
-    np.testing.assert_array_equal(*last)
+    np.testing.assert_array_equal(last[0], last[1])
 
 
 def test_a_minute_without_observations_is_told_and_recovered_from() -> None:
@@ -149,10 +157,12 @@ def test_a_minute_without_observations_is_told_and_recovered_from() -> None:
         session.on_observation(pose.stamp, whole(truth[k], k))
     for pose in rest:
         estimate = session.on_pose(pose).estimate
-    assert estimate is not None and not estimate.corrected
+    assert estimate is not None
+    assert not estimate.corrected
     assert estimate.unmeasured_for == pytest.approx(rest[-1].stamp - way[-1].stamp)
     result = session.on_observation(rest[-1].stamp, whole(estimate.positions, 1))
-    assert result.estimate is not None and result.estimate.corrected
+    assert result.estimate is not None
+    assert result.estimate.corrected
 
 
 def test_time_set_back_starts_anew() -> None:
@@ -160,7 +170,9 @@ def test_time_set_back_starts_anew() -> None:
     for pose in way:
         session.on_pose(pose)
     result = session.on_pose(way[0])
-    assert result.problem is None and result.estimate is not None and result.estimate.unmeasured_for == math.inf
+    assert result.problem is None
+    assert result.estimate is not None
+    assert result.estimate.unmeasured_for == math.inf
 
 
 def test_a_centreline_that_ends_early_is_taken() -> None:
