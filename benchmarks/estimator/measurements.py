@@ -279,7 +279,7 @@ def measure_cost(segments: int, seed: int) -> dict[str, float]:
 
 
 def measure_references(folder: Path, seed: int, progress: Callable[[], None]) -> dict[str, dict[str, float]]:
-    """Return errors on reference trajectories, in % of the length: estimate and prediction by name of the trajectory."""
+    """Return errors on reference trajectories, in % of the length, by the trajectory's name."""
     found = {}
     for path in sorted(folder.glob("*.npz")):
         progress()

@@ -29,7 +29,8 @@ def path_without_outliers(points: Points, penalty: float, kept: NDArray[np.bool_
 
     Args:
         points: shape (m, 2).
-        penalty: more than what noise adds to the path, and than the points' spacing, less than twice the distance of an outlier; same unit.
+        penalty: more than what noise adds to the path, and than the points' spacing, less than twice the distance of
+            an outlier; same unit.
         kept: written, shape (m,).
     """
     count = len(points)

@@ -9,9 +9,9 @@ the predicted thread, banded:
 
     d' Lambda d = sum_i (n_i . d_i)^2 / v_i  +  sum_i (l^2 / v_i) |d_{i+1} - d_i|^2  +  sum_i (2 k / q_i) |c_i(d)|^2
 
-The first two terms are errors of a variance of v / 2 l that are alike over a length l: sqrt(1 + (l k)^4), which a filter
-would have for forces that are, is between both at every wave number k. The third is what bending leaves of errors under a
-noise of intensity q; k = EI / (zeta D^4). With no constraint active this is the measurement update of a Kalman filter,
+The first two terms are errors of a variance of v / 2 l that are alike over a length l. Under forces that are alike over
+it a filter would have sqrt(1 + (l k)^4) in the place of 1 + (l k)^2 at the wave number k, which is never less than 0.7
+of it. The third is what bending leaves of errors under a noise of intensity q; k = EI / (zeta D^4). With no constraint active this is the measurement update of a Kalman filter,
 and the inverse of the program's matrix its covariance.
 
 Source: maximum a posteriori estimation; the information of the steady state of Riccati's equation for a rod in a
@@ -40,6 +40,7 @@ MAX_REWEIGHTED = 3  # of them with new robust weights
 FREEDOM = 4.0  # degrees of freedom of Student's distribution of a point's error
 ALONG = 1e-6  # information along the thread over that across it; the chords hold it there
 RIGID = 10.0  # information on the thread's longest bending wave over that of the points; more changes nothing
+NEIGHBOURS = 2  # on each side of a point, that it is compared with
 CHANGED = 0.1  # of a robust weight, from which on the program is solved again
 
 
@@ -79,15 +80,28 @@ def robust_weights(points: MeasuredPoints, residual: Vector, spread: Vector, wei
 
         w = (f + 1) / (f + r^2 / s)
 
+    with r less the median of the errors of its neighbours, where that is smaller: what many say is no outlier but
+    where the thread is.
+
     Args:
         points: the points.
         residual: r of each.
         spread: s, the variance of r.
         weights: written, at most 1.
     """
-    change = 0.0
-    for p in range(len(residual)):
-        weight = min(1.0, (FREEDOM + 1.0) / (FREEDOM + residual[p] * residual[p] / spread[p]))
+    change, count = 0.0, len(residual)
+    near = np.empty(2 * NEIGHBOURS + 1)
+    for p in range(count):
+        first, last = max(0, p - NEIGHBOURS), min(count, p + NEIGHBOURS + 1)
+        for k in range(first, last):  # sorted by insertion
+            at = k - first
+            while at > 0 and near[at - 1] > residual[k]:
+                near[at] = near[at - 1]
+                at -= 1
+            near[at] = residual[k]
+        off = residual[p] - near[(last - first) // 2]
+        off = off if abs(off) < abs(residual[p]) else residual[p]
+        weight = min(1.0, (FREEDOM + 1.0) / (FREEDOM + off * off / spread[p]))
         change = max(change, abs(weight - weights[p]))
         weights[p] = weight
     return change
@@ -325,8 +339,8 @@ def correct(
         tolerance: largest residual of a solution.
 
     Returns:
-        `CORRECTED`, `NO_ROOM` for contacts, or `FAILED`; number of solves; how far off the hard constraints are over what
-        is allowed, at most 1 where they hold; the residuals of the last solve.
+        `CORRECTED`, `NO_ROOM` for contacts, or `FAILED`; number of solves; how far off the hard constraints are over
+        what is allowed, at most 1 where they hold; the residuals of the last solve.
     """
     nodes, segments = len(start), len(start) - 1
     known, about, moved = memory.known, memory.about, memory.moved

@@ -82,7 +82,7 @@ class Estimate:
     """The thread at one instant, as model and camera have it.
 
     Attributes:
-        prediction: the step that led to it; its positions, residual and margins are the model's, from the last estimate.
+        prediction: the step that led to it; its positions and margins are the model's, from the last estimate.
         positions: of all nodes, shape (n + 1, 2) [m].
         covariance: of each node, shape (n + 1, 2, 2) [m^2].
         deviation: of each node across the thread, shape (n + 1,) [m].

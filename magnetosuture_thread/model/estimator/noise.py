@@ -21,7 +21,7 @@ from magnetosuture_thread.compiled import compiled
 
 Vector = NDArray[np.float64]
 
-WINDOWS = 8
+WINDOWS = 16
 GRID = 10.0 ** np.arange(-17.0, -5.5)
 """Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
 QUIET = 1e-14  # before anything is measured [m^2/s]

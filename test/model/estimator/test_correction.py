@@ -189,9 +189,9 @@ def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> No
     nodes = np.column_stack([-np.arange(10.0), np.zeros(10)])
     variance = np.zeros(10)
     variance[5] = 1.0
-    propagate([*nodes, 1.0, 0.0], nodes, np.zeros(10), variance, np.empty(10))
+    propagate(nodes + np.array([1.0, 0.0]), nodes, np.zeros(10), variance, np.empty(10))
     np.testing.assert_allclose(variance, np.eye(10)[6], atol=1e-12)
-    propagate([*nodes, 0.0, 1.0], nodes, np.full(10, 0.1), variance, np.empty(10))
+    propagate(nodes + np.array([0.0, 1.0]), nodes, np.full(10, 0.1), variance, np.empty(10))
     np.testing.assert_allclose(variance, np.eye(10)[6] + 0.1, atol=1e-12)
 
 
