@@ -11,8 +11,8 @@ the predicted thread, banded:
 
 The first two terms are errors of a variance of v / 2 l that are alike over a length l. Under forces that are alike over
 it a filter would have sqrt(1 + (l k)^4) in the place of 1 + (l k)^2 at the wave number k, which is never less than 0.7
-of it. The third is what bending leaves of errors under a noise of intensity q; k = EI / (zeta D^4). With no constraint active this is the measurement update of a Kalman filter,
-and the inverse of the program's matrix its covariance.
+of it. The third is what bending leaves of errors under a noise of intensity q; k = EI / (zeta D^4). With no constraint
+active this is the measurement update of a Kalman filter, and the inverse of the program's matrix its covariance.
 
 Source: maximum a posteriori estimation; the information of the steady state of Riccati's equation for a rod in a
 viscous liquid. Deviation: [Forghani2025] has no estimate, its program runs open loop.
