@@ -19,7 +19,7 @@ from magnetosuture_thread.evaluation.reference import read_reference
 from magnetosuture_thread.evaluation.reference_scores import reference_thread
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.model.estimator import Estimate, EstimatorSession, ThreadEstimator
+from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -112,12 +112,12 @@ def _bent(nodes: Points, length: float) -> Points:
 
 def play(
     case: Case, run: Run, seen: Sequence[ThreadObservation | None], estimator: ThreadEstimator, first: Points
-) -> list[Estimate]:
+) -> list[ThreadEstimate]:
     """Return the estimate at each pose but the first, as it is known when the pose comes."""
     session = EstimatorSession(estimator)
     estimator.reset()
     poses = [_scaled(pose, case.camera) for pose in run.poses]
-    estimates: list[Estimate] = []
+    estimates: list[ThreadEstimate] = []
     for index, pose in enumerate(poses):
         late = seen[index - case.latency] if index >= case.latency else None
         observed = late if case.start == "measured" or index > 0 else None
@@ -233,13 +233,13 @@ def _judged(case: Case, run: Run, contact: int, segments: int) -> tuple[slice, s
     return frames, nodes
 
 
-def _squared(estimates: Sequence[Estimate]) -> NDArray[np.float64]:
+def _squared(estimates: Sequence[ThreadEstimate]) -> NDArray[np.float64]:
     """Return normalised innovations squared of each frame's windows, nan where nothing is measured."""
     empty = np.full(len(estimates[0].noise), np.nan)
     return np.array([each.innovations.normalised_squared if each.innovations else empty for each in estimates])
 
 
-def _within_band(estimates: Sequence[Estimate], squared: NDArray[np.float64]) -> list[bool]:
+def _within_band(estimates: Sequence[ThreadEstimate], squared: NDArray[np.float64]) -> list[bool]:
     """Return of each window of 5 s whether the mean is within the band that 95 % of means of so many are in."""
     stamps = np.array([each.stamp for each in estimates])
     inside = []

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from magnetosuture_thread.model.estimator.disturbance import Disturbance
-from magnetosuture_thread.model.estimator.estimator import Estimate, ThreadEstimator
+from magnetosuture_thread.model.estimator.estimate import ThreadEstimate
+from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.session import EstimatorSession
 
-__all__ = ["Disturbance", "Estimate", "EstimatorOptions", "EstimatorSession", "ThreadEstimator"]
+__all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"]

@@ -29,6 +29,7 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
+from magnetosuture_thread.model.estimator.covariance import selected_inverse
 from magnetosuture_thread.model.formulations.rod_step import STRAIN_TOLERANCE, RodProperties, segment_rows
 from magnetosuture_thread.model.formulations.step import DEPTH_TOLERANCE, StepBuffers, contact_rows, program_of
 from magnetosuture_thread.model.solvers import banded
@@ -75,7 +76,7 @@ def normals_of(positions: Points, normals: Points) -> None:
 
 
 @compiled
-def robust_weights(points: MeasuredPoints, residual: Vector, spread: Vector, weights: Vector) -> float:
+def robust_weights(points: MeasuredPoints, residual: Vector, variance: Vector, weights: Vector) -> float:
     """Write the weight of each point's error under Student's distribution; return the largest change.
 
         w = (f + 1) / (f + r^2 / s)
@@ -86,7 +87,7 @@ def robust_weights(points: MeasuredPoints, residual: Vector, spread: Vector, wei
     Args:
         points: the points.
         residual: r of each.
-        spread: s, the variance of r.
+        variance: s, the variance of r.
         weights: written, at most 1.
     """
     change, count = 0.0, len(residual)
@@ -101,7 +102,7 @@ def robust_weights(points: MeasuredPoints, residual: Vector, spread: Vector, wei
             near[at] = residual[k]
         off = residual[p] - near[(last - first) // 2]
         off = off if abs(off) < abs(residual[p]) else residual[p]
-        weight = min(1.0, (FREEDOM + 1.0) / (FREEDOM + off * off / spread[p]))
+        weight = min(1.0, (FREEDOM + 1.0) / (FREEDOM + off * off / variance[p]))
         change = max(change, abs(weight - weights[p]))
         weights[p] = weight
     return change
@@ -182,7 +183,7 @@ def measured_rows(
         scale: by which information is divided.
         about: where segments' normals are taken, shape (n + 1, 2).
         row: the first row.
-        gram: memory, shape (n, 5).
+        gram: written, shape (n, 5).
         buffers: written from that row on.
     """
     gram[:] = 0.0
@@ -236,31 +237,6 @@ def measured_rows(
     return row
 
 
-@compiled
-def selected_inverse(width: int, unknowns: int, band: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
-    """Write the entries within the band of the inverse of L D L', in time linear in its size.
-
-        Z = D^-1 L^-1 + (I - L') Z,    column by column from the last
-
-    Args:
-        width: half-width of the band.
-        unknowns: size of the matrix.
-        band: L D L' as `banded.factorise` leaves it.
-        inverse: written: [j, k] is the entry of row j + k and column j, shape (unknowns + width, width + 1).
-
-    Source: K. Takahashi, J. Fagan, M.-S. Chen 1973.
-    """
-    inverse[unknowns:] = 0.0
-    for j in range(unknowns - 1, -1, -1):
-        for a in range(width, -1, -1):
-            value = band[j, 0] if a == 0 else 0.0
-            for k in range(1, width + 1):
-                low, high = (a, k) if a <= k else (k, a)
-                # Z[j + a, j + k], which for a = 0 is in the column being written.
-                value -= band[j, k] * (inverse[j, k] if a == 0 else inverse[j + low, high - low])
-            inverse[j, a] = value
-
-
 class CorrectionBuffers(NamedTuple):
     """Memory of a correction, kept from one to the next.
 
@@ -284,7 +260,7 @@ class CorrectionBuffers(NamedTuple):
 
     @classmethod
     def of(cls, nodes: int) -> CorrectionBuffers:
-        """Return memory for a thread of so many nodes."""
+        """Return work for a thread of so many nodes."""
         return cls(
             np.zeros((nodes, 2)),
             np.zeros((nodes - 1, 5)),
@@ -306,7 +282,7 @@ def correct(
     buffers: StepBuffers,
     workspace: WorkspaceData,
     solver_buffers: banded.SolverBuffers,
-    memory: CorrectionBuffers,
+    work: CorrectionBuffers,
     start: Points,
     heading: Points,
     density: Vector,
@@ -326,7 +302,7 @@ def correct(
         buffers: of the program, with room for two rows a segment besides those of the rod.
         workspace: obstacles and wall [m].
         solver_buffers: of the structured solver.
-        memory: `known` is read; `about` gets the corrected thread, `moved` the correction, `covariance` what is left.
+        work: `known` is read; `about` gets the corrected thread, `moved` the correction, `covariance` what is left.
         start: the predicted thread, shape (n + 1, 2) [D].
         heading: of the needle.
         density: v of each node [D^2].
@@ -343,8 +319,8 @@ def correct(
         what is allowed, at most 1 where they hold; the residuals of the last solve.
     """
     nodes, segments = len(start), len(start) - 1
-    known, about, moved = memory.known, memory.about, memory.moved
-    normals_of(start, memory.normals)
+    known, about, moved = work.known, work.about, work.moved
+    normals_of(start, work.normals)
     scale = 0.0
     for i in range(1, nodes):
         scale = max(scale, 1.0 / density[i])
@@ -358,7 +334,7 @@ def correct(
     while True:
         mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
         strain = segment_rows(buffers, about, start, known, 1.0)
-        row = measured_rows(points, weights, scale, start, segments, memory.gram, buffers)
+        row = measured_rows(points, weights, scale, start, segments, work.gram, buffers)
         if np.isfinite(end[1]):
             ex, ey = start[segments, 0] - start[segments - 1, 0], start[segments, 1] - start[segments - 1, 1]
             size = np.hypot(ex, ey)
@@ -373,7 +349,7 @@ def correct(
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
         if solves > 0 and ((off <= 1.0 and change <= CHANGED) or solves >= MAX_SOLVES):
             break
-        prior_information(density, noise, length, stiffness, scale, rod.clamped, memory.normals, buffers)
+        prior_information(density, noise, length, stiffness, scale, rod.clamped, work.normals, buffers)
         rows = row + contacts
         program = program_of(buffers, known, rows)
         u, multipliers = moved.copy(), buffers.multipliers[:rows].copy()
@@ -393,40 +369,11 @@ def correct(
             dx, dy = (1.0 - t) * u[i, 0] + t * u[i + 1, 0], (1.0 - t) * u[i, 1] + t * u[i + 1, 1]
             residual[p] = points.innovation[p] - (-ey * dx + ex * dy) / size
         change = robust_weights(points, residual, points.variance, weights) if solves < MAX_REWEIGHTED else 0.0
-    selected_inverse(6, 2 * nodes, solver_buffers.band, memory.inverse)
+    selected_inverse(6, 2 * nodes, solver_buffers.band, work.inverse)
     for i in range(nodes):
         for a in range(2):
             for b in range(2):
                 j = 2 * i
-                value = memory.inverse[j + min(a, b), abs(a - b)] / scale
-                memory.covariance[i, a, b] = 0.0 if known[i] else value
+                value = work.inverse[j + min(a, b), abs(a - b)] / scale
+                work.covariance[i, a, b] = 0.0 if known[i] else value
     return CORRECTED, solves, off, found
-
-
-@compiled
-def propagate(positions: Points, before: Points, added: Vector, variance: Vector, work: Vector) -> None:
-    """Propagate variances of errors across the thread over a step: they stay where they are, and grow.
-
-    The thread slides along itself when it is pulled: a node comes to where another part of the thread was, and has
-    that part's error. Behind the needle, whose place is known, comes thread without error.
-
-    Args:
-        positions: after the step, shape (n + 1, 2) [D].
-        before: before it [D].
-        added: noise over the step, shape (n + 1,) [D^2].
-        variance: of each node, shape (n + 1,) [D^2]; written.
-        work: memory, shape (n + 1,).
-    """
-    last = len(positions) - 1
-    work[:] = variance
-    for i in range(last + 1):
-        a, b = max(i - 1, 0), min(i + 1, last)
-        tx, ty = before[a, 0] - before[b, 0], before[a, 1] - before[b, 1]  # towards the needle
-        size = np.hypot(tx, ty)
-        slid = 0.0
-        if size > 0.0:
-            slid = ((positions[i, 0] - before[i, 0]) * tx + (positions[i, 1] - before[i, 1]) * ty) / size
-        at = min(max(i - slid, 0.0), float(last))
-        low = min(int(at), last - 1)
-        part = at - low
-        variance[i] = (1.0 - part) * work[low] + part * work[low + 1] + added[i]

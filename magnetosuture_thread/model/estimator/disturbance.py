@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator.innovations import moved_apart
+from magnetosuture_thread.model.thread import Thread
 
 Vector = NDArray[np.float64]
+
+FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
+CONFIRMED = 0.25  # of the averaging time, for which it must last
 
 
 @dataclass(frozen=True)
@@ -103,3 +110,58 @@ def strongest(force: Vector, positions: Points, unit: float, significance: float
         significance=significance,
         since=since,
     )
+
+
+class DisturbanceTest:
+    """Tests whether what the camera moves the thread by goes on in one direction.
+
+    Corrections of a right model are a difference of two errors of the estimate; those that go on in one direction
+    are of something that the model does not know.
+
+    Args:
+        thread: the thread.
+        time: over which corrections are averaged [s].
+    """
+
+    def __init__(self, thread: Thread, time: float) -> None:
+        self._thread, self._time = thread, time
+        self._rate = np.zeros((thread.segments + 1, 2))  # m/s
+        self._since, self._significance, self._interval = math.nan, 0.0, 0.0
+
+    def copied(self) -> DisturbanceTest:
+        """Return a copy."""
+        other = copy.copy(self)
+        other._rate = self._rate.copy()
+        return other
+
+    def decay(self, interval: float) -> None:
+        """Let time pass [s]."""
+        self._rate *= math.exp(-interval / self._time)
+
+    def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, interval: float) -> None:
+        """Add a correction.
+
+        Args:
+            moved: by it, shape (n + 1, 2) [m].
+            normals: of the nodes, shape (n + 1, 2).
+            variance: of the mean of each window's points, inf where nothing is measured, shape (w,) [m^2].
+            stamp: [s]
+            interval: since the last one [s].
+        """
+        self._rate += moved / self._time
+        significance = np.empty(len(variance))
+        moved_apart(self._rate, normals, self._time, variance, significance)
+        self._significance, self._interval = float(significance.max()), interval
+        if self._significance > FOUND:
+            self._since = stamp if math.isnan(self._since) else self._since
+        elif self._significance < LOST:
+            self._since = math.nan
+
+    def found(self, stamp: float, positions: Points) -> tuple[Disturbance, ...]:
+        """Return the forces that explain what the camera moves the thread by, if it does so for long."""
+        if not stamp - self._since >= CONFIRMED * self._time:
+            return ()
+        thread = self._thread
+        drag, bending = thread.medium, thread.bending_stiffness * self._interval
+        force = force_density(self._rate, positions, drag.drag_across, drag.drag_along, bending)
+        return (strongest(force, positions, thread.segment_length, self._significance, self._since),)

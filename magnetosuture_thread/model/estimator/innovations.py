@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,22 +15,40 @@ from magnetosuture_thread.model.estimator.correction import CorrectionBuffers, M
 Vector = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Innovations:
+    """What a frame says against the prediction, by windows of equal arc length from the needle to the free end.
+
+    Attributes:
+        mean: of the points' innovations across the thread, positive to the left; nan where nothing is measured [m].
+        variance: that the filter expects of it [m^2].
+    """
+
+    mean: Vector
+    variance: Vector
+
+    @property
+    def normalised_squared(self) -> Vector:
+        """Normalised innovation squared of each window, 1 in the mean; nan where nothing is measured."""
+        return np.asarray(self.mean**2 / self.variance)
+
+
 class WindowSums(NamedTuple):
     """Of each window of equal arc length, shape (w,).
 
     Attributes:
         mean: mean innovation of its points, nan where there is none [D].
-        spread: variance of it by the points' own, inf where there is none [D^2].
+        own: variance of it by the points' own, inf where there is none [D^2].
         known: variance of the prior, in the points' mean [D^2].
     """
 
     mean: Vector
-    spread: Vector
+    own: Vector
     known: Vector
 
     @classmethod
     def of(cls, windows: int) -> WindowSums:
-        """Return memory for so many windows."""
+        """Return arrays for so many windows."""
         return cls(np.empty(windows), np.empty(windows), np.empty(windows))
 
 
@@ -50,29 +69,29 @@ def weigh(points: MeasuredPoints, variance: Vector, weights: Vector, sums: Windo
         sums: written.
     """
     count, windows, segments = len(weights), len(sums.mean), len(variance) - 1
-    spread = np.empty(count)
+    expected = np.empty(count)
     for p in range(count):
-        spread[p] = points.variance[p] + _at(variance, points.place[p])
-    robust_weights(points, points.innovation, spread, weights)
-    sums.mean[:], sums.known[:], sums.spread[:] = 0.0, 0.0, 0.0
+        expected[p] = points.variance[p] + _at(variance, points.place[p])
+    robust_weights(points, points.innovation, expected, weights)
+    sums.mean[:], sums.known[:], sums.own[:] = 0.0, 0.0, 0.0
     for p in range(count):
         w = min(int(points.place[p] * windows / segments), windows - 1)
         precision = weights[p] * points.share[p] / points.variance[p]
-        sums.spread[w] += precision
+        sums.own[w] += precision
         sums.mean[w] += precision * points.innovation[p]
-        sums.known[w] += precision * (spread[p] - points.variance[p])
+        sums.known[w] += precision * (expected[p] - points.variance[p])
     for w in range(windows):
-        total = sums.spread[w]
+        total = sums.own[w]
         sums.mean[w] = sums.mean[w] / total if total > 0.0 else np.nan
         sums.known[w] = sums.known[w] / total if total > 0.0 else np.nan
-        sums.spread[w] = 1.0 / total if total > 0.0 else np.inf
+        sums.own[w] = 1.0 / total if total > 0.0 else np.inf
 
 
 @compiled
 def take_over(
     points: MeasuredPoints,
     weights: Vector,
-    memory: CorrectionBuffers,
+    work: CorrectionBuffers,
     density: Vector,
     variance: Vector,
     applied: Vector,
@@ -82,7 +101,7 @@ def take_over(
     Args:
         points: the points.
         weights: robust ones.
-        memory: of the correction.
+        work: of the correction.
         density: v of each node; written [D^2].
         variance: of each node across the thread; written [D^2].
         applied: mean correction of the points of each window; written, shape (w,) [D].
@@ -94,9 +113,9 @@ def take_over(
     gained, total, seen = np.zeros(segments + 1), np.zeros(windows), np.zeros(segments, dtype=np.bool_)
     across = np.empty(segments + 1)
     for i in range(segments + 1):
-        n, c = memory.normals[i], memory.covariance[i]
+        n, c = work.normals[i], work.covariance[i]
         variance[i] = n[0] * n[0] * c[0, 0] + 2.0 * n[0] * n[1] * c[0, 1] + n[1] * n[1] * c[1, 1]
-        across[i] = n[0] * memory.moved[i, 0] + n[1] * memory.moved[i, 1]
+        across[i] = n[0] * work.moved[i, 0] + n[1] * work.moved[i, 1]
     applied[:] = 0.0
     for p in range(len(weights)):
         low = min(int(points.place[p]), segments - 1)

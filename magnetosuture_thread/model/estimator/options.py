@@ -17,9 +17,7 @@ class EstimatorOptions:
         point_correlation: distance along a measured piece over which the errors of its points are alike; points
             closer than this share one point's information [m].
         min_deviation: standard deviation of a measured point, at the least [m].
-        frame_correlation: time over which the errors of one place in the image are alike, as those of the pixels' grid
-            are while the thread rests; frames closer than this share one frame's information [s].
-        memory: time over which the process noise is learned from innovations [s].
+        noise_time: time over which the process noise is learned from innovations [s].
         initial_error: standard deviation of the free end of a thread whose shape nobody has seen, as a part of its
             length.
         disturbance_time: averaging time of the test for what the model does not know [s].
@@ -32,8 +30,7 @@ class EstimatorOptions:
     error_correlation: float = 0.1
     point_correlation: float = 2.5e-4
     min_deviation: float = 5e-6
-    frame_correlation: float = 0.0
-    memory: float = 1.0
+    noise_time: float = 1.0
     initial_error: float = 0.2
     disturbance_time: float = 0.4
     history: float = 1.0
@@ -42,5 +39,5 @@ class EstimatorOptions:
         """Check the values."""
         for each in fields(self):
             value = getattr(self, each.name)
-            if not (math.isfinite(value) and value >= 0.0 and (value > 0.0 or each.name == "frame_correlation")):
+            if not (math.isfinite(value) and value > 0.0):
                 raise ConfigurationError(f"estimator.{each.name}", value, "a positive number")

@@ -15,6 +15,7 @@ from magnetosuture_thread.model.estimator.association import (
     project,
     search_start,
 )
+from magnetosuture_thread.model.estimator.correction import MeasuredPoints
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
@@ -24,6 +25,7 @@ MAX_COORDINATE = 10.0  # m
 DETOUR = 8.0  # standard deviations that noise may lengthen the path by at a point
 STEP = 20.0  # standard deviations; steps of a path over which its length is measured
 WHOLE = 0.05  # of the length, by which a piece from the tail to the free end may differ and still be the thread
+LENGTH_ERROR = 0.005  # of the length, by which a thread is known to be longer or shorter than told
 GATE = 4.0  # standard deviations; a piece of unknown arc length that is farther from the prior is another thread's
 OVERLAP = 0.5  # of a piece; if so much of it lies where another one does already, it is that one again or not ours
 FRESH_POINTS = 2  # of a piece, at the least
@@ -196,6 +198,82 @@ def smoothed(points: Points, arcs: Vector, length: float) -> Points:
     room = np.minimum(arcs, arcs[-1] - arcs)
     weights *= np.abs(arcs[:, None] - arcs[None, :]) <= room[:, None] + 1e-12
     return np.asarray(weights @ points / weights.sum(axis=1, keepdims=True))
+
+
+def continued(path: Points, positions: Points, node: int) -> Points:
+    """Return a path that goes on as a thread lay from a node on, turned so that it goes on straight.
+
+    Args:
+        path: shape (m, 2), m >= 2.
+        positions: of the thread, shape (n + 1, 2).
+        node: at the end of the path.
+    """
+    path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 0.0])]
+    if node >= len(positions) - 2 or len(path) < 2:
+        return path
+    rest = positions[node + 1 :] - positions[node]
+    old, new = positions[node + 1] - positions[max(node - 1, 0)], path[-1] - path[-min(len(path), 4)]
+    turn = math.atan2(new[1], new[0]) - math.atan2(old[1], old[0])
+    c, s = math.cos(turn), math.sin(turn)
+    return np.vstack([path, path[-1] + rest @ np.array([[c, s], [-s, c]])])
+
+
+def measured_points(
+    placed: list[PlacedPiece],
+    nodes: Points,
+    unit: float,
+    workspace: Workspace,
+    margin: float,
+    scale: float,
+    problems: list[str],
+) -> MeasuredPoints | None:
+    """Return the points of all pieces on the thread, or None if there is none.
+
+    Args:
+        placed: the pieces.
+        nodes: of the predicted thread, shape (n + 1, 2) [D].
+        unit: D [m].
+        workspace: the obstacles.
+        margin: how deep the way from a point to the thread must lead into one to be refused [m].
+        scale: factor on the points' variance.
+        problems: gets why points are refused.
+    """
+    found = []
+    for piece in placed:
+        place, innovation = piece.projected(nodes)
+        good = np.isfinite(place)
+        far = good & (np.abs(innovation) > 0.5)
+        if len(workspace.shapes) and far.any():
+            at = np.minimum(place[far].astype(np.int64), len(nodes) - 2)
+            part = (place[far] - at)[:, None]
+            start = (1.0 - part) * nodes[at] + part * nodes[at + 1]
+            parted = through_obstacle(start * unit, piece.points[far] * unit, workspace, margin)
+            if parted.any():
+                problems.append(f"{int(parted.sum())} points lie beyond an obstacle")
+                good[np.flatnonzero(far)[parted]] = False
+        if good.any():
+            found.append((place[good], innovation[good], scale * piece.variance[good], piece.share[good]))
+    if not found:
+        return None
+    return MeasuredPoints(*(np.ascontiguousarray(np.concatenate(each)) for each in zip(*found, strict=True)))
+
+
+def free_end(placed: list[PlacedPiece], nodes: Points, variance: float) -> tuple[float, float]:
+    """Return by how much farther along the thread its free end is seen [D], and the variance of it [D^2].
+
+    Args:
+        placed: the pieces.
+        nodes: of the predicted thread, shape (n + 1, 2) [D].
+        variance: of the last one [D^2].
+    """
+    for piece in placed:
+        if piece.free_end:
+            along = nodes[-1] - nodes[-2]
+            off = float((piece.points[-1] - nodes[-1]) @ along) / math.hypot(*along)
+            deviation = LENGTH_ERROR * (len(nodes) - 1)
+            if abs(off) < 6.0 * (deviation + math.sqrt(variance)):
+                return off, deviation**2 + float(piece.variance[-1])
+    return 0.0, math.inf
 
 
 def through_obstacle(start: Points, points: Points, workspace: Workspace, margin: float) -> np.ndarray:

@@ -9,7 +9,8 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator.estimator import Estimate, FilterState, ThreadEstimator
+from magnetosuture_thread.model.estimator.estimate import ThreadEstimate
+from magnetosuture_thread.model.estimator.estimator import FilterState, ThreadEstimator
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
@@ -37,8 +38,8 @@ class EstimationResult:
         problem: why there is no estimate, or why the observation was refused; None if nothing is wrong.
     """
 
-    estimate: Estimate | None
-    measured: Estimate | None = field(default=None, repr=False)
+    estimate: ThreadEstimate | None
+    measured: ThreadEstimate | None = field(default=None, repr=False)
     problem: InvalidInputError | SolverError | None = None
 
 
@@ -117,8 +118,8 @@ class EstimatorSession:
 
     def _fold_in(self, index: int, before: FilterState | None) -> EstimationResult:
         """Take a moment and all after it again."""
-        measured: Estimate | None = None
-        estimate: Estimate | None = None
+        measured: ThreadEstimate | None = None
+        estimate: ThreadEstimate | None = None
         if before is None:
             # The oldest moment that is kept: its own step cannot be taken again, but be corrected after it.
             first = self._moments[index]
@@ -138,7 +139,7 @@ class EstimatorSession:
                 problem = error
         return EstimationResult(estimate, measured, problem)
 
-    def _take(self, moment: _Moment) -> Estimate:
+    def _take(self, moment: _Moment) -> ThreadEstimate:
         if not self._estimator.started:
             estimate = self._estimator.start(moment.pose)
             if moment.observation is not None:

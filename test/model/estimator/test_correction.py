@@ -14,9 +14,8 @@ from magnetosuture_thread.model.estimator.correction import (
     measured_rows,
     normals_of,
     prior_information,
-    propagate,
-    selected_inverse,
 )
+from magnetosuture_thread.model.estimator.covariance import propagate, selected_inverse
 from magnetosuture_thread.model.formulations.step import StepBuffers, program_of
 from magnetosuture_thread.model.program import as_quadratic_program
 from magnetosuture_thread.model.solvers import BandedSolver

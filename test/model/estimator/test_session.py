@@ -225,5 +225,5 @@ def test_what_the_estimator_cannot_correct_is_refused() -> None:
         ThreadEstimator(ThreadPredictor(thread_of(), formulation="paper"))
     with pytest.raises(ConfigurationError, match="plane"):
         ThreadEstimator(ThreadPredictor(thread_of(), Workspace((), 5e-3, dimension=3)))
-    with pytest.raises(ConfigurationError, match="memory"):
-        EstimatorOptions(memory=0.0)
+    with pytest.raises(ConfigurationError, match="noise_time"):
+        EstimatorOptions(noise_time=0.0)
