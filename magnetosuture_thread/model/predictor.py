@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import Barrier, BarrierRows
+from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
@@ -121,9 +121,8 @@ class ThreadPredictor:
 
     Attributes:
         thread: the thread.
-        formulation: what steps it.
-        fixed_nodes: see the arguments.
-        pose: the last one, and `state` the thread's at it; None before the start.
+        formulation, fixed_nodes, contact_tolerance: see the arguments; `scene_version` is empty where there is no scene.
+        pose, state: the last ones; None before the start.
 
     Raises:
         ConfigurationError: a name is unknown, a barrier or a shape cannot be used, or the segments do not resolve the
@@ -149,21 +148,19 @@ class ThreadPredictor:
     ) -> None:
         for node in fixed_nodes:
             _check_node("fixed node", node, thread)
-        workspace, self._scene_version = Workspace((), margin_range), ""
+        workspace, self.scene_version = Workspace((), margin_range), ""
         if isinstance(scene, Workspace):
             workspace = scene
         elif scene is not None:
             check_scene(thread, scene)
             reach = margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
             workspace = Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius)
-            self._scene_version = scene.version
+            self.scene_version = scene.version
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)
             formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
-        self.thread = thread
-        self.formulation, self._contact_tolerance = formulation, contact_tolerance
-        self._longest_step = max_step
-        self._most_substeps = max_substeps
+        self.thread, self.formulation, self.contact_tolerance = thread, formulation, contact_tolerance
+        self._longest_step, self._most_substeps = max_step, max_substeps
         self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
         self.pose: NeedlePose | None = None
@@ -218,10 +215,6 @@ class ThreadPredictor:
     def started(self) -> bool:
         """Whether the thread has a shape."""
         return self.state is not None
-
-    def margins_of(self, rows: Sequence[BarrierRows]) -> Margins:
-        """Return the margins of barriers' rows, as those of a prediction."""
-        return Margins.of(rows, self._contact_tolerance, self._scene_version)
 
     def warm_up(self) -> None:
         """Step a straight thread, so that no kernel is compiled in the first callback."""
@@ -366,14 +359,15 @@ class ThreadPredictor:
         added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
         def compute_margins() -> Margins:
-            return self.margins_of([*formulation.margins(positions, pose.heading), *added])
+            rows = formulation.margins(positions, pose.heading)
+            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
 
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
         return Prediction(
             stamp=pose.stamp,
             formulation=formulation.name,
-            scene_version=self._scene_version,
+            scene_version=self.scene_version,
             positions=positions,
             strain=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import OBSTACLE, WALL, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator.disturbance import Disturbance
+from magnetosuture_thread.model.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.model.estimator.innovations import Innovations
+from magnetosuture_thread.model.estimator.noise import NoiseModel
+from magnetosuture_thread.model.formulations import ThreadState
 from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.model.predictor import NeedlePose, Prediction
 
 Vector = NDArray[np.float64]
 
@@ -41,6 +43,8 @@ class ThreadEstimate:
         noise: intensity of the process noise in each window, shape (w,) [m^2/s].
         disturbances: what the model does not know.
         problems: why pieces or the whole observation were refused.
+        compute_rows: of the barriers, at its positions.
+        contact_tolerance: a node this close to a shape or the wall touches it [m].
     """
 
     prediction: Prediction
@@ -59,7 +63,7 @@ class ThreadEstimate:
     disturbances: tuple[Disturbance, ...]
     problems: tuple[str, ...]
     compute_rows: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
-    make_margins: Callable[[Sequence[BarrierRows]], Margins] = field(repr=False, compare=False)
+    contact_tolerance: float = field(repr=False)
 
     @property
     def stamp(self) -> float:
@@ -69,7 +73,7 @@ class ThreadEstimate:
     @cached_property
     def margins(self) -> Margins:
         """The margins of every barrier by its name, of the estimate's positions; computed at first access."""
-        return self.make_margins(self.compute_rows())
+        return Margins.of(self.compute_rows(), self.contact_tolerance, self.prediction.scene_version)
 
     @cached_property
     def clearance_bounds(self) -> dict[str, Vector]:
@@ -93,3 +97,21 @@ def _bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
     deviation = np.sqrt(np.einsum("rka,rkab,rkb->rk", rows.gradient, covariance[rows.nodes], rows.gradient)).sum(axis=1)
     slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
     return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
+
+
+@dataclass(frozen=True)
+class FilterState:
+    """Everything that the next step and correction depend on."""
+
+    prediction: Prediction
+    converged: bool
+    pose: NeedlePose
+    thread: ThreadState
+    warm_start: tuple[Vector, Vector]
+    density: Vector
+    variance: Vector
+    noise: NoiseModel
+    test: DisturbanceTest
+    measured_at: float
+    gross: int
+    unknown: bool

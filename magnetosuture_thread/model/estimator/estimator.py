@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from magnetosuture_thread.model.estimator.correction import (
 )
 from magnetosuture_thread.model.estimator.covariance import propagate
 from magnetosuture_thread.model.estimator.disturbance import DisturbanceTest
-from magnetosuture_thread.model.estimator.estimate import ThreadEstimate
+from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
 from magnetosuture_thread.model.estimator.innovations import Innovations, WindowSums, take_over, weigh
 from magnetosuture_thread.model.estimator.noise import (
     MIN_INTERVAL,
@@ -51,24 +51,6 @@ LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farthe
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
 MIN_VARIANCE = 1e-12  # D^2
-
-
-@dataclass(frozen=True)
-class FilterState:
-    """Everything that the next step and correction depend on."""
-
-    prediction: Prediction
-    converged: bool
-    pose: NeedlePose
-    thread: ThreadState
-    warm_start: tuple[Vector, Vector]
-    density: Vector
-    variance: Vector
-    noise: NoiseModel
-    test: DisturbanceTest
-    measured_at: float
-    gross: int
-    unknown: bool
 
 
 class ThreadEstimator:
@@ -106,8 +88,7 @@ class ThreadEstimator:
         self._use(StepBuffers.of(nodes, 2, 3 * self.thread.segments + 1, 2 * nodes))
         self._known = np.zeros(nodes, dtype=np.bool_)
         self._known[[0, *predictor.fixed_nodes]] = True
-        self._work = np.empty(nodes)
-        self._added = np.empty(nodes)
+        self._work, self._added = np.empty(nodes), np.empty(nodes)
         self._prediction: Prediction | None = None
         self._converged = False
         self._sums, self._applied = WindowSums.of(WINDOWS), np.zeros(WINDOWS)
@@ -135,7 +116,6 @@ class ThreadEstimator:
         self.predictor.warm_up()
         path = np.array([[0.0, 0.0], [-self.thread.length, 0.0]])
         points = np.linspace(path[0], path[1], 50)
-
         piece = ThreadPiece(points, np.full(50, 1e-5), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), False)
         pose = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
         self.start(pose, path)
@@ -176,10 +156,7 @@ class ThreadEstimator:
         return self._estimate(())
 
     def start_observed(self, pose: NeedlePose, observation: ThreadObservation) -> ThreadEstimate:
-        """Set the thread's shape from a first observation: along the piece that leaves the needle, and on from there.
-
-        Without such a piece the thread lies straight behind the needle, and nothing is known of it.
-        """
+        """Set the thread's shape along the piece that leaves the needle; without one, straight behind it."""
         self.start(pose)
         return self.correct(observation)
 
@@ -390,7 +367,7 @@ class ThreadEstimator:
             disturbances=self._test.found(pose.stamp, positions),
             problems=problems,
             compute_rows=compute_rows,
-            make_margins=self.predictor.margins_of,
+            contact_tolerance=self.predictor.contact_tolerance,
         )
 
     def snapshot(self) -> FilterState | None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator.estimate import ThreadEstimate
-from magnetosuture_thread.model.estimator.estimator import FilterState, ThreadEstimator
+from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
+from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
 from magnetosuture_thread.model.predictor import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
