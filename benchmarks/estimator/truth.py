@@ -16,7 +16,7 @@ from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 
 LENGTH = 0.019  # of the thread [m]
-SEGMENTS = 228  # of the rod that is the truth
+SEGMENTS = 114  # of the rod that is the truth
 WALL_RADIUS = 0.0175  # of the dish [m]
 STRAIN_STIFFNESS = 2.0  # EA of the rod [N]; the drag of the needle then stretches it by 1e-5
 

@@ -21,16 +21,17 @@ SEARCH_POINTS = 24  # of a piece, which the search for its beginning compares
 
 
 @compiled
-def path_without_outliers(points: Points, penalty: float, kept: NDArray[np.bool_]) -> None:
+def path_without_outliers(points: Points, spacing: float, penalty: float, kept: NDArray[np.bool_]) -> None:
     """Mark the points of a piece that lie on its path.
 
-    The path is the shortest one through the points in their order when each point left out costs `penalty`: a point
-    far aside costs two ways, one on the path next to nothing.
+    The path goes through the points in their order. A step costs what it is longer than twice the spacing of the
+    points it leads over, a point left out costs `penalty`: a point far aside costs two long ways, one on the path
+    nothing.
 
     Args:
         points: shape (m, 2).
-        penalty: more than what noise adds to the path, and than the points' spacing, less than twice the distance of
-            an outlier; same unit.
+        spacing: of the points, same unit.
+        penalty: less than the distance of an outlier.
         kept: written, shape (m,).
     """
     count = len(points)
@@ -40,10 +41,10 @@ def path_without_outliers(points: Points, penalty: float, kept: NDArray[np.bool_
         cost[i], before[i] = penalty * i, -1
         for j in range(max(0, i - MAX_SKIPPED), i):
             step = np.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
-            value = cost[j] + step + penalty * (i - j - 1)
-            if value < cost[i]:
+            value = cost[j] + max(step - 2.0 * spacing * (i - j), 0.0) + penalty * (i - j - 1)
+            if value <= cost[i]:
                 cost[i], before[i] = value, j
-        if cost[i] + penalty * (count - 1 - i) < best:
+        if cost[i] + penalty * (count - 1 - i) <= best:
             best, last = cost[i] + penalty * (count - 1 - i), i
     kept[:] = False
     while last >= 0:
@@ -69,8 +70,7 @@ def clean_path(
     for k in range(count - 1):
         spacing[k] = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
     kept = np.empty(count, dtype=np.bool_)
-    # More than a point's own stretch of the path, or the shortest one would end early.
-    path_without_outliers(points, max(detour * np.median(deviation), 2.0 * np.median(spacing)), kept)
+    path_without_outliers(points, np.median(spacing), detour * np.median(deviation), kept)
     points, deviation = points[kept], deviation[kept]
     count = len(points)
     arcs, share = np.zeros(count), np.ones(count)

@@ -31,7 +31,7 @@ def test_points_far_aside_are_left_out_of_the_path() -> None:
     wrong[[0, 7, 8, 40, 41, 42, 77, 99]] = True
     points[wrong] += rng.choice([-1.0, 1.0], (8, 2)) * 4.0
     kept = np.zeros(100, dtype=np.bool_)
-    path_without_outliers(points, 0.3, kept)
+    path_without_outliers(points, 0.12, 0.3, kept)
     np.testing.assert_array_equal(kept, ~wrong)
 
 
