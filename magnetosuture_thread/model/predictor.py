@@ -121,7 +121,7 @@ class ThreadPredictor:
 
     Attributes:
         thread: the thread.
-        formulation, fixed_nodes, contact_tolerance: see the arguments; `scene_version` is empty where there is no scene.
+        formulation, fixed_nodes, contact_tolerance: see the arguments; `scene_version` is empty without a scene.
         pose, state: the last ones; None before the start.
 
     Raises:
