@@ -300,7 +300,7 @@ def test_python_examples_run(page: Path, code: str, capsys: pytest.CaptureFixtur
     names: dict[str, Any] = {}
     exec(compile(code, str(page), "exec"), names)
     assert capsys.readouterr().out
-    prediction = names.get("estimate", names.get("prediction"))
+    prediction: Any = names.get("estimate", names.get("prediction"))
     assert prediction.converged
     assert prediction.residual < 1e-6
     if page == README:
