@@ -14,6 +14,7 @@ from rich.console import Console
 from benchmarks import keep_out
 from benchmarks.attack import command as attack
 from benchmarks.bridge import command as bridge
+from benchmarks.estimator import command as estimator
 from benchmarks.page import command as page
 from benchmarks.solver import command as solver
 from benchmarks.vision import command as vision
@@ -24,7 +25,7 @@ from magnetosuture_thread.cli.terminal import make_console, write_json
 # Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
 BENCHMARKS: dict[str, Any] = {
     **{"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out},
-    **{"attack": attack, "vision": vision},
+    **{"attack": attack, "vision": vision, "estimator": estimator},
 }
 
 

@@ -300,7 +300,7 @@ def test_python_examples_run(page: Path, code: str, capsys: pytest.CaptureFixtur
     names: dict[str, Any] = {}
     exec(compile(code, str(page), "exec"), names)
     assert capsys.readouterr().out
-    prediction = names["prediction"]
+    prediction: Any = names.get("estimate", names.get("prediction"))
     assert prediction.converged
     assert prediction.residual < 1e-6
     if page == README:
@@ -350,7 +350,7 @@ def test_commands_of_sentences_exist(page: Path):
 @pages
 def test_options_exist(page: Path):
     known = {option for leaf in leaves(make_parser()) for option in options_of(leaf)} | FOREIGN_OPTIONS
-    for name in ("solver", "bridge", "page", "keep-out", "attack", "vision"):
+    for name in ("solver", "bridge", "page", "keep-out", "attack", "vision", "estimator"):
         with suppress(pytest.fail.Exception, AssertionError):  # that each exists is another test
             known |= benchmark_options(name)
     named = {word for span in spans(page) for word in span.split()[:1] if word.startswith("--")}

@@ -121,6 +121,8 @@ class ThreadPredictor:
 
     Attributes:
         thread: the thread.
+        formulation, fixed_nodes, contact_tolerance: see the arguments; `scene_version` is empty without a scene.
+        pose, state: the last ones; None before the start.
 
     Raises:
         ConfigurationError: a name is unknown, a barrier or a shape cannot be used, or the segments do not resolve the
@@ -146,25 +148,23 @@ class ThreadPredictor:
     ) -> None:
         for node in fixed_nodes:
             _check_node("fixed node", node, thread)
-        workspace, self._scene_version = Workspace((), margin_range), ""
+        workspace, self.scene_version = Workspace((), margin_range), ""
         if isinstance(scene, Workspace):
             workspace = scene
         elif scene is not None:
             check_scene(thread, scene)
             reach = margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
             workspace = Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius)
-            self._scene_version = scene.version
+            self.scene_version = scene.version
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)
             formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
-        self.thread = thread
-        self._formulation, self._contact_tolerance = formulation, contact_tolerance
-        self._longest_step = max_step
-        self._most_substeps = max_substeps
-        self._fixed = tuple(sorted(set(fixed_nodes)))
+        self.thread, self.formulation, self.contact_tolerance = thread, formulation, contact_tolerance
+        self._longest_step, self._most_substeps = max_step, max_substeps
+        self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
-        self._pose: NeedlePose | None = None
-        self._state: ThreadState | None = None
+        self.pose: NeedlePose | None = None
+        self.state: ThreadState | None = None
 
     @classmethod
     def create(
@@ -214,11 +214,11 @@ class ThreadPredictor:
     @property
     def started(self) -> bool:
         """Whether the thread has a shape."""
-        return self._state is not None
+        return self.state is not None
 
     def warm_up(self) -> None:
         """Step a straight thread, so that no kernel is compiled in the first callback."""
-        dimension = self._formulation.dimension
+        dimension = self.formulation.dimension
         east = np.eye(dimension)[0]
         path = -self.thread.segment_length * np.arange(self.thread.segments + 1)[:, None] * east
         begun = self.start_at(NeedlePose(0.0, np.zeros(dimension), east), path)
@@ -226,12 +226,12 @@ class ThreadPredictor:
         with suppress(SolverError):  # an obstacle that lies here says nothing of a thread that lies elsewhere
             for count in (1, 2):
                 self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
-        self._formulation.warm_up()
+        self.formulation.warm_up()
         self.reset()
 
     def reset(self) -> None:
         """Forget the thread's shape; the next call must be `start`."""
-        self._pose = self._state = None
+        self.pose = self.state = None
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> Prediction:
         """Set the thread's shape from a centreline, measured or assumed, from tail to end.
@@ -282,14 +282,14 @@ class ThreadPredictor:
         if gap > self.thread.segment_length:
             nearest = f"at most {self.thread.segment_length:.2e} m"
             raise InvalidInputError("thread's first node", f"{gap:.2e} m from the needle's tail", nearest)
-        self._state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
-        self._pose = pose
+        self.state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
+        self.pose = pose
         return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0), True)
 
     def follow_on(self, other: ThreadPredictor) -> None:
         """Continue from the state of another predictor, if it has started."""
-        self._pose = other._pose
-        self._state = other._state.resampled(other.thread, self.thread) if other._state is not None else None
+        self.pose = other.pose
+        self.state = other.state.resampled(other.thread, self.thread) if other.state is not None else None
 
     def step(self, pose: NeedlePose, prescribed: Mapping[int, Points] | None = None) -> Prediction:
         """Follow the needle to its next pose.
@@ -308,14 +308,14 @@ class ThreadPredictor:
                 none of the thread's, or not finite.
             SolverError: a solution's residual is above the tolerance.
         """
-        if self._pose is None or self._state is None:
+        if self.pose is None or self.state is None:
             raise InvalidInputError("needle pose", "a pose before the start", "a centreline first")
         check_pose(pose)
-        last, state = self._pose, self._state
+        last, state = self.pose, self.state
         interval = pose.stamp - last.stamp
         if interval <= 0.0:
             raise InvalidInputError("needle pose stamp", f"{pose.stamp:.6f} s", f"later than {last.stamp:.6f} s")
-        ends = {0: pose.tail, **{node: state.positions[node] for node in self._fixed}}
+        ends = {0: pose.tail, **{node: state.positions[node] for node in self.fixed_nodes}}
         for node, position in (prescribed or {}).items():
             _check_node("node of prescribed motion", node, self.thread)
             if np.shape(position) != pose.tail.shape or not np.all(np.abs(position) <= MAX_COORDINATE):
@@ -333,7 +333,7 @@ class ThreadPredictor:
         for index in range(1, substeps + 1):
             part = index / substeps
             heading = direction_between(last.heading, pose.heading, part)
-            done = self._formulation.step(
+            done = self.formulation.step(
                 state,
                 PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval),
                 interval / substeps,
@@ -341,7 +341,7 @@ class ThreadPredictor:
             state, residuals = done.state, residuals.or_worse(done.residuals)
             converged = converged and done.converged
             worst = done if worst is None or worst.status == SOLVED else worst
-        self._pose, self._state = pose, state
+        self.pose, self.state = pose, state
         return self._prediction(pose, interval, substeps, worst, residuals, converged)
 
     def _prediction(
@@ -353,21 +353,21 @@ class ThreadPredictor:
         residuals: Residuals,
         converged: bool,
     ) -> Prediction:
-        assert self._state is not None
-        positions, formulation = self._state.positions, self._formulation
+        assert self.state is not None
+        positions, formulation = self.state.positions, self.formulation
         formulation.added.set_time(pose.stamp)
         added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
         def compute_margins() -> Margins:
-            rows = [*formulation.margins(positions, pose.heading), *added]
-            return Margins.of(rows, self._contact_tolerance, self._scene_version)
+            rows = formulation.margins(positions, pose.heading)
+            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
 
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
         return Prediction(
             stamp=pose.stamp,
             formulation=formulation.name,
-            scene_version=self._scene_version,
+            scene_version=self.scene_version,
             positions=positions,
             strain=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,

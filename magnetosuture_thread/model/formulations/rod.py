@@ -104,6 +104,11 @@ class RodFormulation(Formulation):
         self._motion = MotionBuffers.of(thread.segments + 1, dimension)
         self._use(self._buffers)
 
+    @property
+    def rod(self) -> RodProperties:
+        """The thread, for compiled code."""
+        return self._rod
+
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""
         unit, motion = self._thread.segment_length, self._motion

@@ -111,7 +111,7 @@ def assemble_step(
     about, start, known, interval = motion.about, motion.start, motion.known, given.interval
     segments = len(about) - 1
     mechanics.chord_lengths(about, given.heading, rod.clamped, buffers.chords)
-    strain = _segment_rows(buffers, about, start, known, interval)
+    strain = segment_rows(buffers, about, start, known, interval)
     contacts, depth = contact_rows(buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius)
     off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
     if contacts >= 0 and (solves == 0 or off > 1.0):
@@ -192,7 +192,7 @@ def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -
 
 
 @compiled
-def _segment_rows(
+def segment_rows(
     buffers: StepBuffers, about: Points, start: Points, known: NDArray[np.bool_], interval: float
 ) -> float:
     """Write the rows  grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt; return the largest |h(y)|."""

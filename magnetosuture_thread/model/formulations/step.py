@@ -349,6 +349,20 @@ class Formulation(ABC):
         residuals_of(program, solution.velocities, solution.multipliers)
         self._buffers.forget()
 
+    @property
+    def workspace(self) -> Workspace:
+        """Obstacles and wall, with the reach of the program's rows [m]."""
+        return self._near
+
+    def warm_start(self) -> tuple[Vector, Vector]:
+        """Return what the next step takes over from the last besides the state: the solver's guess."""
+        return self._buffers.multipliers[: self._rows].copy(), self._buffers.push.copy()
+
+    def restore(self, warm_start: tuple[Vector, Vector]) -> None:
+        """Restore what `warm_start` returned, so that the next step is that one again to the last bit."""
+        self._buffers.multipliers[: self._rows] = warm_start[0]
+        self._buffers.push[:] = warm_start[1]
+
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
         return np.full(self._thread.segments, self._thread.segment_length)

@@ -1,0 +1,1 @@
+"""The thread estimator against ground truth."""

@@ -1,0 +1,328 @@
+"""Plays the cases through estimator, predictor, camera and registration: errors, consistency and time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.estimator.camera import CameraModel
+from benchmarks.estimator.cases import CASES, RATE, Case, contact_frame, free_run, run_of, second_thread
+from benchmarks.estimator.trackers import CameraAlone, CoherentPointDrift
+from benchmarks.estimator.truth import Run
+from magnetosuture_thread.evaluation.reference import read_reference
+from magnetosuture_thread.evaluation.reference_scores import reference_thread
+from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.polyline import Points, points_at
+from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.thread_observation import ThreadObservation
+
+THREADS = (("polyamide_7_0", "pinned"), ("polyamide_7_0", "clamped"), ("silk_6_0", "pinned"))
+CONSISTENCY_WINDOW = 5.0  # s
+FOUND_TIME = 0.5  # s
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Distance of nodes from the truth, in % of the length."""
+
+    mean: float
+    maximum: float
+
+    @classmethod
+    def of(cls, errors: NDArray[np.float64]) -> Errors:
+        """Return both figures of errors of any shape."""
+        return cls(float(errors.mean()), float(errors.max())) if errors.size else cls(0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class CaseFigures:
+    """What was measured in a case, over all threads and seeds.
+
+    Attributes:
+        name: of the case.
+        limits: of mean and maximum.
+        estimate: errors.
+        prediction: of the model alone, from the true first shape.
+        camera: of the camera alone; None if it was not asked for.
+        registration: of the registration tracker; None if it was not asked for.
+        consistent: part of the windows of 5 s in which the mean normalised innovation squared is within its 95 % band.
+        innovation: mean normalised innovation squared.
+        worse: number of runs whose estimate is worse than the prediction alone.
+        runs: number of runs.
+        found: of those with a contact nobody told of, how many were found within 0.5 s of it.
+        false_alarms: runs with a right model, in which a disturbance was reported before any contact.
+        met: whether the limits hold.
+    """
+
+    name: str
+    limits: tuple[float, float]
+    estimate: Errors
+    prediction: Errors
+    camera: Errors | None
+    registration: Errors | None
+    consistent: float
+    innovation: float
+    worse: int
+    runs: int
+    found: int
+    false_alarms: int
+    met: bool
+
+
+def targets(run: Run, segments: int) -> NDArray[np.float64]:
+    """Return where the nodes of a thread are in truth at each frame, shape (T, n + 1, 2) [m]."""
+    at = np.linspace(0.0, run.thread.length, segments + 1)
+    return np.array([points_at(thread, at) for thread in run.threads])
+
+
+def estimator_of(thread: Thread, run: Run, case: Case | None = None) -> ThreadEstimator:
+    """Return an estimator that knows of a run what the case lets it."""
+    posts = () if case is not None and case.post == "unknown" else run.posts
+    estimator = ThreadEstimator(ThreadPredictor(thread, Workspace(posts, 5e-3, wall_radius=run.wall_radius)))
+    estimator.warm_up()
+    return estimator
+
+
+def observations(case: Case, run: Run, seed: int) -> list[ThreadObservation | None]:
+    """Return what each frame shows; None for a frame that never comes."""
+    rng, other = np.random.default_rng(seed), second_thread(seed)
+    seen: list[ThreadObservation | None] = []
+    for index, (pose, nodes) in enumerate(zip(run.poses, run.threads, strict=True)):
+        others = (other(pose.stamp),) if case.second else ()
+        observation = case.camera.observe(nodes, pose.stamp, rng, others)
+        lost = rng.random() < case.lost and index > 0
+        seen.append(observation if index % case.every == 0 and not lost else None)
+    return seen
+
+
+def _bent(nodes: Points, length: float) -> Points:
+    """Return a shape that is off by a fifth of the length at the free end."""
+    aside = np.array([nodes[-1, 1] - nodes[0, 1], nodes[0, 0] - nodes[-1, 0]])
+    aside = 0.2 * length * aside / max(float(np.linalg.norm(aside)), 1e-9)
+    return np.asarray(nodes + np.linspace(0.0, 1.0, len(nodes))[:, None] * aside)
+
+
+def play(
+    case: Case, run: Run, seen: Sequence[ThreadObservation | None], estimator: ThreadEstimator, first: Points
+) -> list[ThreadEstimate]:
+    """Return the estimate at each pose but the first, as it is known when the pose comes."""
+    session = EstimatorSession(estimator)
+    estimator.reset()
+    poses = [_scaled(pose, case.camera) for pose in run.poses]
+    estimates: list[ThreadEstimate] = []
+    for index, pose in enumerate(poses):
+        late = seen[index - case.latency] if index >= case.latency else None
+        observed = late if case.start == "measured" or index > 0 else None
+        if index == 0 and case.start == "bent":
+            session.start(pose, _bent(first, estimator.thread.length))
+            continue
+        if case.latency == 0 and observed is not None:
+            session.on_observation(pose.stamp, observed)
+        result = session.on_pose(pose)
+        if case.latency and observed is not None:
+            result = session.on_observation(poses[index - case.latency].stamp, observed)
+        if result.problem is not None:
+            raise result.problem
+        if index > 0:
+            assert result.estimate is not None
+            estimates.append(result.estimate)
+    return estimates
+
+
+def _scaled(pose: NeedlePose, camera: CameraModel) -> NeedlePose:
+    return replace(pose, tail=pose.tail * camera.scale)
+
+
+def predict(run: Run, estimator: ThreadEstimator, first: Points) -> NDArray[np.float64]:
+    """Return the nodes of the model alone at each pose but the first, from the true first shape."""
+    predictor = estimator.predictor
+    predictor.reset()
+    predictor.start_at(run.poses[0], first)
+    return np.array([predictor.step(pose).positions for pose in run.poses[1:]])
+
+
+def measure_case(
+    case: Case, count: int, seed: int, segments: int, with_trackers: bool, progress: Callable[[], None]
+) -> CaseFigures:
+    """Measure one case over all threads and a number of seeds."""
+    errors: dict[str, list[NDArray[np.float64]]] = {"estimate": [], "prediction": [], "camera": [], "registration": []}
+    inside: list[bool] = []
+    innovations: list[NDArray[np.float64]] = []
+    worse = runs = found = alarms = 0
+    for material, attachment in THREADS:
+        for number in range(seed, seed + count):
+            progress()
+            run = run_of(case, material, attachment, number)
+            if run is None:
+                continue
+            thread = _with_segments(run.thread, segments)
+            truth, estimator = targets(run, segments), estimator_of(thread, run, case)
+            seen = observations(case, run, number)
+            estimates = play(case, run, seen, estimator, truth[0])
+            contact = contact_frame(run) if case.post else len(truth)
+            judged = _judged(case, run, contact, segments)
+            off = _off(np.array([each.positions for each in estimates]), truth, thread.length)
+            alone = _off(predict(run, estimator, truth[0]), truth, thread.length)
+            errors["estimate"].append(off[judged])
+            errors["prediction"].append(alone[judged])
+            if with_trackers:
+                camera, drift = CameraAlone(truth[0], thread.length), CoherentPointDrift(truth[0], thread.length)
+                by_camera = np.array([camera.step(each) for each in seen[1:]])
+                tails = [_scaled(pose, case.camera).tail for pose in run.poses[1:]]
+                by_drift = np.array([drift.step(tail, each) for tail, each in zip(tails, seen[1:], strict=True)])
+                errors["camera"].append(_off(by_camera, truth, thread.length)[judged])
+                errors["registration"].append(_off(by_drift, truth, thread.length)[judged])
+            worse += bool(off[judged].mean() > alone[judged].mean())
+            runs += 1
+            squared = _squared(estimates)
+            inside += _within_band(estimates, squared)
+            innovations.append(squared[np.isfinite(squared)])
+            alarms_at = [index + 1 for index, each in enumerate(estimates) if each.disturbances]
+            if case.post == "unknown":
+                found += any(contact <= index <= contact + FOUND_TIME * RATE for index in alarms_at)
+            alarms += any(index < contact for index in alarms_at)
+    estimate = Errors.of(_flat(errors["estimate"]))
+    met = estimate.mean <= case.limits[0] and estimate.maximum <= case.limits[1] and not (case.better and worse)
+    return CaseFigures(
+        name=case.name,
+        limits=case.limits,
+        estimate=estimate,
+        prediction=Errors.of(_flat(errors["prediction"])),
+        camera=Errors.of(_flat(errors["camera"])) if with_trackers else None,
+        registration=Errors.of(_flat(errors["registration"])) if with_trackers else None,
+        consistent=float(np.mean(inside)) if inside else 0.0,
+        innovation=float(np.mean(np.concatenate([np.ones(1), *innovations]))),
+        worse=worse,
+        runs=runs,
+        found=found,
+        false_alarms=alarms,
+        met=met and runs > 0 and (case.post != "unknown" or found >= 0.95 * runs),
+    )
+
+
+def _with_segments(thread: Thread, segments: int) -> Thread:
+    return replace(thread, segments=segments)
+
+
+def _off(nodes: NDArray[np.float64], truth: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+    """Return errors of all nodes but the needle's, in % of the length, shape (T - 1, n)."""
+    return np.asarray(100.0 / length * np.linalg.norm(nodes[:, 1:] - truth[1:, 1:], axis=2))
+
+
+def _flat(errors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.concatenate([np.empty(0), *(each.ravel() for each in errors)])
+
+
+def _judged(case: Case, run: Run, contact: int, segments: int) -> tuple[slice, slice]:
+    """Return the frames and nodes that count."""
+    frames, nodes = slice(int(RATE), None), slice(None)
+    if case.judged == "hidden":
+        low, high = (round(bound / run.thread.length * segments) for bound in case.camera.hidden)
+        frames = slice(*(round(bound * RATE) - 1 for bound in case.camera.hidden_time))
+        nodes = slice(max(low - 1, 0), high)
+    elif case.judged == "contact":
+        frames = slice(min(contact, len(run.threads) - 2), None)
+    return frames, nodes
+
+
+def _squared(estimates: Sequence[ThreadEstimate]) -> NDArray[np.float64]:
+    """Return normalised innovations squared of each frame's windows, nan where nothing is measured."""
+    empty = np.full(len(estimates[0].noise), np.nan)
+    return np.array([each.innovations.normalised_squared if each.innovations else empty for each in estimates])
+
+
+def _within_band(estimates: Sequence[ThreadEstimate], squared: NDArray[np.float64]) -> list[bool]:
+    """Return of each window of 5 s whether the mean is within the band that 95 % of means of so many are in."""
+    stamps = np.array([each.stamp for each in estimates])
+    inside = []
+    for begin in np.arange(stamps[0], stamps[-1] - 0.99 * CONSISTENCY_WINDOW, CONSISTENCY_WINDOW):
+        values = squared[(stamps >= begin) & (stamps < begin + CONSISTENCY_WINDOW)]
+        values = values[np.isfinite(values)]
+        if len(values):
+            inside.append(bool(abs(values.mean() - 1.0) <= 1.96 * np.sqrt(2.0 / len(values))))
+    return inside
+
+
+def measure_cost(segments: int, seed: int) -> dict[str, float]:
+    """Return median times of a step with and without a measurement [s], and the number of points."""
+    case = CASES["right, free"]
+    run = free_run("silk_6_0", "pinned", seed, 25.0)
+    thread = _with_segments(run.thread, segments)
+    estimator, seen = estimator_of(thread, run), observations(case, run, seed)
+    truth = targets(run, segments)[0]
+    times: dict[str, list[float]] = {"estimate_s": [], "prediction_s": []}
+    for repeat in range(2):
+        estimator.reset()
+        first = seen[0]
+        assert first is not None
+        estimator.start_observed(run.poses[0], first)
+        for pose, each in zip(run.poses[1:], seen[1:], strict=True):
+            began = time.perf_counter()
+            estimator.step(pose, each)
+            times["estimate_s"].append(time.perf_counter() - began)
+        estimator.predictor.start_at(run.poses[0], truth)
+        for pose in run.poses[1:]:
+            began = time.perf_counter()
+            estimator.predictor.step(pose)
+            times["prediction_s"].append(time.perf_counter() - began)
+        del repeat
+    points = seen[1].pieces[0].points if seen[1] is not None else np.empty((0, 2))
+    return {name: float(np.median(values)) for name, values in times.items()} | {"points": float(len(points))}
+
+
+def measure_references(folder: Path, seed: int, progress: Callable[[], None]) -> dict[str, dict[str, float]]:
+    """Return errors on reference trajectories, in % of the length, by the trajectory's name."""
+    found = {}
+    for path in sorted(folder.glob("*.npz")):
+        progress()
+        reference = read_reference(path)
+        thread, _ = reference_thread(reference, path, None)
+        heading = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])
+        step = max(1, round(1.0 / (RATE * float(np.median(np.diff(reference.times))))))
+        poses = tuple(
+            NeedlePose(float(reference.times[k]), reference.tails[k], heading[k])
+            for k in range(0, len(reference.times), step)
+        )
+        run = Run(thread, poses, reference.threads[::step], reference.discs, np.inf)
+        case = CASES["right, free"]
+        truth, estimator = targets(run, thread.segments), estimator_of(thread, run)
+        estimates = play(case, run, observations(case, run, seed), estimator, truth[0])
+        off = Errors.of(_off(np.array([each.positions for each in estimates]), truth, thread.length)[int(RATE) :])
+        alone = Errors.of(_off(predict(run, estimator, truth[0]), truth, thread.length)[int(RATE) :])
+        found[reference.name] = {
+            "estimate_mean": off.mean,
+            "estimate_maximum": off.maximum,
+            "prediction_mean": alone.mean,
+            "prediction_maximum": alone.maximum,
+        }
+    return found
+
+
+def measure_long(minutes: float, seed: int, segments: int) -> dict[str, float]:
+    """Return the mean errors of the first and the last minute of a long run, in % of the length."""
+    case, run = CASES["stiffness x 5"], None
+    run = run_of(case, "silk_6_0", "pinned", seed, 60.0 * minutes)
+    assert run is not None
+    thread = _with_segments(run.thread, segments)
+    truth, estimator = targets(run, segments), estimator_of(thread, run)
+    estimates = play(case, run, observations(case, run, seed), estimator, truth[0])
+    off, minute = _off(np.array([each.positions for each in estimates]), truth, thread.length), int(60 * RATE)
+    return {
+        "minutes": minutes,
+        "first_minute_mean": float(off[int(RATE) : minute].mean()),
+        "last_minute_mean": float(off[-minute:].mean()),
+        "maximum": float(off[int(RATE) :].max()),
+    }
+
+
+def as_json(figures: Sequence[CaseFigures]) -> list[dict[str, Any]]:
+    """Return what goes into JSON."""
+    return [asdict(each) for each in figures]

@@ -1,0 +1,11 @@
+"""The thread estimated: the predictor's program, corrected by what the camera measures."""
+
+from __future__ import annotations
+
+from magnetosuture_thread.model.estimator.disturbance import Disturbance
+from magnetosuture_thread.model.estimator.estimate import ThreadEstimate
+from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
+from magnetosuture_thread.model.estimator.options import EstimatorOptions
+from magnetosuture_thread.model.estimator.session import EstimatorSession
+
+__all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"]

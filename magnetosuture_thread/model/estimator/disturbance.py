@@ -1,0 +1,167 @@
+"""Disturbances: where the thread moves in a way that no force of the model explains."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator.innovations import moved_apart
+from magnetosuture_thread.model.thread import Thread
+
+Vector = NDArray[np.float64]
+
+FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
+CONFIRMED = 0.25  # of the averaging time, for which it must last
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A force on the thread that the model does not know: a contact, a hand, a current.
+
+    Attributes:
+        arc_length: of the middle of the force, from the needle's tail [m].
+        extent: length of the stretch of thread that it acts on [m].
+        position: of the middle, shape (2,) [m].
+        direction: unit vector of the force, shape (2,).
+        force: [N]
+        significance: of the innovations, in standard deviations.
+        since: when it was first found [s].
+    """
+
+    arc_length: float
+    extent: float
+    position: Points
+    direction: Points
+    force: float
+    significance: float
+    since: float
+
+
+def force_density(
+    rate: Points, positions: Points, drag_across: float, drag_along: float, bending: float = 0.0
+) -> Vector:
+    """Return the normal force on each node that explains a velocity that the model does not predict [N].
+
+        f_i = D zeta_perp n_i . r_i + (dt EI / D^3) n_i . (second differences of c(r))_i + T_i kappa_i
+        T_i = -sum_{j > i} D zeta_par t_j . r_j,    c(r)_i = r_{i+1} - 2 r_i + r_{i-1}
+
+    The force of what touches the thread is across it; along it the tension alone balances the drag.
+
+    Args:
+        rate: r, by how much faster each node moves than predicted, shape (n + 1, 2) [m/s].
+        positions: shape (n + 1, 2) [m].
+        drag_across: zeta_perp [Pa s].
+        drag_along: zeta_par [Pa s].
+        bending: dt EI, the stiffness times the interval over which r was averaged [N m^2 s].
+    """
+    along = np.gradient(positions, axis=0)
+    size = np.maximum(np.hypot(*along.T), 1e-12)
+    tangent = along / size[:, None]
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    unit = float(size.mean())
+    pull = unit * drag_along * np.einsum("ij,ij->i", tangent, rate)
+    tensions = -(np.cumsum(pull[::-1])[::-1] - pull)
+    turn = np.zeros(len(positions))
+    bend = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
+    turn[1:-1] = np.einsum("ij,ij->i", bend, normal[1:-1]) / unit
+    curved = np.zeros_like(rate)
+    curved[1:-1] = rate[2:] - 2.0 * rate[1:-1] + rate[:-2]
+    bent = -2.0 * curved
+    bent[1:] += curved[:-1]
+    bent[:-1] += curved[1:]
+    force = unit * drag_across * rate + bending / unit**3 * bent
+    return np.asarray(np.einsum("ij,ij->i", normal, force) - tensions * turn)
+
+
+def strongest(force: Vector, positions: Points, unit: float, significance: float, since: float) -> Disturbance:
+    """Return the stretch of thread with the greatest force to one side.
+
+    Args:
+        force: on each node along its normal, shape (n + 1,) [N].
+        positions: shape (n + 1, 2) [m].
+        unit: D [m].
+        significance: [standard deviations]
+        since: [s]
+    """
+    # Stretches of one sign; the needle itself, node 0, carries what acts on it.
+    signs = np.sign(force[1:])
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(signs)) + 1, [len(signs)]])
+    sums = np.add.reduceat(force[1:], starts[:-1])
+    k = int(np.abs(sums).argmax())
+    nodes = np.arange(starts[k], starts[k + 1]) + 1
+    share = force[nodes] / sums[k] if sums[k] != 0.0 else np.full(len(nodes), 1.0 / len(nodes))
+    middle = float(share @ nodes)
+    along = np.gradient(positions, axis=0)
+    at = round(middle)
+    tangent = along[at] / max(float(np.hypot(*along[at])), 1e-12)
+    place = np.array([np.interp(middle, np.arange(len(positions)), positions[:, axis]) for axis in range(2)])
+    side = 1.0 if sums[k] >= 0.0 else -1.0
+    return Disturbance(
+        arc_length=middle * unit,
+        extent=len(nodes) * unit,
+        position=place,
+        direction=side * np.array([-tangent[1], tangent[0]]),
+        force=abs(float(sums[k])),
+        significance=significance,
+        since=since,
+    )
+
+
+class DisturbanceTest:
+    """Tests whether what the camera moves the thread by goes on in one direction.
+
+    Corrections of a right model are a difference of two errors of the estimate; those that go on in one direction
+    are of something that the model does not know.
+
+    Args:
+        thread: the thread.
+        time: over which corrections are averaged [s].
+    """
+
+    def __init__(self, thread: Thread, time: float) -> None:
+        self._thread, self._time = thread, time
+        self._rate = np.zeros((thread.segments + 1, 2))  # m/s
+        self._since, self._significance, self._interval = math.nan, 0.0, 0.0
+
+    def copied(self) -> DisturbanceTest:
+        """Return a copy."""
+        other = copy.copy(self)
+        other._rate = self._rate.copy()
+        return other
+
+    def decay(self, interval: float) -> None:
+        """Let time pass [s]."""
+        self._rate *= math.exp(-interval / self._time)
+
+    def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, interval: float) -> None:
+        """Add a correction.
+
+        Args:
+            moved: by it, shape (n + 1, 2) [m].
+            normals: of the nodes, shape (n + 1, 2).
+            variance: of the mean of each window's points, inf where nothing is measured, shape (w,) [m^2].
+            stamp: [s]
+            interval: since the last one [s].
+        """
+        self._rate += moved / self._time
+        significance = np.empty(len(variance))
+        moved_apart(self._rate, normals, self._time, variance, significance)
+        self._significance, self._interval = float(significance.max()), interval
+        if self._significance > FOUND:
+            self._since = stamp if math.isnan(self._since) else self._since
+        elif self._significance < LOST:
+            self._since = math.nan
+
+    def found(self, stamp: float, positions: Points) -> tuple[Disturbance, ...]:
+        """Return the forces that explain what the camera moves the thread by, if it does so for long."""
+        if not stamp - self._since >= CONFIRMED * self._time:
+            return ()
+        thread = self._thread
+        drag, bending = thread.medium, thread.bending_stiffness * self._interval
+        force = force_density(self._rate, positions, drag.drag_across, drag.drag_along, bending)
+        return (strongest(force, positions, thread.segment_length, self._significance, self._since),)

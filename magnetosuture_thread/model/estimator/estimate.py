@@ -1,0 +1,117 @@
+"""The estimate: the thread as model and camera have it, with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.barrier import OBSTACLE, WALL, BarrierRows
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator.disturbance import Disturbance, DisturbanceTest
+from magnetosuture_thread.model.estimator.innovations import Innovations
+from magnetosuture_thread.model.estimator.noise import NoiseModel
+from magnetosuture_thread.model.formulations import ThreadState
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+
+Vector = NDArray[np.float64]
+
+ONE_SIDED_99 = 2.3263478740408408
+
+
+@dataclass(frozen=True)
+class ThreadEstimate:
+    """The thread at one instant, as model and camera have it.
+
+    Attributes:
+        prediction: the step that led to it; its positions and margins are the model's, from the last estimate.
+        positions: of all nodes, shape (n + 1, 2) [m].
+        covariance: of each node, shape (n + 1, 2, 2) [m^2].
+        deviation: of each node across the thread, shape (n + 1,) [m].
+        corrected: whether a measurement went into it; otherwise it is only a prediction.
+        unmeasured_for: time since the last measurement went in, inf if none ever did [s].
+        converged: whether the barriers themselves hold.
+        residual: largest scaled residual of the correction's program.
+        solves: number of programs of the correction.
+        points: number of points that were measured and placed on the thread.
+        hidden: part of the thread that no point shows.
+        innovations: None without a measurement.
+        noise: intensity of the process noise in each window, shape (w,) [m^2/s].
+        disturbances: what the model does not know.
+        problems: why pieces or the whole observation were refused.
+        compute_rows: of the barriers, at its positions.
+        contact_tolerance: a node this close to a shape or the wall touches it [m].
+    """
+
+    prediction: Prediction
+    positions: Points
+    covariance: NDArray[np.float64]
+    deviation: Vector
+    corrected: bool
+    unmeasured_for: float
+    converged: bool
+    residual: float
+    solves: int
+    points: int
+    hidden: float
+    innovations: Innovations | None
+    noise: Vector
+    disturbances: tuple[Disturbance, ...]
+    problems: tuple[str, ...]
+    compute_rows: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
+    contact_tolerance: float = field(repr=False)
+
+    @property
+    def stamp(self) -> float:
+        """Of the needle's pose [s]."""
+        return self.prediction.stamp
+
+    @cached_property
+    def margins(self) -> Margins:
+        """The margins of every barrier by its name, of the estimate's positions; computed at first access."""
+        return Margins.of(self.compute_rows(), self.contact_tolerance, self.prediction.scene_version)
+
+    @cached_property
+    def clearance_bounds(self) -> dict[str, Vector]:
+        """One-sided 99 % bound of each margin of obstacles, wall and added barriers as a distance [m].
+
+            clearance - 2.33 sum_k (g_k' C_k g_k)^(1/2) / |g|
+
+        with the covariances C_k of the nodes that the row depends on, taken as fully correlated.
+        """
+        bounds = {}
+        for rows in self.compute_rows():
+            if rows.name in (OBSTACLE, WALL) or rows.name not in _OWN:
+                bounds[rows.name] = _bound(rows, self.covariance)
+        return bounds
+
+
+_OWN = ("connectivity", "compression", "enhanced_connectivity", "stiffness", OBSTACLE, WALL)
+
+
+def _bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
+    deviation = np.sqrt(np.einsum("rka,rkab,rkb->rk", rows.gradient, covariance[rows.nodes], rows.gradient)).sum(axis=1)
+    slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
+    return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
+
+
+@dataclass(frozen=True)
+class FilterState:
+    """Everything that the next step and correction depend on."""
+
+    prediction: Prediction
+    converged: bool
+    pose: NeedlePose
+    thread: ThreadState
+    warm_start: tuple[Vector, Vector]
+    density: Vector
+    variance: Vector
+    noise: NoiseModel
+    test: DisturbanceTest
+    measured_at: float
+    gross: int
+    unknown: bool

@@ -1,0 +1,195 @@
+"""Process noise, learned from innovations: how fast the model goes wrong, in each window of arc length.
+
+Each window has a bank of scalar Kalman filters of the estimate's mean error e in it, one for each intensity q of the
+noise that could be at work:
+
+    e' = e + w,  var w = q dt,        nu = e + v,  var v = r
+
+with nu the mean innovation of the window's points. The weights of the bank are the likelihoods of the q, forgotten
+over time; the process noise is their geometric mean. So it falls to nothing where the model is right, and rises
+within a frame or two where something happens that the model does not know.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.model.estimator.innovations import Innovations, WindowSums
+
+Vector = NDArray[np.float64]
+
+WINDOWS = 16
+GRID = 10.0 ** np.arange(-17.0, -5.5)
+"""Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
+QUIET = 1e-14  # before anything is measured [m^2/s]
+SCALE_TIME = 5.0  # s; over which the scale of the points' variance is learned
+RATIO_TIME = 2.0  # s; over which the covariance of innovations is matched to them
+LEARNING_PRIOR = 0.2  # s of measurements, that what is assumed to begin with is worth
+MIN_SCALE, MAX_SCALE = 0.25, 16.0
+SURE = 3.0  # standard deviations
+MIN_INTERVAL = 1e-3  # s; between measurements, in which noise can be at work
+SWITCHING = 1e-4  # share of the weights that every intensity gets anew each second: the noise may change at once
+
+
+class NoiseBank(NamedTuple):
+    """The filters of all windows.
+
+    Attributes:
+        error: e of each, shape (w, g) [m].
+        variance: of it, shape (w, g) [m^2].
+        weight: likelihood of each intensity, rows sum to 1, shape (w, g).
+        intensity: q of each window, shape (w,) [m^2/s].
+    """
+
+    error: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    intensity: Vector
+
+    @classmethod
+    def of(cls, windows: int) -> NoiseBank:
+        """Return a bank that knows nothing but that the model is usually right."""
+        prior = -np.abs(np.log10(GRID / QUIET))
+        weight = np.exp(prior) / np.exp(prior).sum()
+        shape = (windows, len(GRID))
+        return cls(np.zeros(shape), np.zeros(shape), np.tile(weight, (windows, 1)), np.full(windows, QUIET))
+
+    def copied(self) -> NoiseBank:
+        """Return a copy."""
+        return NoiseBank(*(array.copy() for array in self))
+
+
+@compiled
+def learn(
+    bank: NoiseBank, grid: Vector, innovation: Vector, variance: Vector, interval: float, time_constant: float
+) -> None:
+    """Take the windows' mean innovations.
+
+    Args:
+        bank: written.
+        grid: q of each filter, shape (g,) [m^2/s].
+        innovation: nu of each window, shape (w,) [m].
+        variance: r of each, inf where nothing is measured, shape (w,) [m^2].
+        interval: since the last measurement [s].
+        time_constant: over which likelihoods are forgotten [s].
+    """
+    keep, share = np.exp(-interval / time_constant), min(1.0, SWITCHING * interval) / len(grid)
+    for w in range(len(innovation)):
+        if not np.isfinite(variance[w]):
+            for g in range(len(grid)):
+                bank.variance[w, g] += grid[g] * interval
+            continue
+        best = -np.inf
+        logs = np.empty(len(grid))
+        for g in range(len(grid)):
+            prior = bank.variance[w, g] + grid[g] * interval
+            expected = prior + variance[w]
+            off = innovation[w] - bank.error[w, g]
+            logs[g] = keep * np.log(bank.weight[w, g]) - 0.5 * (np.log(expected) + off * off / expected)
+            best = max(best, logs[g])
+            bank.error[w, g] += prior / expected * off
+            bank.variance[w, g] = prior * variance[w] / expected
+        total = 0.0
+        for g in range(len(grid)):
+            bank.weight[w, g] = np.exp(logs[g] - best)
+            total += bank.weight[w, g]
+        mean = 0.0
+        for g in range(len(grid)):
+            bank.weight[w, g] = max(bank.weight[w, g] / total * (1.0 - share * len(grid)) + share, 1e-30)
+            mean += bank.weight[w, g] * np.log(grid[g])
+        bank.intensity[w] = np.exp(mean)
+
+
+def unexplained(bank: NoiseBank) -> tuple[Vector, Vector]:
+    """Return the error that each window's filters expect of the estimate [m], and their variance of it [m^2]."""
+    return (bank.weight * bank.error).sum(axis=1), (bank.weight * bank.variance).sum(axis=1)
+
+
+@compiled
+def shift_errors(bank: NoiseBank, correction: Vector) -> None:
+    """Take what the estimate was moved by in each window, shape (w,) [m]: it is no error any more."""
+    for w in range(len(correction)):
+        for g in range(bank.error.shape[1]):
+            bank.error[w, g] -= correction[w]
+
+
+@compiled
+def interpolate_to_nodes(values: Vector, nodes: int, result: Vector) -> None:
+    """Write at each node the windows' values, interpolated in their logarithms between the windows' middles."""
+    windows = len(values)
+    for i in range(nodes):
+        at = windows * i / (nodes - 1.0) - 0.5
+        low = int(min(max(np.floor(at), 0.0), windows - 2.0))
+        part = min(max(at - low, 0.0), 1.0)
+        result[i] = np.exp((1.0 - part) * np.log(values[low]) + part * np.log(values[low + 1]))
+
+
+class NoiseModel:
+    """What is learned of process noise and measurement noise.
+
+    Args:
+        time_constant: over which the process noise is learned [s].
+
+    Attributes:
+        bank: filters of the windows.
+        scale: of the points' variance over what the camera says.
+        ratio: of squared innovations over what is expected.
+        intensity: of the process noise at the last measurement, shape (w,) [m^2/s].
+    """
+
+    def __init__(self, time_constant: float) -> None:
+        self.bank = NoiseBank.of(WINDOWS)
+        self.scale, self.ratio = 1.0, 1.0
+        self.intensity = self.bank.intensity.copy()
+        self._time_constant, self._learned_for = time_constant, 0.0
+        self._last_mean, self._last_variance = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)
+
+    def copied(self) -> NoiseModel:
+        """Return a copy."""
+        other = copy.copy(self)
+        other.bank, other.intensity = self.bank.copied(), self.intensity.copy()
+        return other
+
+    def learn(self, sums: WindowSums, unit: float, elapsed: float) -> Innovations:
+        """Test the innovations of a frame, and learn from them.
+
+        Args:
+            sums: of the windows.
+            unit: D [m].
+            elapsed: since the last measurement [s].
+        """
+        mean, own = sums.mean * unit, sums.own * unit**2
+        seen, expected = np.isfinite(mean), own + sums.known * unit**2
+        innovations = Innovations(mean, self.ratio * expected)
+        if seen.any():
+            self.ratio += self._share(elapsed, RATIO_TIME) * (float((mean**2 / expected)[seen].mean()) - self.ratio)
+        self._learn_scale(mean, own / self.scale, seen, elapsed)
+        learn(self.bank, GRID, mean, own, elapsed, self._time_constant)
+        # Where the bank knows of an error that the last correction left, the noise was too low: as if it came at once.
+        left, doubt = unexplained(self.bank)
+        excess = np.where(seen, np.maximum(left**2 - SURE**2 * doubt, 0.0), 0.0)
+        self.intensity = self.bank.intensity + excess / max(elapsed, MIN_INTERVAL)
+        self._learned_for += elapsed
+        return innovations
+
+    def _learn_scale(self, mean: Vector, variance: Vector, seen: NDArray[np.bool_], elapsed: float) -> None:
+        """Learn by how much the points' variance is larger than told, from what changes between two frames.
+
+        E (nu_k - nu_{k-1})^2 = 2 s r,    as errors of the model last, and those of two frames are independent
+        """
+        both = seen & np.isfinite(self._last_mean)
+        if both.any():
+            change = (mean - self._last_mean)[both] ** 2
+            ratio = float(np.minimum(change / (variance + self._last_variance)[both], MAX_SCALE).mean())
+            share = self._share(elapsed, SCALE_TIME)
+            self.scale = min(max(self.scale + share * (ratio - self.scale), MIN_SCALE), MAX_SCALE)
+        self._last_mean, self._last_variance = np.where(seen, mean, np.nan), variance
+
+    def _share(self, elapsed: float, time_constant: float) -> float:
+        """Return the share of a new value in a mean: of all values at first, later of those of some time."""
+        return min(elapsed / (min(self._learned_for, time_constant) + LEARNING_PRIOR), 1.0)

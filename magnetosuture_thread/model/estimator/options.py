@@ -1,0 +1,43 @@
+"""Options of the estimator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+from magnetosuture_thread.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class EstimatorOptions:
+    """How much the camera and the model are trusted.
+
+    Attributes:
+        error_correlation: distance along the thread over which the model's errors are alike, as a part of its length.
+        point_correlation: distance along a measured piece over which the errors of its points are alike; points
+            closer than this share one point's information [m].
+        min_deviation: standard deviation of a measured point, at the least [m].
+        noise_time: time over which the process noise is learned from innovations [s].
+        initial_error: standard deviation of the free end of a thread whose shape nobody has seen, as a part of its
+            length.
+        disturbance_time: averaging time of the test for what the model does not know [s].
+        history: how late an observation may come [s].
+
+    Raises:
+        ConfigurationError: a value is not a positive number.
+    """
+
+    error_correlation: float = 0.1
+    point_correlation: float = 2.5e-4
+    min_deviation: float = 5e-6
+    noise_time: float = 1.0
+    initial_error: float = 0.2
+    disturbance_time: float = 0.4
+    history: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ConfigurationError(f"estimator.{each.name}", value, "a positive number")

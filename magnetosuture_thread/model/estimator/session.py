@@ -1,0 +1,169 @@
+"""Streaming estimation: poses and observations in any order, late ones folded in at their stamps."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
+from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
+from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+
+MAX_LATENESS = 1.0  # s; a pose older by more than this is not late: time itself was set back
+MAX_POSES = 400  # that are kept, however many come in the time for which history is kept
+DOUBLED = "a second observation of the same frame"
+
+
+@dataclass
+class _Moment:
+    """A pose, what was measured at it, and the state of the filter after both."""
+
+    pose: NeedlePose
+    observation: ThreadObservation | None = None
+    after: FilterState | None = None
+
+
+@dataclass(frozen=True)
+class EstimationResult:
+    """What came of a pose or an observation.
+
+    Attributes:
+        estimate: at the last pose; None before the thread has a shape, or where a step was not solved.
+        measured: at the observation's own stamp, where that came late; else the same as `estimate`.
+        problem: why there is no estimate, or why the observation was refused; None if nothing is wrong.
+    """
+
+    estimate: ThreadEstimate | None
+    measured: ThreadEstimate | None = field(default=None, repr=False)
+    problem: InvalidInputError | SolverError | None = None
+
+
+class EstimatorSession:
+    """Estimates the thread over one run.
+
+    A late observation is folded in at its stamp: the filter goes back to the pose of its frame and takes all later
+    poses and observations again. So the estimate is, to the last bit, the one that would have been had it come in time.
+
+    Args:
+        estimator: warmed up.
+    """
+
+    def __init__(self, estimator: ThreadEstimator) -> None:
+        self._estimator = estimator
+        self._moments: deque[_Moment] = deque(maxlen=MAX_POSES)
+        self._early: dict[float, ThreadObservation] = {}
+
+    def reset(self) -> None:
+        """Forget the thread."""
+        self._estimator.reset()
+        self._moments.clear()
+        self._early.clear()
+
+    def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
+        """Start from a shape that is given; without it, straight behind the needle."""
+        self.reset()
+        estimate = self._estimator.start(pose, centreline)
+        self._moments.append(_Moment(pose, after=self._estimator.snapshot()))
+        return EstimationResult(estimate, estimate)
+
+    def on_pose(self, pose: NeedlePose) -> EstimationResult:
+        """Follow the needle to its next pose; an observation of its frame that came before it is taken with it.
+
+        The first pose starts the thread: from the observation of its frame, or straight behind the needle.
+        """
+        if self._moments and pose.stamp < self._moments[-1].pose.stamp - MAX_LATENESS:
+            self.reset()
+        moment = _Moment(pose, self._early.pop(pose.stamp, None))
+        try:
+            estimate = self._take(moment)
+        except (InvalidInputError, SolverError) as error:
+            return EstimationResult(None, problem=error)
+        self._moments.append(moment)
+        while self._moments[0].pose.stamp < pose.stamp - self._estimator.options.history:
+            self._moments.popleft()
+        self._early = {stamp: early for stamp, early in self._early.items() if stamp > pose.stamp}
+        return EstimationResult(estimate, estimate)
+
+    def on_observation(self, stamp: float, observation: ThreadObservation) -> EstimationResult:
+        """Take what a frame shows of the thread, at the pose of that frame.
+
+        An observation of a frame whose pose has not come yet waits for it. One that is older than what is kept, of a
+        frame without a pose, or of one that was observed already, is refused.
+        """
+        if not np.isfinite(stamp):
+            return self._refused(stamp, "a finite time [s]")
+        last = self._moments[-1].pose.stamp if self._moments else -np.inf
+        if stamp > last:
+            if self._moments and stamp > last + self._estimator.options.history:
+                return self._refused(stamp, f"at most {self._estimator.options.history:g} s after the last pose")
+            self._early[stamp] = observation
+            while len(self._early) > MAX_POSES:
+                del self._early[min(self._early)]
+            return EstimationResult(None)
+        index = next((k for k, moment in enumerate(self._moments) if moment.pose.stamp == stamp), None)
+        if index is None:
+            return self._refused(stamp, "the stamp of a pose that is kept")
+        if self._moments[index].observation is not None:
+            return self._refused(stamp, f"no {DOUBLED}")
+        before = self._moments[index - 1].after if index > 0 else None
+        if index == 0 and self._moments[0].after is None:
+            return self._refused(stamp, "a pose that was stepped to")
+        self._moments[index].observation = observation
+        return self._fold_in(index, before)
+
+    def _fold_in(self, index: int, before: FilterState | None) -> EstimationResult:
+        """Take a moment and all after it again."""
+        measured: ThreadEstimate | None = None
+        estimate: ThreadEstimate | None = None
+        if before is None:
+            # The oldest moment that is kept: its own step cannot be taken again, but be corrected after it.
+            first = self._moments[index]
+            assert first.after is not None
+            assert first.observation is not None
+            self._estimator.restore(first.after)
+            measured = estimate = self._estimator.correct(first.observation)
+            first.after = self._estimator.snapshot()
+        else:
+            self._estimator.restore(before)
+            measured = estimate = self._take(self._moments[index])
+        problem = None
+        for later in list(self._moments)[index + 1 :]:
+            try:
+                estimate = self._take(later)
+            except (InvalidInputError, SolverError) as error:
+                problem = error
+        return EstimationResult(estimate, measured, problem)
+
+    def _take(self, moment: _Moment) -> ThreadEstimate:
+        if not self._estimator.started:
+            estimate = self._estimator.start(moment.pose)
+            if moment.observation is not None:
+                estimate = self._estimator.correct(moment.observation)
+        else:
+            estimate = self._estimator.step(moment.pose, moment.observation)
+        moment.after = self._estimator.snapshot()
+        return estimate
+
+    def _refused(self, stamp: float, expected: str) -> EstimationResult:
+        return EstimationResult(None, problem=InvalidInputError("thread observation stamp", stamp, expected))
+
+
+def observation_of(centreline: Points, length: float, deviation: float) -> ThreadObservation:
+    """Return an observation of a measured centreline, from the needle's tail on, which may end early.
+
+    Args:
+        centreline: shape (m, 2) [m].
+        length: of the thread [m].
+        deviation: of each point across it [m].
+    """
+    points = np.asarray(centreline, dtype=np.float64).reshape(-1, 2)
+    along = float(np.hypot(*np.diff(points, axis=0).T).sum()) if len(points) > 1 else 0.0
+    complete = along > 0.97 * length
+    last = PieceEnd.FREE if complete else PieceEnd.UNKNOWN
+    piece = ThreadPiece(points, np.full(len(points), deviation), PieceEnd.TAIL, last, (0.0, 0.0))
+    return ThreadObservation((piece,), complete)

@@ -1,0 +1,135 @@
+"""Points are put where they belong along the thread, or refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import Disc
+from magnetosuture_thread.model.estimator.association import path_lengths, path_without_outliers, search_start
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from test.model.estimator.threads import (
+    DEVIATION,
+    LENGTH,
+    error_percent,
+    estimator_of,
+    piece_of,
+    poses,
+    thread_of,
+    true_shapes,
+    whole,
+)
+
+NAN = (float("nan"), float("nan"))
+
+
+def test_points_far_aside_are_left_out_of_the_path() -> None:
+    rng = np.random.default_rng(1)
+    angle = np.linspace(0.0, 4.0, 100)
+    points = 3.0 * np.column_stack([np.cos(angle), np.sin(angle)]) + rng.normal(0.0, 0.02, (100, 2))
+    wrong = np.zeros(100, dtype=np.bool_)
+    wrong[[0, 7, 8, 40, 41, 42, 77, 99]] = True
+    points[wrong] += rng.choice([-1.0, 1.0], (8, 2)) * 4.0
+    kept = np.zeros(100, dtype=np.bool_)
+    path_without_outliers(points, 0.12, 0.3, kept)
+    np.testing.assert_array_equal(kept, ~wrong)
+
+
+def test_length_of_a_noisy_path_is_not_that_of_its_noise() -> None:
+    rng = np.random.default_rng(2)
+    points = np.column_stack([np.linspace(0.0, 10.0, 200), rng.normal(0.0, 0.02, 200)])
+    arcs = np.empty(200)
+    path_lengths(points, 0.4, arcs)
+    assert abs(arcs[-1] - 10.0) < 0.05 < 0.2 < np.hypot(*np.diff(points, axis=0).T).sum() - 10.0
+    assert np.all(np.diff(arcs) >= 0.0)
+
+
+def test_start_of_a_piece_is_found_along_the_thread() -> None:
+    nodes = np.column_stack([np.arange(30.0), 3.0 * np.sin(0.3 * np.arange(30.0))])
+    at = np.arange(0.0, 8.0, 0.25)
+    along = np.concatenate([[0.0], np.hypot(*np.diff(nodes, axis=0).T).cumsum()])
+    unit = nodes * 29.0 / along[-1]
+    chain = np.column_stack(
+        [np.interp(np.linspace(0.0, 29.0, 30), along * 29.0 / along[-1], unit[:, a]) for a in (0, 1)]
+    )
+    points = np.column_stack([np.interp(11.3 + at, np.arange(30.0), chain[:, a]) for a in (0, 1)])
+    found, square = search_start(chain, points, at, 0.0, 21.0, 100.0)
+    assert found == pytest.approx(11.3, abs=0.06)
+    assert square < 0.01
+
+
+def run_with(pieces_at, count: int = 60, **options):
+    """Return estimates of a thread that starts as it lies, with pieces made from its true nodes at each pose."""
+    way, thread = poses(count), thread_of(**options)
+    truth = true_shapes(thread, way)
+    estimator = estimator_of(thread_of(viscosity=1.3))
+    estimator.start(way[0])
+    found = [estimator.step(pose, pieces_at(truth[k], k)) for k, pose in enumerate(way[1:], 1)]
+    return found, truth
+
+
+def test_a_piece_of_unknown_place_and_direction_is_placed() -> None:
+    def seen(nodes: np.ndarray, k: int) -> ThreadObservation:
+        piece = piece_of(nodes, k, 0.4 * LENGTH, 0.8 * LENGTH)
+        turned = piece.points[::-1] if k % 2 else piece.points
+        return ThreadObservation(
+            (ThreadPiece(turned, piece.deviation, PieceEnd.UNKNOWN, PieceEnd.UNKNOWN, NAN, direction_known=False),)
+        )
+
+    found, truth = run_with(seen)
+    assert all(each.corrected and not each.problems for each in found)
+    assert found[-1].hidden == pytest.approx(0.6, abs=0.1)
+    assert error_percent(found[-1].positions, truth[-1]) < 0.2
+
+
+def test_another_thread_is_refused() -> None:
+    other = np.column_stack([np.linspace(-0.012, 0.004, 60), np.full(60, 0.002)])
+
+    def seen(nodes: np.ndarray, k: int) -> ThreadObservation:
+        piece = ThreadPiece(other, np.full(60, DEVIATION), PieceEnd.UNKNOWN, PieceEnd.UNKNOWN, NAN, False)
+        return ThreadObservation((piece, piece_of(nodes, k)))
+
+    found, truth = run_with(seen)
+    assert all(any("another" in problem for problem in each.problems) for each in found)
+    assert error_percent(found[-1].positions, truth[-1]) < 0.15
+
+
+def test_outliers_do_not_move_the_thread() -> None:
+    def seen(nodes: np.ndarray, k: int) -> ThreadObservation:
+        rng, piece = np.random.default_rng(k), piece_of(nodes, k)
+        wrong = rng.random(len(piece.points)) < 0.1
+        angle = rng.uniform(0.0, 2.0 * np.pi, wrong.sum())
+        piece.points[wrong] += 5e-3 * np.column_stack([np.cos(angle), np.sin(angle)])
+        return ThreadObservation((piece,))
+
+    found, truth = run_with(seen)
+    assert max(error_percent(each.positions, nodes) for each, nodes in zip(found, truth[1:], strict=True)) < 0.5
+    assert error_percent(found[-1].positions, truth[-1]) < 0.15
+
+
+def test_points_beyond_an_obstacle_are_refused() -> None:
+    disc, way = Disc((-0.01, 0.0021), 2e-3), poses(3, turn=0.0)
+    estimator = estimator_of(thread_of(), (disc,))
+    estimator.start(way[0])
+    nodes = np.column_stack([-np.linspace(0.0, LENGTH, 26), np.zeros(26)]) + way[1].tail
+    piece = piece_of(nodes, 1)
+    beyond = (piece.points[:, 0] < -0.0094) & (piece.points[:, 0] > -0.0106)
+    piece.points[beyond, 1] = 0.0045
+    estimate = estimator.step(way[1], ThreadObservation((piece,)))
+    assert (
+        any("obstacle" in problem or "path" in problem for problem in estimate.problems)
+        or np.abs(estimate.positions[:, 1]).max() < 1e-4
+    )
+    assert np.abs(estimate.positions[:, 1]).max() < 1e-4
+
+
+@pytest.mark.parametrize("start", ["straight", "wrong"])
+def test_unknown_start_is_found_at_once(start: str) -> None:
+    way = poses(90)
+    truth = true_shapes(thread_of(), way)
+    estimator = estimator_of(thread_of())
+    bent = truth[40] + np.linspace(0.0, 1.0, 26)[:, None] * np.array([0.0, 0.2 * LENGTH])
+    estimator.start(way[40], bent if start == "wrong" else None)
+    for k in range(41, 71):
+        estimate = estimator.step(way[k], whole(truth[k], k))
+    assert error_percent(estimate.positions, truth[70]) < 0.3

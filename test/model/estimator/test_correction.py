@@ -1,0 +1,275 @@
+"""The correction is the measurement update of a Kalman filter, on the thread's constraints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import Disc
+from magnetosuture_thread.model.estimator.correction import (
+    CORRECTED,
+    CorrectionBuffers,
+    MeasuredPoints,
+    correct,
+    measured_rows,
+    normals_of,
+    prior_information,
+)
+from magnetosuture_thread.model.estimator.covariance import propagate, selected_inverse
+from magnetosuture_thread.model.formulations.step import StepBuffers, program_of
+from magnetosuture_thread.model.program import as_quadratic_program
+from magnetosuture_thread.model.solvers import BandedSolver
+from magnetosuture_thread.model.solvers.banded import assemble_matrix, factorise
+from magnetosuture_thread.thread_observation import ThreadObservation
+from test.model.estimator.threads import (
+    LENGTH,
+    RATE,
+    error_percent,
+    estimator_of,
+    piece_of,
+    poses,
+    thread_of,
+    true_shapes,
+    whole,
+)
+
+NODES = 13
+
+
+def bent_chain(rng: np.random.Generator) -> np.ndarray:
+    turns = np.concatenate([[0.3], rng.normal(0.0, 0.15, NODES - 2)]).cumsum()
+    return np.vstack([np.zeros(2), np.column_stack([np.cos(turns), np.sin(turns)]).cumsum(axis=0)])
+
+
+def measured(rng: np.random.Generator, count: int) -> MeasuredPoints:
+    return MeasuredPoints(
+        np.sort(rng.uniform(0.2, NODES - 1.0, count)),
+        rng.normal(0.0, 0.05, count),
+        rng.uniform(1e-4, 1e-3, count),
+        rng.uniform(0.3, 1.0, count),
+    )
+
+
+def dense_rows(points: MeasuredPoints, nodes: np.ndarray) -> np.ndarray:
+    rows = np.zeros((len(points.place), 2 * NODES))
+    for p, place in enumerate(points.place):
+        i = min(int(place), NODES - 2)
+        t = place - i
+        along = nodes[i + 1] - nodes[i]
+        normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+        rows[p, 2 * i : 2 * i + 2], rows[p, 2 * i + 2 : 2 * i + 4] = (1.0 - t) * normal, t * normal
+    return rows
+
+
+def dense_of(buffers: StepBuffers, known: np.ndarray, rows: int) -> np.ndarray:
+    """Return P of a program, dense."""
+    program = as_quadratic_program(program_of(buffers, known, rows))
+    upper = program.P.toarray()[: 2 * NODES, : 2 * NODES]
+    return upper + upper.T - np.diag(np.diag(upper))
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_prior_information_is_the_one_that_is_documented(clamped: bool) -> None:
+    rng = np.random.default_rng(1)
+    nodes, known = bent_chain(rng), np.zeros(NODES, dtype=np.bool_)
+    density, noise = rng.uniform(0.5, 2.0, NODES), rng.uniform(0.5, 2.0, NODES)
+    normals, buffers = np.zeros((NODES, 2)), StepBuffers.of(NODES, 2, 1, 2)
+    normals_of(nodes, normals)
+    length, stiffness, scale = 2.0, 0.7, 3.0
+    prior_information(density, noise, length, stiffness, scale, clamped, normals, buffers)
+    found = dense_of(buffers, known, 0)
+    for _ in range(5):
+        d = rng.normal(0.0, 1.0, (NODES, 2))
+        across = np.einsum("ia,ia->i", normals, d)
+        value = (across**2 / density).sum() + 1e-6 * (np.einsum("ia,ia->i", d, d) / density).sum()
+        middle = 0.5 * (density[1:] + density[:-1])
+        value += (length**2 / middle * ((d[1:] - d[:-1]) ** 2).sum(axis=1)).sum()
+        bend = d[2:] - 2.0 * d[1:-1] + d[:-2]
+        value += (2.0 * stiffness / noise[1:-1] * (bend**2).sum(axis=1)).sum()
+        if clamped:
+            value += stiffness / noise[0] * float(((2.0 * (d[1] - d[0])) ** 2).sum())
+        assert d.ravel() @ found @ d.ravel() == pytest.approx(value / scale, rel=1e-10)
+
+
+def test_rows_of_a_segment_are_those_of_all_its_points() -> None:
+    rng = np.random.default_rng(2)
+    nodes, points = bent_chain(rng), measured(rng, 60)
+    weights = rng.uniform(0.2, 1.0, 60)
+    buffers, gram = StepBuffers.of(NODES, 2, 2 * NODES, 2), np.zeros((NODES - 1, 5))
+    end = measured_rows(points, weights, 1.0, nodes, 0, gram, buffers)
+    assert end <= 2 * (NODES - 1)
+    full = dense_rows(points, nodes)
+    precision = weights * points.share / points.variance
+    matrix, right = np.zeros((2 * NODES, 2 * NODES)), np.zeros(2 * NODES)
+    for r in range(end):
+        row = np.zeros(2 * NODES)
+        first = 2 * buffers.first[r]
+        row[first : first + 6] = buffers.gradient[r].ravel()
+        matrix += np.outer(row, row) / buffers.compliance[r]
+        right += row * buffers.lower[r] / buffers.compliance[r]
+    np.testing.assert_allclose(matrix, full.T @ (precision[:, None] * full), rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(right, full.T @ (precision * points.innovation), rtol=1e-9, atol=1e-6)
+
+
+def test_selected_inverse_matches_the_dense_one() -> None:
+    rng = np.random.default_rng(3)
+    nodes, known = bent_chain(rng), np.zeros(NODES, dtype=np.bool_)
+    known[0] = True
+    buffers, points = StepBuffers.of(NODES, 2, 3 * NODES, 2), measured(rng, 40)
+    normals = np.zeros((NODES, 2))
+    normals_of(nodes, normals)
+    prior_information(np.ones(NODES), np.ones(NODES), 1.5, 0.4, 1.0, False, normals, buffers)
+    rows = measured_rows(points, np.ones(40), 1.0, nodes, 0, np.zeros((NODES - 1, 5)), buffers)
+    band = np.zeros((2 * NODES + 6, 7))
+    program = program_of(buffers, known, rows)
+    assemble_matrix((0, 1), program, 1.0 / program.compliance, np.ones(rows, dtype=np.bool_), band)
+    dense = np.zeros((2 * NODES, 2 * NODES))
+    for j in range(2 * NODES):
+        for k in range(7):
+            if j + k < 2 * NODES:
+                dense[j, j + k] = dense[j + k, j] = band[j, k]
+    assert factorise((0, 1), band)
+    inverse = np.zeros((2 * NODES + 6, 7))
+    selected_inverse(6, 2 * NODES, band, inverse)
+    expected = np.linalg.inv(dense)
+    for k in range(7):
+        np.testing.assert_allclose(inverse[: 2 * NODES - k, k], np.diagonal(expected, k), rtol=1e-7, atol=1e-10)
+
+
+def test_correction_agrees_with_a_dense_kalman_filter() -> None:
+    """A straight thread has no constraint across it, so that across it the update is the plain one."""
+    rng = np.random.default_rng(4)
+    segments = NODES - 1
+    estimator = estimator_of(thread_of(segments))
+    estimator.start(poses(1)[0])
+    nodes = np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
+    points = MeasuredPoints(
+        np.sort(rng.uniform(0.5, segments, 40)), rng.normal(0.0, 1e-4, 40), np.full(40, 1e-4), np.ones(40)
+    )
+    density, noise = np.full(NODES, 3e-4), np.full(NODES, 1.0)
+    buffers, memory = StepBuffers.of(NODES, 2, 3 * segments + 1, 2 * NODES), CorrectionBuffers.of(NODES)
+    memory.known[0] = True
+    formulation, solver = estimator.predictor.formulation, BandedSolver()
+    code, _, off, residuals = correct(
+        (0, 1),
+        formulation.rod,  # type: ignore[attr-defined]
+        buffers,
+        formulation.workspace.data,
+        solver.buffers(NODES, 2, len(buffers.first)),
+        memory,
+        nodes,
+        np.array([1.0, 0.0]),
+        density,
+        noise,
+        2.0,
+        0.5,
+        points,
+        np.ones(40),
+        (0.0, np.inf),
+        1e-6,
+    )
+    assert code == CORRECTED
+    assert off <= 1.0
+    assert max(residuals) < 1e-6
+    check = StepBuffers.of(NODES, 2, 1, 2)
+    prior_information(density, noise, 2.0, 0.5, 1.0, False, memory.normals, check)
+    information = dense_of(check, np.zeros(NODES, dtype=np.bool_), 0)[2:, 2:][1::2, 1::2]
+    rows = dense_rows(points, nodes)[:, 3::2]
+    prior = np.linalg.inv(information)
+    spread = rows @ prior @ rows.T + np.diag(points.variance)
+    gain = prior @ rows.T @ np.linalg.inv(spread)
+    np.testing.assert_allclose(memory.moved[1:, 1], gain @ points.innovation, rtol=1e-3, atol=1e-8)
+    covariance = prior - gain @ rows @ prior
+    np.testing.assert_allclose(memory.covariance[1:, 1, 1], np.diag(covariance), rtol=1e-3)
+    assert np.abs(memory.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
+
+
+def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> None:
+    nodes = np.column_stack([-np.arange(10.0), np.zeros(10)])
+    variance = np.zeros(10)
+    variance[5] = 1.0
+    propagate(nodes + np.array([1.0, 0.0]), nodes, np.zeros(10), variance, np.empty(10))
+    np.testing.assert_allclose(variance, np.eye(10)[6], atol=1e-12)
+    propagate(nodes + np.array([0.0, 1.0]), nodes, np.full(10, 0.1), variance, np.empty(10))
+    np.testing.assert_allclose(variance, np.eye(10)[6] + 0.1, atol=1e-12)
+
+
+def test_deviation_matches_the_spread_of_estimates() -> None:
+    """Of a thread at rest whose shape is known to nobody at first, estimates spread as the covariance says."""
+    thread = thread_of()
+    rest = poses(2, speed=0.0, turn=0.0)
+    truth = np.column_stack([-np.linspace(0.0, LENGTH, 26), np.zeros(26)])
+    found, told = [], []
+    for seed in range(60):
+        estimator = estimator_of(thread)
+        estimator.start(rest[0], truth, deviation=1e-4)
+        estimate = estimator.step(rest[1], ThreadObservation((piece_of(truth, seed),), True))
+        found.append(estimate.positions[5:, 1])
+        told.append(estimate.deviation[5:])
+    ratio = np.sqrt(np.square(found).mean() / np.square(told).mean())
+    assert 0.5 < ratio < 1.5
+
+
+def test_constraints_hold_after_a_correction() -> None:
+    """A measured thread that lies in an obstacle, and is too long, leaves the estimate outside and as long as it is."""
+    disc = Disc((-0.008, 0.0015), 1.2e-3)
+    thread = thread_of()
+    estimator = estimator_of(thread, (disc,))
+    way = poses(30, turn=0.0)
+    first = np.column_stack([-np.linspace(0.0, LENGTH, 26), np.zeros(26)])
+    estimator.start(way[0], first)
+    for k, pose in enumerate(way[1:]):
+        seen = first + pose.tail
+        seen[:, 1] += 1.5e-3 * np.sin(np.linspace(0.0, np.pi, 26))  # through the disc
+        estimate = estimator.step(pose, ThreadObservation((piece_of(1.02 * seen, k),), True))
+        assert estimate.converged
+        gap = np.linalg.norm(estimate.positions - np.array(disc.centre), axis=1) - disc.radius - 0.5 * thread.diameter
+        assert gap.min() > -1.5e-7
+        assert (
+            np.abs(
+                estimator.predictor.formulation.rest_lengths(estimate.positions, pose.heading)
+                / np.linalg.norm(np.diff(estimate.positions, axis=0), axis=1)
+                - 1.0
+            ).max()
+            < 1.5e-3
+        )
+
+
+def test_without_observations_the_estimate_is_the_prediction_to_the_last_bit() -> None:
+    thread, way = thread_of(), poses(40)
+    estimator, alone = estimator_of(thread), estimator_of(thread).predictor
+    estimator.start(way[0])
+    alone.start(way[0])
+    for pose in way[1:]:
+        estimate = estimator.step(pose)
+        assert not estimate.corrected
+        assert estimate.unmeasured_for == np.inf
+        np.testing.assert_array_equal(estimate.positions, alone.step(pose).positions)
+
+
+def test_a_wrong_model_is_corrected() -> None:
+    way = poses(150)
+    truth = true_shapes(thread_of(material="polyamide_7_0"), way)
+    estimator, alone = estimator_of(thread_of()), estimator_of(thread_of()).predictor
+    estimator.start(way[0])
+    alone.start(way[0])
+    for k, pose in enumerate(way[1:], 1):
+        estimate, prediction = estimator.step(pose, whole(truth[k], k)), alone.step(pose)
+    assert estimate.corrected
+    assert RATE * estimate.unmeasured_for < 0.5
+    assert error_percent(estimate.positions, truth[-1]) < 0.15 < 1.0 < error_percent(prediction.positions, truth[-1])
+
+
+def test_bound_of_clearance_is_below_the_clearance_by_the_deviation() -> None:
+    disc, way = Disc((-0.008, 0.003), 1.2e-3), poses(5, turn=0.0)
+    estimator = estimator_of(thread_of(), (disc,))
+    estimator.start(way[0])
+    estimate = estimator.step(way[1], whole(true_shapes(thread_of(), way)[1], 1))
+    rows = {each.name: each for each in estimate.compute_rows()}["obstacle"]
+    bound = estimate.clearance_bounds["obstacle"]
+    node = rows.nodes[:, -1]
+    expected = rows.clearance - 2.3263 * np.sqrt(
+        np.einsum("ra,rab,rb->r", rows.gradient[:, 0], estimate.covariance[node], rows.gradient[:, 0])
+    )
+    np.testing.assert_allclose(bound, expected, rtol=1e-4)
+    assert (bound < rows.clearance)[node > 0].all()
