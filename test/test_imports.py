@@ -28,7 +28,6 @@ ALLOWED = {
     "untrusted": set(),
     "compiled": set(),
     "workers": set(),
-    "thread_observation": {"geometry"},
     "barrier": {"errors", "geometry", "texts"},
     "geometry": {"errors", "compiled"},
     "scene": {*BASE, "geometry", "interface", "shared_parameters"},

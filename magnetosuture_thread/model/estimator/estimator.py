@@ -222,7 +222,7 @@ class ThreadEstimator:
             return None
         self._gross = 0
         unit, segments = self._unit, self.thread.segments
-        seen = smoothed(piece.points, piece.arcs, SMOOTHING * self.options.point_correlation / unit) * unit
+        seen = smoothed_line(piece.points, piece.arcs, SMOOTHING * self.options.point_correlation / unit) * unit
         path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         chain = chain_inside(path, segments, unit, radius)

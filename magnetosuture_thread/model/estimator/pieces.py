@@ -191,7 +191,7 @@ def _not_ours(piece: PlacedPiece, nodes: Points, variance: Vector) -> str:
     return ""
 
 
-def smoothed(points: Points, arcs: Vector, length: float) -> Points:
+def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:
     """Return a path averaged over a length along it, by a normal distribution of that standard deviation."""
     weights = np.exp(-0.5 * ((arcs[:, None] - arcs[None, :]) / length) ** 2)
     # Towards an end the average is taken over less, evenly to both sides, so that the end stays where it is.
