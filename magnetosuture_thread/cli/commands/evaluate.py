@@ -169,9 +169,11 @@ def run_track(options: argparse.Namespace) -> int:
 
     --json writes a list with an entry for each frame: file (for a bag, topic and stamp), status (tracked, lost
     or searching) and its reason, tail_m, tip_m and heading_rad (the tangent at the tail), curvature_per_m
-    (positive to the left), thread_m from the tail on, all in the dish frame, confidence from 0 to 1, stamp_s,
-    and time_s, the processor time to search the frame, on one core, without reading and decoding it; all is
-    compiled before. What has no value is null.
+    (positive to the left), thread_m from the tail on, all in the dish frame, needle_length_m as measured over
+    the first frames of a bag, pieces of the thread (points_m, deviation_m across, why their ends are ends,
+    arc_length_m of the first point at least and at most) and whether they are complete, confidence from 0 to 1,
+    stamp_s, and time_s, the processor time to search the frame, on one core, without reading and decoding it;
+    all is compiled before. What has no value is null.
     """
     from magnetosuture_thread import read_scene
     from magnetosuture_thread.jobs.track import settings_with, track

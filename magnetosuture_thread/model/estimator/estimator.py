@@ -36,7 +36,7 @@ from magnetosuture_thread.model.estimator.pieces import (
     free_end,
     measured_points,
     place_pieces,
-    smoothed,
+    smoothed_line,
 )
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.model.formulations.step import StepBuffers
