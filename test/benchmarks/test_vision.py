@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.vision.covers import CLASSES
+from benchmarks.vision.classes import CLASSES
 from benchmarks.vision.frames import Case
 from benchmarks.vision.measurements import compare, frame_of, row_of
 from magnetosuture_thread.vision.look import State, Track
