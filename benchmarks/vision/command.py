@@ -115,8 +115,8 @@ def table(rows: list[Row]) -> Table:
             f"{row.median_ms:.1f}",
         )
     result.caption = (
-        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or\n"
-        "heading by 5 degrees; rev: by 90; >cov: by more than the covariance\n"
+        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or "
+        "heading by 5 degrees; rev: by 90; >cov: by more than the covariance "
         "says; px, deg: RMS of the others"
     )
     result.caption_justify = "left"
@@ -141,10 +141,10 @@ def table_of_pieces(rows: list[Row]) -> Table:
             _number(row.normalised, ".1f"),
         )
     result.caption = (
-        "line: visible thread that is followed from the tail; pcs: that is on\n"
-        "pieces; off: share of pieces where no thread is; ?: pieces of unknown\n"
-        "place; wrg: of a place that is wrong; all: frames said to show all of\n"
-        "the thread; free: ends said to be its own; not: of these, that are not;\n"
+        "line: visible thread that is followed from the tail; pcs: that is on "
+        "pieces; off: share of pieces where no thread is; ?: pieces of unknown "
+        "place; wrg: of a place that is wrong; all: frames said to show all of "
+        "the thread; free: ends said to be its own; not: of these, that are not; "
         "dev: RMS of errors over their standard deviation"
     )
     result.caption_justify = "left"
