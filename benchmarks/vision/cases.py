@@ -49,11 +49,13 @@ NO_THREAD = np.array([[0.5, 0.5], [0.519, 0.5]])  # m; outside of the image
 SKIN_BGR = (150.0, 170.0, 225.0)
 
 
-def _unit(angle: float) -> Points:
+def unit_vector(angle: float) -> Points:
+    """Return the unit vector at an angle [rad], shape (2,)."""
     return np.array([math.cos(angle), math.sin(angle)])
 
 
-def _lighting(random: Random) -> Lighting:
+def random_lighting(random: Random) -> Lighting:
+    """Return lighting and noise of a usual laboratory."""
     return Lighting(
         gain=random.uniform(0.7, 1.05),
         slope=random.uniform(0.0, 3.0),
@@ -63,7 +65,8 @@ def _lighting(random: Random) -> Lighting:
     )
 
 
-def _needle(random: Random, length: float = 0.007, within: float = WITHIN, width: float = 0.0004) -> Needle:
+def random_needle(random: Random, length: float = 0.007, within: float = WITHIN, width: float = 0.0004) -> Needle:
+    """Return a needle that lies within a distance of the dish's centre [m]."""
     while True:
         tail, heading = random.uniform(-within, within, 2), random.uniform(-np.pi, np.pi)
         needle = Needle(tail, heading, float(random.choice(CURVATURES)), length, width)
@@ -71,7 +74,7 @@ def _needle(random: Random, length: float = 0.007, within: float = WITHIN, width
             return needle
 
 
-def _laid(random: Random, start: Points, angle: float, length: float, bends: float = 250.0) -> Points:
+def winding_line(random: Random, start: Points, angle: float, length: float, bends: float = 250.0) -> Points:
     """Return a line that begins at an angle, nearly straight, and then winds at random, shape (m, 2) [m]."""
     steps = max(4, round(length / TURN_STEP))
     knots = np.concatenate([[0.0], random.uniform(-bends, bends, 6)])
@@ -80,7 +83,8 @@ def _laid(random: Random, start: Points, angle: float, length: float, bends: flo
     return np.vstack([start, start + walked])
 
 
-def _is_inside(thread: Points) -> bool:
+def is_inside(thread: Points) -> bool:
+    """Say whether a line stays off the wall."""
     return bool(np.linalg.norm(thread, axis=1).max() < THREAD_WITHIN)
 
 
@@ -98,20 +102,20 @@ def _crosses_itself(thread: Points) -> bool:
     return bool((apart[near] < 0.7e-3).any())
 
 
-def _usual(random: Random, length: float = 0.007, thread: float = 0.019, within: float = WITHIN) -> Case:
+def usual_case(random: Random, length: float = 0.007, thread: float = 0.019, within: float = WITHIN) -> Case:
     """Return a needle with a thread that leaves backwards and crosses nothing."""
     for _ in range(MAX_TRIES):
-        needle = _needle(random, length, within)
-        line = _laid(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), thread)
-        if _is_inside(line) and _is_clear(needle, line) and not _crosses_itself(line):
-            return Case(needle, line, lighting=_lighting(random), quality=int(random.integers(80, 97)))
+        needle = random_needle(random, length, within)
+        line = winding_line(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), thread)
+        if is_inside(line) and _is_clear(needle, line) and not _crosses_itself(line):
+            return Case(needle, line, lighting=random_lighting(random), quality=int(random.integers(80, 97)))
     raise RuntimeError("no thread fits into the dish")
 
 
 def _folded(low: float, high: float, length: float, random: Random) -> Case:
     """Return a thread that lies beside, under or over its needle, at an angle from the heading [degrees]."""
     for _ in range(MAX_TRIES):
-        needle = _needle(random, length, width=random.uniform(0.28e-3, 0.42e-3))
+        needle = random_needle(random, length, width=random.uniform(0.28e-3, 0.42e-3))
         fold = math.radians(random.uniform(low, high)) * random.choice((-1.0, 1.0))
         how = str(random.choice(("under", "over", "beside")))
         along = random.uniform(0.6, 1.6) * length
@@ -119,53 +123,57 @@ def _folded(low: float, high: float, length: float, random: Random) -> Case:
             radius, side = random.uniform(0.2e-3, 0.5e-3), math.copysign(1.0, fold)
             turns = np.linspace(0.0, np.pi - abs(fold), 20)
             first = needle.heading + np.pi
-            centre = needle.tail + radius * _unit(first - side * 0.5 * np.pi)
-            begun = centre + radius * np.array([_unit(first + side * (0.5 * np.pi - turn)) for turn in turns])
+            centre = needle.tail + radius * unit_vector(first - side * 0.5 * np.pi)
+            begun = centre + radius * np.array([unit_vector(first + side * (0.5 * np.pi - turn)) for turn in turns])
             start, angle = begun[-1], needle.heading + fold
         else:
             begun, start, angle = needle.tail[None], needle.tail, needle.heading + fold
-        straight = _laid(random, start, angle, along, 60.0)
+        straight = winding_line(random, start, angle, along, 60.0)
         line = np.vstack([begun, straight[1:]])
         leaving = math.atan2(*(line[-1] - line[-2])[::-1])
-        line = np.vstack([line, _laid(random, line[-1], leaving, 0.019 - arc_lengths(line)[-1])[1:]])
+        line = np.vstack([line, winding_line(random, line[-1], leaving, 0.019 - arc_lengths(line)[-1])[1:]])
         beyond = line[arc_lengths(line) > 1.4 * length + 1e-3]
-        if _is_inside(line) and needle.distances(beyond[::4]).min() > 0.8e-3 and not _crosses_itself(line[20:]):
+        if is_inside(line) and needle.distances(beyond[::4]).min() > 0.8e-3 and not _crosses_itself(line[20:]):
             labels = {"fold": math.degrees(fold), "how": how}
             width = random.uniform(0.8, 1.6)
-            light, over = _lighting(random), how == "over"
+            light, over = random_lighting(random), how == "over"
             return Case(needle, line, thread_px=width, lighting=light, thread_over=over, labels=labels)
     raise RuntimeError("no thread fits into the dish")
 
 
-def _crossing_itself(random: Random) -> Case:
+def thread_with_loop(random: Random) -> Case:
     """Return a thread with a loop."""
     for _ in range(MAX_TRIES):
-        needle = _needle(random)
-        first = _laid(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.3), random.uniform(4e-3, 7e-3))
+        needle = random_needle(random)
+        first = winding_line(
+            random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.3), random.uniform(4e-3, 7e-3)
+        )
         angle = math.atan2(*(first[-1] - first[-2])[::-1])
         turn, radius = random.choice((-1.0, 1.0)), random.uniform(1.2e-3, 2.2e-3)
         turns = np.arange(0.0, random.uniform(1.7, 1.95) * np.pi, TURN_STEP / radius)
         steps = angle + turn * turns
         loop = first[-1] + np.cumsum(TURN_STEP * np.column_stack([np.cos(steps), np.sin(steps)]), axis=0)
         line = np.vstack([first, loop])
-        line = np.vstack([line, _laid(random, line[-1], float(steps[-1]), 0.026 - arc_lengths(line)[-1], 100.0)[1:]])
+        line = np.vstack(
+            [line, winding_line(random, line[-1], float(steps[-1]), 0.026 - arc_lengths(line)[-1], 100.0)[1:]]
+        )
         own = line[::2]
         apart = np.linalg.norm(own[:, None] - own[None], axis=2)
         meets = np.triu(apart < 2.0 * TURN_STEP, 20).any()
-        if _is_inside(line) and _is_clear(needle, line) and meets:
-            return Case(needle, line, lighting=_lighting(random))
+        if is_inside(line) and _is_clear(needle, line) and meets:
+            return Case(needle, line, lighting=random_lighting(random))
     raise RuntimeError("no thread fits into the dish")
 
 
 def _crossing_needle(random: Random) -> Case:
     """Return a thread that comes back and crosses its needle, under or over it."""
     for _ in range(MAX_TRIES):
-        needle = _needle(random, within=0.011)
+        needle = random_needle(random, within=0.011)
         side, share = random.choice((-1.0, 1.0)), random.uniform(0.3, 0.75)
         at, along = (values[0] for values in needle.axis(np.array([share])))
         aside = side * np.array([-along[1], along[0]])
         way = math.cos(lean := random.uniform(-0.7, 0.7)) * aside + math.sin(lean) * along
-        back = -_unit(needle.heading)
+        back = -unit_vector(needle.heading)
         out = needle.tail + 2.2e-3 * back
         knots = [
             needle.tail,
@@ -175,17 +183,17 @@ def _crossing_needle(random: Random) -> Case:
             at,
             at + 2.6e-3 * way,
         ]
-        line = _spline(np.array(knots))
+        line = smooth_line(np.array(knots))
         leaving = math.atan2(*(line[-1] - line[-2])[::-1])
-        line = np.vstack([line, _laid(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
+        line = np.vstack([line, winding_line(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
         after = line[(arc_lengths(line) > 1.5e-3)]
         near = needle.distances(after[::4])
-        if _is_inside(line) and (near < 0.5 * needle.width).sum() < 15 and near[-30:].min() > 1e-3:
-            return Case(needle, line, lighting=_lighting(random), thread_over=bool(random.random() < 0.5))
+        if is_inside(line) and (near < 0.5 * needle.width).sum() < 15 and near[-30:].min() > 1e-3:
+            return Case(needle, line, lighting=random_lighting(random), thread_over=bool(random.random() < 0.5))
     raise RuntimeError("no thread fits into the dish")
 
 
-def _spline(knots: Points) -> Points:
+def smooth_line(knots: Points) -> Points:
     """Return a smooth line through points, cubic in the chord length, with vertices of equal distance."""
     at = arc_lengths(knots)
     line = CubicSpline(at, knots)(np.linspace(0.0, at[-1], 400))
@@ -197,28 +205,28 @@ def _at_wall(end: str, random: Random) -> Case:
     length, width = 0.007, 0.0004
     for _ in range(MAX_TRIES):
         angle, gap = random.uniform(-np.pi, np.pi), random.uniform(0.0, 0.4e-3)
-        outward = _unit(angle)
+        outward = unit_vector(angle)
         if end == "side":
             heading = angle + random.choice((-0.5, 0.5)) * np.pi
             distance = math.sqrt((DISH_RADIUS - gap - 0.5 * width) ** 2 - 0.25 * length**2)
-            tail = distance * outward - 0.5 * length * _unit(heading)
+            tail = distance * outward - 0.5 * length * unit_vector(heading)
         elif end == "tip":
             heading = angle + random.uniform(-0.8, 0.8)
-            tail = (DISH_RADIUS - gap) * outward - length * _unit(heading)
+            tail = (DISH_RADIUS - gap) * outward - length * unit_vector(heading)
         else:
             heading = angle + np.pi + random.uniform(-0.8, 0.8)
             tail = (DISH_RADIUS - gap - 0.5 * width) * outward
         needle = Needle(tail, heading, 0.0, length, width)
         inward = math.atan2(*-tail[::-1]) + random.normal(0.0, 0.4)
-        line = _laid(random, tail, inward if end == "tail" else heading + np.pi + random.normal(0.0, 0.3), 0.012)
-        if _is_inside(line[arc_lengths(line) > 3e-3]) and _is_clear(needle, line) and not _crosses_itself(line):
-            return Case(needle, line, lighting=_lighting(random), labels={"gap": gap})
+        line = winding_line(random, tail, inward if end == "tail" else heading + np.pi + random.normal(0.0, 0.3), 0.012)
+        if is_inside(line[arc_lengths(line) > 3e-3]) and _is_clear(needle, line) and not _crosses_itself(line):
+            return Case(needle, line, lighting=random_lighting(random), labels={"gap": gap})
     raise RuntimeError("no thread fits into the dish")
 
 
 def _image_width(columns: int, random: Random) -> Case:
     """Return the usual needle and thread in an image of another size; lens and sensor go with the pixels."""
-    case = _usual(random)
+    case = usual_case(random)
     width, height = SIZES[columns]
     return replace(case, size=(width, height), thread_px=0.975 * height / ROWS)
 
@@ -226,13 +234,13 @@ def _image_width(columns: int, random: Random) -> Case:
 def _thread(colour: str, width_px: float, random: Random) -> Case:
     """Return a thread of a colour and a width in the image."""
     size = SIZES[int(random.choice((640, 640, 640, 1280, 1920)))]
-    return replace(_usual(random), size=size, thread_px=width_px, thread_bgr=COLOURS[colour])
+    return replace(usual_case(random), size=size, thread_px=width_px, thread_bgr=COLOURS[colour])
 
 
 def _covered(width: float, random: Random) -> Case:
     """Return a thread over which a post stands or an instrument lies, as wide as given [m]."""
     for _ in range(MAX_TRIES):
-        case = _usual(random, thread=0.028)
+        case = usual_case(random, thread=0.028)
         lengths = arc_lengths(case.thread)
         middle = random.uniform(3e-3 + 0.5 * width, 22e-3 - 0.5 * width)
         index = int(np.searchsorted(lengths, middle))
@@ -245,20 +253,21 @@ def _covered(width: float, random: Random) -> Case:
         else:
             across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
             across *= math.copysign(1.0, float(across @ at))  # towards the nearer wall
-            outline, how = _strip(at - 2e-3 * across, across, 0.06, width), "instrument"
+            outline, how = straight_strip(at - 2e-3 * across, across, 0.06, width), "instrument"
         cover = Cover(outline, colour, 1.0)
         axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-        if _signed(outline, np.vstack([axis, case.thread[:20]])) < -1.2e-3:
+        if depth_inside(outline, np.vstack([axis, case.thread[:20]])) < -1.2e-3:
             return replace(case, hidden_by=(cover,), labels={"how": how})
     raise RuntimeError("no cover stays off the needle")
 
 
-def _strip(end: Points, way: Points, length: float, width: float) -> Points:
+def straight_strip(end: Points, way: Points, length: float, width: float) -> Points:
+    """Return the outline of a strip that begins at `end` and runs along the unit vector `way`, shape (4, 2) [m]."""
     across = 0.5 * width * np.array([-way[1], way[0]])
     return np.vstack([end - across, end + across, end + length * way + across, end + length * way - across])
 
 
-def _signed(outline: Points, points: Points) -> float:
+def depth_inside(outline: Points, points: Points) -> float:
     """Return how deep the deepest point lies in an outline, negative outside [m]."""
     ring = (outline * 1e6).astype(np.float32)
     return max(cv2.pointPolygonTest(ring, (float(x), float(y)), True) for x, y in points * 1e6) * 1e-6
@@ -267,8 +276,8 @@ def _signed(outline: Points, points: Points) -> float:
 def _second_needle(random: Random, *, glare: bool = False) -> Case:
     """Return a frame with a needle that has no thread; with glare, the lamp is reflected on the one with the thread."""
     for _ in range(MAX_TRIES):
-        case = _usual(random)
-        other = _needle(random)
+        case = usual_case(random)
+        other = random_needle(random)
         axis, _ = other.axis(np.linspace(0.0, 1.0, 20))
         if case.needle.distances(axis).min() > 2e-3 and min(other.distances(case.thread[::4])) > 1.2e-3:
             break
@@ -282,32 +291,32 @@ def _second_needle(random: Random, *, glare: bool = False) -> Case:
 
 
 def _tilted(degrees: float, random: Random) -> Case:
-    return replace(_usual(random), finish=(tilted(math.radians(degrees), random.uniform(-np.pi, np.pi)),))
+    return replace(usual_case(random), finish=(tilted(math.radians(degrees), random.uniform(-np.pi, np.pi)),))
 
 
 def _saturated(random: Random) -> Case:
-    case = _usual(random)
+    case = usual_case(random)
     return replace(case, lighting=replace(case.lighting, gain=random.uniform(1.1, 1.6)))
 
 
 def _dark_field(random: Random) -> Case:
-    return replace(_usual(random), finish=(dark_field,))
+    return replace(usual_case(random), finish=(dark_field,))
 
 
 def _blunt_rod(random: Random) -> Case:
-    return replace(_usual(random), rod=True)
+    return replace(usual_case(random), rod=True)
 
 
 def _drawn_path(random: Random) -> Case:
     """Return a frame into which a program has drawn the way that the needle shall go."""
     bgr = ((60, 180, 60), (200, 90, 40), (40, 40, 200))[int(random.integers(3))]
     start = random.uniform(-0.01, 0.01, 2)
-    line = _laid(random, start, random.uniform(-np.pi, np.pi), 0.012, 200.0)
-    return replace(_usual(random), finish=(drawn_path(line, bgr, int(random.integers(1, 4))),))
+    line = winding_line(random, start, random.uniform(-np.pi, np.pi), 0.012, 200.0)
+    return replace(usual_case(random), finish=(drawn_path(line, bgr, int(random.integers(1, 4))),))
 
 
 def _distorted(told: bool, random: Random) -> Case:
-    strength, case = random.uniform(-0.06, 0.06), _usual(random)
+    strength, case = random.uniform(-0.06, 0.06), usual_case(random)
     lens = lens_with(strength, case.size) if told else None
     return replace(case, finish=(distorted(strength),), lens=lens)
 
@@ -315,9 +324,13 @@ def _distorted(told: bool, random: Random) -> Case:
 def _cut_dish(least: float, greatest: float, random: Random) -> Case:
     """Return a dish of which the frame shows a part, with all of needle and thread."""
     for _ in range(MAX_TRIES):
-        case = _usual(random)
+        case = usual_case(random)
         shift = (
-            random.uniform(least, greatest) * DISH_RADIUS / SCALE * _unit(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+            random.uniform(least, greatest)
+            * DISH_RADIUS
+            / SCALE
+            * unit_vector(random.uniform(-np.pi, np.pi))
+            * (1.6, 1.0)
         )
         moved = replace(case, shift=(float(shift[0]), float(shift[1])))
         ends = case.needle.axis(np.linspace(0.0, 1.0, 9))[0]
@@ -330,69 +343,69 @@ def _cut_dish(least: float, greatest: float, random: Random) -> Case:
 def _hand(random: Random) -> Case:
     """Return a finger that comes in from the border and keeps off the needle."""
     for _ in range(MAX_TRIES):
-        case = _usual(random)
+        case = usual_case(random)
         angle, width = random.uniform(-np.pi, np.pi), random.uniform(8e-3, 16e-3)
         turns = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 20)
-        inwards = -_unit(angle)
+        inwards = -unit_vector(angle)
         across = np.array([-inwards[1], inwards[0]])
         end = -random.uniform(3e-3, 14e-3) * inwards
         cap = end + 0.5 * width * (np.cos(turns)[:, None] * inwards + np.sin(turns)[:, None] * across)
         back = end - 0.1 * inwards
         outline = np.vstack([back - 0.5 * width * across, cap, back + 0.5 * width * across])
         axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-        if _signed(outline, axis) < -1.5e-3:
+        if depth_inside(outline, axis) < -1.5e-3:
             return replace(case, hidden_by=(Cover(outline, SKIN_BGR, 2.5),))
     raise RuntimeError("no finger stays off the needle")
 
 
 def _length_off(share: float, random: Random) -> Case:
     """Return the usual frame, and a length of the needle that is set wrong by a share."""
-    return replace(_usual(random), length_error=share * random.choice((-1.0, 1.0)))
+    return replace(usual_case(random), length_error=share * random.choice((-1.0, 1.0)))
 
 
 def _rod_in_path(random: Random) -> Case:
     """Return a rod without a thread, of a length known to 10 %, in a frame into which its way is drawn."""
     length = random.uniform(3e-3, 10e-3)
-    needle = replace(_needle(random, length), curvature=0.0)
+    needle = replace(random_needle(random, length), curvature=0.0)
     centre, _ = needle.axis(np.array([random.uniform(0.1, 0.9)]))
     angle = random.uniform(-np.pi, np.pi)
-    line = _laid(random, centre[0] - 6e-3 * _unit(angle), angle, 0.012, 100.0)
+    line = winding_line(random, centre[0] - 6e-3 * unit_vector(angle), angle, 0.012, 100.0)
     bgr = tuple(int(value) for value in random.integers(40, 220, 3))
     drawn = drawn_path(line, (bgr[0], bgr[1], bgr[2]), int(random.integers(1, 4)))
     error = random.uniform(-0.1, 0.1)
-    return Case(needle, NO_THREAD, lighting=_lighting(random), rod=True, finish=(drawn,), length_error=error)
+    return Case(needle, NO_THREAD, lighting=random_lighting(random), rod=True, finish=(drawn,), length_error=error)
 
 
 def _suture_needle(random: Random) -> Case:
     """Return a needle bent up to a half circle, of any usual length and width."""
     length, width = random.uniform(2e-3, 12e-3), float(random.choice((0.28e-3, 0.4e-3, 0.6e-3)))
     for _ in range(MAX_TRIES):
-        needle = replace(_needle(random, length, width=width), curvature=random.uniform(-np.pi, np.pi) / length)
-        line = _laid(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), 0.015)
+        needle = replace(random_needle(random, length, width=width), curvature=random.uniform(-np.pi, np.pi) / length)
+        line = winding_line(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), 0.015)
         axis, _ = needle.axis(np.linspace(0.0, 1.0, 20))
-        if _is_inside(line) and _is_inside(axis) and _is_clear(needle, line) and not _crosses_itself(line):
-            return Case(needle, line, lighting=_lighting(random))
+        if is_inside(line) and is_inside(axis) and _is_clear(needle, line) and not _crosses_itself(line):
+            return Case(needle, line, lighting=random_lighting(random))
     raise RuntimeError("no thread fits into the dish")
 
 
 def _instrument_beside(random: Random) -> Case:
     """Return a frame with a dark instrument as wide as the needle, but longer, that lies in the dish."""
     for _ in range(MAX_TRIES):
-        case = _usual(random)
+        case = usual_case(random)
         length, angle = random.uniform(1.4, 3.0) * case.needle.length, random.uniform(-np.pi, np.pi)
-        outline = _strip(random.uniform(-0.012, 0.012, 2), _unit(angle), length, case.needle.width)
+        outline = straight_strip(random.uniform(-0.012, 0.012, 2), unit_vector(angle), length, case.needle.width)
         axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-        if _signed(outline, np.vstack([axis, case.thread])) < -1.2e-3 and _is_inside(outline):
+        if depth_inside(outline, np.vstack([axis, case.thread])) < -1.2e-3 and is_inside(outline):
             return replace(case, hidden_by=(Cover(outline, STEEL_BGR, 0.3),))
     raise RuntimeError("no instrument stays off the needle")
 
 
 def _classes() -> dict[str, MakeCase]:
-    classes: dict[str, MakeCase] = {"usual": _usual}
+    classes: dict[str, MakeCase] = {"usual": usual_case}
     for length in (2.5, 7.0):
         for low, high in FOLDS:
             classes[f"fold_{low}_{high}_{length:g}mm"] = partial(_folded, low, high, 1e-3 * length)
-    classes |= {"crossing_itself": _crossing_itself, "crossing_needle": _crossing_needle}
+    classes |= {"crossing_itself": thread_with_loop, "crossing_needle": _crossing_needle}
     classes |= {f"wall_{end}": partial(_at_wall, end) for end in ("tip", "tail", "side")}
     classes |= {f"width_{columns}": partial(_image_width, columns) for columns in SIZES}
     for colour in COLOURS:
@@ -414,4 +427,4 @@ def _classes() -> dict[str, MakeCase]:
     return classes
 
 
-CLASSES = _classes()
+BASIC_CLASSES = _classes()

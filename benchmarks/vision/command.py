@@ -15,7 +15,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.vision.covers import CLASSES
+from benchmarks.vision.classes import CLASSES
 from benchmarks.vision.measurements import Row, frame_of, measure_vision
 from benchmarks.vision.photographs import PHOTOGRAPHS, RIGHT, measure_photographs
 from benchmarks.vision.ropes import ROPES, rope_row
@@ -115,8 +115,8 @@ def table(rows: list[Row]) -> Table:
             f"{row.median_ms:.1f}",
         )
     result.caption = (
-        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or\n"
-        "heading by 5 degrees; rev: by 90; >cov: by more than the covariance\n"
+        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or "
+        "heading by 5 degrees; rev: by 90; >cov: by more than the covariance "
         "says; px, deg: RMS of the others"
     )
     result.caption_justify = "left"
@@ -128,7 +128,7 @@ def table_of_pieces(rows: list[Row]) -> Table:
     title = f"the thread in rendered frames, {rows[0].frames} of each class"
     result = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     result.add_column("class", no_wrap=True)
-    for name in ("line", "pcs", "off", "unkn", "wrong", "all", "not", "free", "not", "dev"):
+    for name in ("line", "pcs", "off", "?", "wrg", "all", "not", "free", "not", "dev"):
         result.add_column(name, justify="right", no_wrap=True)
     for row in rows:
         counts = (row.unplaced, row.misplaced, row.complete, row.incomplete, row.free, row.not_free)
@@ -136,15 +136,15 @@ def table_of_pieces(rows: list[Row]) -> Table:
             row.name,
             f"{row.covered:.0%}",
             f"{row.pieces:.0%}",
-            _number(row.wrong_pieces, ".3f"),
+            "" if row.wrong_pieces is None else f"{row.wrong_pieces:.1%}",
             *map(str, counts),
-            _number(row.normalised, ".2f"),
+            _number(row.normalised, ".1f"),
         )
     result.caption = (
-        "line: visible thread that is followed from the tail; pcs: that is on\n"
-        "pieces; off: share of pieces where no thread is; unkn: pieces of unknown\n"
-        "place; wrong: of a place that is wrong; all: frames said to show all of\n"
-        "the thread; free: ends said to be its own; not: of these, that are not;\n"
+        "line: visible thread that is followed from the tail; pcs: that is on "
+        "pieces; off: share of pieces where no thread is; ?: pieces of unknown "
+        "place; wrg: of a place that is wrong; all: frames said to show all of "
+        "the thread; free: ends said to be its own; not: of these, that are not; "
         "dev: RMS of errors over their standard deviation"
     )
     result.caption_justify = "left"

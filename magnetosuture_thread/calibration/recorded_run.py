@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import MIN_KNOWN_SHARE, mean_over_nodes, target_points
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.model.session import InitialObservation
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
 
@@ -41,7 +42,7 @@ class RecordedRun:
         tails: the needle's tail, shape (T, 2) [m].
         headings: unit vectors from tail to tip, shape (T, 2).
         legs: the first pose of each leg.
-        initials: the thread as it was seen at these, each of shape (m, 2) [m].
+        initials: the thread as it was seen at these, each of shape (m, 2) [m]; see `InitialObservation`.
         frames: poses at which the prediction is compared, shape (K,).
         targets: where the thread's nodes 1 ... n were, X(s_i), shape (K, n, 2) [m]; not a number where unknown.
         ground_truths: the same of the ground truth, if the bag holds it; else not a number.
@@ -98,6 +99,13 @@ class RecordedRun:
         return float(self.stamps[-1] - self.stamps[0]) * 1e-9
 
 
+def _initial_shape(observation: Observation, initial: InitialObservation) -> Points | None:
+    """Return the shape from which a leg starts, as a thread of the node does; None if it does not from this frame."""
+    if observation.observation is not None:
+        return initial.shape(observation.stamp, observation.observation)
+    return observation.measured if len(observation.measured) > 1 else None
+
+
 def read_run(
     name: str,
     observations: Iterable[Observation],
@@ -126,6 +134,7 @@ def read_run(
     initials: list[Points] = []
     compared: list[tuple[int, Points, Points]] = []
     length, enough = settings.thread_length, MIN_KNOWN_SHARE * settings.thread_length
+    start = InitialObservation()
     for observation in observations:
         if not observation.found:
             continue
@@ -139,10 +148,11 @@ def read_run(
                 raise InvalidInputError(name, f"a time {back:.1f} s before the last", "one run, by time, in each bag")
             continue
         if last is None or stamp > last + GAP:
-            if lengths[0] < enough:
+            initial = _initial_shape(observation, start)
+            if initial is None or arc_lengths(initial)[-1] < enough:
                 continue
             legs.append(len(poses))
-            initials.append(observation.measured)
+            initials.append(initial)
         poses.append((stamp, observation.tail, observation.heading))
         # Before, the noise of the leg's first centreline has not straightened out.
         is_settled = stamp >= poses[legs[-1]][0] + round(SETTLING * 1e9)

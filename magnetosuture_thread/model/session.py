@@ -62,6 +62,43 @@ class PredictionResult:
         return self.prediction is None and self.problem is None
 
 
+class InitialObservation:
+    """Chooses the observation from which a thread starts.
+
+    Half of a thread looks like a shorter one. So a thread starts from the first observation that is complete. If there
+    was none for `PARTIAL_WAIT` of the frames' time since a part was first seen, it starts from the piece that leaves
+    the needle.
+    """
+
+    def __init__(self) -> None:
+        self._first_part: int | None = None  # stamp of the first part since the last start [ns]
+
+    def reset(self) -> None:
+        """Forget the parts that were seen."""
+        self._first_part = None
+
+    def shape(self, stamp: int, observation: ThreadObservation) -> Points | None:
+        """Return the shape to start from.
+
+        Args:
+            stamp: of the frame [ns].
+            observation: of the thread.
+
+        Returns:
+            Points from the needle's tail on, shape (m, 2) [m]; None where the thread does not start from this frame.
+        """
+        points = observation.from_tail
+        if points is None:
+            return None
+        if not observation.complete:
+            if self._first_part is None or stamp < self._first_part:
+                self._first_part = stamp
+            if stamp - self._first_part < PARTIAL_WAIT:
+                return None
+        self._first_part = None
+        return points
+
+
 class ThreadSession:
     """Predicts the thread over one run: starts from its first measured centreline, then follows the poses.
 
@@ -88,7 +125,7 @@ class ThreadSession:
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
-        self._partial: int | None = None  # stamp of the first part that was seen
+        self._initial_observation = InitialObservation()
         self._motion = settings.node_motion()
 
     @property
@@ -156,9 +193,7 @@ class ThreadSession:
     def on_observation(self, stamp: int, observation: ThreadObservation) -> Iterator[PredictionResult]:
         """Start from what the camera sees of the thread: from all of it, or after a while from a part.
 
-        Half of a thread looks like a shorter one. So the thread starts from the first observation that is complete. If
-        there was none for `PARTIAL_WAIT` of the frames' time since a part was first seen, it starts from the piece that
-        leaves the needle, and what is missing goes on straight; see `ThreadPredictor.start`.
+        See `InitialObservation`; what is missing of a part goes on straight, see `ThreadPredictor.start`.
 
         Args:
             stamp: of the frame [ns].
@@ -167,15 +202,11 @@ class ThreadSession:
         Returns:
             See `on_measured_thread`.
         """
-        points = observation.from_tail
-        if points is None or not self.needs_measured_thread(stamp):
+        if not self.needs_measured_thread(stamp):
             return iter(())
-        if not observation.complete:
-            if self._partial is None or stamp < self._partial:
-                self._partial = stamp
-            if stamp - self._partial < PARTIAL_WAIT:
-                return iter(())
-        self._partial = None
+        points = self._initial_observation.shape(stamp, observation)
+        if points is None:
+            return iter(())
         return self.on_measured_thread(stamp, points)
 
     def on_pose(self, stamp: int, pose: NeedlePose) -> PredictionResult:
@@ -187,7 +218,8 @@ class ThreadSession:
         """
         if self._last is not None and stamp < self._last - MAX_LATENESS:
             self._predictor.reset()
-            self._last = self._partial = None
+            self._last = None
+            self._initial_observation.reset()
             self._early.clear()
             if self._seen is not None and self._seen[0] > stamp:
                 self._seen = None  # of the time before it was set back

@@ -18,6 +18,8 @@ from magnetosuture_thread.calibration.residuals import (
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import prediction_error_percent
+from magnetosuture_thread.model.session import PARTIAL_WAIT
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.calibration.runs import LENGTH, SETTINGS, path, rig_run, stiff
 
 TRUE = 1.3e-9
@@ -57,6 +59,37 @@ def test_after_a_gap_it_begins_anew_from_the_thread_as_seen():
         frame_errors(replay_with_parameters(passage, model), passage.targets, LENGTH)[-1] for passage in (whole, parts)
     ]
     assert last == pytest.approx([0.0, 0.0], abs=0.3)
+
+
+def observed(sight: Observation, shown: int) -> Observation:
+    """Return a sight in which so many points of the thread are seen, from the tail on."""
+    points = sight.measured[:shown]
+    whole = shown == len(sight.measured)
+    ends = PieceEnd.TAIL, PieceEnd.FREE if whole else PieceEnd.COVERED
+    piece = ThreadPiece(points, np.full(len(points), 1e-5), *ends, (0.0, 0.0))
+    return replace(sight, measured=points, observation=ThreadObservation((piece,), complete=whole))
+
+
+def test_a_leg_starts_from_a_complete_observation():
+    covered = [observed(sight, 40 if k < 8 else 64) for k, sight in enumerate(SIGHTS)]
+    passage = read_run("bag", covered, SETTINGS)
+    assert passage.stamps[0] == SIGHTS[8].stamp
+    assert np.array_equal(passage.initials[0], SIGHTS[8].measured)
+
+
+def test_a_leg_starts_from_a_part_where_no_more_was_seen_for_a_second():
+    part = [observed(sight, 40) for sight in SIGHTS]
+    passage = read_run("bag", part, SETTINGS)
+    assert (passage.stamps[0] - SIGHTS[0].stamp) * 1e-9 == pytest.approx(PARTIAL_WAIT * 1e-9, abs=0.1)
+    assert len(passage.initials[0]) == 40
+
+
+def test_a_frame_that_does_not_show_the_tail_starts_no_leg():
+    away = [
+        replace(observed(sight, 64), observation=ThreadObservation()) if k < 5 else sight
+        for k, sight in enumerate(SIGHTS)
+    ]
+    assert read_run("bag", away, SETTINGS).stamps[0] == SIGHTS[5].stamp
 
 
 def test_what_is_not_seen_is_not_known():
