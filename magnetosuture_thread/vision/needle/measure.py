@@ -145,8 +145,8 @@ def _checked(
     if reason:
         return reason
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
-    confidence *= max(0.2, 1.0 - 2.0 * float(fit.covariance[1, 1]))
-    covariance = fit.covariance
+    covariance = fit.covariance()
+    confidence *= max(0.2, 1.0 - 2.0 * float(covariance[1, 1]))
     pull = PULL_PX * max(0.0, float(_excess(steel, fit, width)[3]))
     if not is_measured:
         pull = math.hypot(pull, 0.5 * size.tolerance * size.length_px)

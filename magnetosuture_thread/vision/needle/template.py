@@ -19,6 +19,7 @@ from magnetosuture_thread.vision.sampling import straighten
 
 TAPER = 0.2  # of the length, towards the tip
 BLUR_PX = 1.03  # of an edge, lens and sensor together
+STEEPNESS = 1.6 / BLUR_PX  # of the edge; with it, it differs least from a normal distribution
 THIN = 0.12  # of the body's width, that a point is ground to
 BESIDE_PX = 4.0  # beside and beyond the body, that is compared too
 STEP_PX = 0.75  # between samples across; along it is 1 px
@@ -45,7 +46,8 @@ class TemplateFit:
         width: of the body [px].
         cost: what the image differs by, robustly [px^2].
         missing: steel that the image lacks [px^2].
-        covariance: of tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3).
+        normal: of (along, aside, angle, bend, half width, length) in the middle; see `_fit`.
+        samples: number of them.
         thin: of the width, that its end tapers to; 1 for a rod.
     """
 
@@ -54,12 +56,21 @@ class TemplateFit:
     width: float
     cost: float
     missing: float
-    covariance: np.ndarray
+    normal: np.ndarray
+    samples: int
     thin: float = THIN
 
     def reversed(self) -> Arc:
         """Return the axis from the tip on."""
         return self.arc.reversed_at(self.length)
+
+    def covariance(self) -> np.ndarray:
+        """Return that of tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3)."""
+        inverse = np.linalg.inv(self.normal) * PULL * CORRELATED_ROWS * self.cost / self.samples
+        covariance = _at_tail(inverse, 0.5 * self.length)
+        lengthwise = np.array([1.0, 0.0, self.arc.curvature])
+        covariance += np.diag([0.0, ASIDE_ERROR_PX**2, ANGLE_ERROR**2])
+        return covariance + TAIL_ERROR_PX**2 * np.outer(lengthwise, lengthwise)
 
 
 def fit_template(
@@ -98,12 +109,7 @@ def fit_template(
     thin = 1.0 if rod else THIN
     cost, missing, count = _fit(steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, normal)
     arc, fitted = Arc(state[:2].copy(), float(state[2]), float(state[3])), float(state[5])
-    inverse = np.linalg.inv(normal) * PULL * CORRELATED_ROWS * cost / count
-    covariance = _at_tail(inverse, 0.5 * fitted)
-    lengthwise = np.array([1.0, 0.0, arc.curvature])
-    covariance += np.diag([0.0, ASIDE_ERROR_PX**2, ANGLE_ERROR**2])
-    covariance += TAIL_ERROR_PX**2 * np.outer(lengthwise, lengthwise)
-    return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, covariance, thin)
+    return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, normal, count, thin)
 
 
 def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:
@@ -115,25 +121,101 @@ def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:
 @compiled
 def edge(x):
     """Return how much of a blurred edge is covered at a distance inside of it, about a normal distribution."""
-    return 0.5 + 0.5 * math.tanh(0.8 * x / BLUR_PX)
+    return 1.0 / (1.0 + math.exp(-STEEPNESS * x))
+
+
+@compiled
+def _half_width(s, length, half, thin):
+    """Return half of a needle's width at a place along it, and its derivative by the length."""
+    part = (s - (1.0 - TAPER) * length) / (TAPER * length)
+    if part <= 0.0:
+        return half, 0.0
+    if part >= 1.0:
+        return half * thin, 0.0
+    return half * (1.0 - (1.0 - thin) * part), half * (1.0 - thin) * s / (TAPER * length * length)
+
+
+@compiled
+def _across(own, aside, share, slope):
+    """Fill in the share of steel across a body of half a width, and its derivative by that; `aside` is symmetric.
+
+    It is edge(own - d) - edge(-own - d), where edge(-x) = 1 - edge(x).
+    """
+    last = len(aside) - 1
+    for column in range(last + 1):
+        share[column] = edge(own - aside[column])
+    for column in range(last // 2 + 1):
+        one, other = share[column], share[last - column]
+        share[column] = share[last - column] = one + other - 1.0
+        slope[column] = slope[last - column] = STEEPNESS * (one * (1.0 - one) + other * (1.0 - other))
 
 
 @compiled
 def _draw(along, aside, length, half, bloom, thin, drawn):
     """Fill in the share of steel of a drawn needle at places along and aside of its axis."""
-    across = np.empty(len(aside))
+    across, slope = np.empty(len(aside)), np.empty(len(aside))
     before = -1.0
     for row in range(len(along)):
         s = along[row]
-        part = (s - (1.0 - TAPER) * length) / (TAPER * length)
-        own = half * (1.0 - (1.0 - thin) * min(max(part, 0.0), 1.0)) + bloom
+        own = _half_width(s, length, half, thin)[0] + bloom
         if own != before:
-            for column in range(len(aside)):
-                across[column] = edge(own - aside[column]) - edge(-own - aside[column])
+            _across(own, aside, across, slope)
             before = own
         ends = edge(s + bloom) * edge(length - s + bloom)
         for column in range(len(aside)):
             drawn[row, column] = min(max((across[column] * ends - SHADOW) / (STEEL - SHADOW), 0.0), 1.0)
+
+
+@compiled
+def _draw_with_slopes(along, aside, length, half, bloom, thin, drawn, wider, longer):
+    """Draw as `_draw` does; fill in the derivatives by half the width and by the length too."""
+    across, slope = np.empty(len(aside)), np.empty(len(aside))
+    before = -1.0
+    scale = 1.0 / (STEEL - SHADOW)
+    for row in range(len(along)):
+        s = along[row]
+        tapered, by_length = _half_width(s, length, half, thin)
+        own = tapered + bloom
+        if own != before:
+            _across(own, aside, across, slope)
+            before = own
+        tail, tip = edge(s + bloom), edge(length - s + bloom)
+        ends, at_tip = tail * tip, STEEPNESS * tail * tip * (1.0 - tip)
+        at_ends = at_tip + STEEPNESS * tail * (1.0 - tail) * tip
+        for column in range(len(aside)):
+            share = (across[column] * ends - SHADOW) * scale
+            if 0.0 < share < 1.0:
+                drawn[row, column] = share
+                wider[row, column] = (slope[column] * ends + across[column] * at_ends) * scale
+                longer[row, column] = (slope[column] * by_length * ends + across[column] * at_tip) * scale
+            else:
+                drawn[row, column] = 0.0 if share <= 0.0 else 1.0
+                wider[row, column] = longer[row, column] = 0.0
+
+
+@compiled
+def _sample_both(surely, perhaps, state, along, aside, least, most):
+    """Fill in two images along and aside of the arc that a state begins with; see `straighten`."""
+    u, v, angle, curvature = state[0], state[1], state[2], state[3]
+    rows, columns = surely.shape
+    for index in range(len(along)):
+        s = along[index]
+        half = 0.5 * curvature * s
+        chord = s if abs(half) < 1e-9 else s * math.sin(half) / half
+        x, y = u + chord * math.cos(angle + half), v + chord * math.sin(angle + half)
+        across, down = -math.sin(angle + 2.0 * half), math.cos(angle + 2.0 * half)
+        for place in range(len(aside)):
+            at_u = min(max(x + aside[place] * across, 0.0), columns - 1.001)
+            at_v = min(max(y + aside[place] * down, 0.0), rows - 1.001)
+            column, row = int(at_u), int(at_v)
+            right, below = at_u - column, at_v - row
+            left, above = 1.0 - right, 1.0 - below
+            least[index, place] = above * (left * surely[row, column] + right * surely[row, column + 1]) + below * (
+                left * surely[row + 1, column] + right * surely[row + 1, column + 1]
+            )
+            most[index, place] = above * (left * perhaps[row, column] + right * perhaps[row, column + 1]) + below * (
+                left * perhaps[row + 1, column] + right * perhaps[row + 1, column + 1]
+            )
 
 
 @compiled
@@ -164,7 +246,6 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal)
     all_longer = np.empty((most_rows, columns))
     right, slope, own = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
     best, best_missing, best_state, samples = np.inf, 0.0, state.copy(), 1
-    step = 0.1
     prior = OTHER * OTHER / (deviations[0] * deviations[0])
     length_prior = OTHER * OTHER / (deviations[1] * deviations[1]) if free else 1.0
     for _ in range(rounds):
@@ -174,12 +255,8 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal)
         along = np.arange(rows) - BESIDE_PX
         least, most, drawn = all_least[:rows], all_most[:rows], all_drawn[:rows]
         wider, longer = all_wider[:rows], all_longer[:rows]
-        _sample(surely, state, along, aside, least)
-        _sample(perhaps, state, along, aside, most)
-        _draw(along, aside, own_length, half, bloom, thin, drawn)
-        _draw(along, aside, own_length, half, bloom + step, thin, wider)
-        if free:
-            _draw(along, aside, own_length + step, half, bloom, thin, longer)
+        _sample_both(surely, perhaps, state, along, aside, least, most)
+        _draw_with_slopes(along, aside, own_length, half, bloom, thin, drawn, wider, longer)
         own[:], right[:] = 0.0, 0.0
         cost, missing = 0.0, 0.0
         slope[5] = 0.0
@@ -203,9 +280,11 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal)
                 slope[1] = side
                 slope[2] = t * side
                 slope[3] = 0.5 * (t * t - middle * middle / 3.0) * side
-                slope[4] = (drawn[row, column] - wider[row, column]) / step
+                slope[4] = -wider[row, column]
+                if slope[0] == 0.0 and side == 0.0 and slope[4] == 0.0:
+                    continue  # as on most of the floor, and in the middle of the body
                 if free:
-                    slope[5] = (drawn[row, column] - longer[row, column]) / step
+                    slope[5] = -longer[row, column]
                 for i in range(PARAMETERS):
                     right[i] -= weight * slope[i] * apart
                     for j in range(i + 1):
