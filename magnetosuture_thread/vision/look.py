@@ -137,13 +137,16 @@ class FoundDish:
         return image if self.tilt is None else self.tilt.corrected(image, self.view)
 
 
-def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> FoundDish | None:
+def see_dish(
+    image: np.ndarray, settings: VisionTrackerSettings, diameter: float, *, photographed: bool = True
+) -> FoundDish | None:
     """Find the view: what of it is given, and the rest by the dish; None if none is seen.
 
     Args:
         image: frame, shape (rows, columns) or (rows, columns, 3), uint8.
         settings: what to look for.
         diameter: of the dish [m].
+        photographed: whether to look for a dish as in a photograph where there is no other, which takes long.
     """
     gray = measured_channel(image)
     fixed = settings.fixed_view()
@@ -164,7 +167,7 @@ def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float
             return FoundDish(view, dark_field, scale_error=error, remark=remark)
         tilt, view = find_tilt(gray, view, diameter)
         return FoundDish(view, dark_field, tilt, SCALE_ERROR, 0.0 if tilt is not None else MIN_ANGLE)
-    return _photographed(image, settings, diameter)
+    return _photographed(image, settings, diameter) if photographed else None
 
 
 def _found_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> tuple[DishView, str] | None:

@@ -18,7 +18,8 @@ STRETCHES = (1.0, 1.0 / 0.9)  # along which an ellipse is nearly a circle; the s
 WAYS = 4
 CENTRES = 4  # looked at for each stretch
 MIN_GRADIENT = 4.0  # grey levels a pixel
-MAX_EDGES = 6000
+MAX_EDGES = 3000
+MAX_FITTED = 300  # of them, that one ellipse is fitted to
 CELL = 2.0  # px; of votes
 RING = 1.03  # ratio of radii of a ring
 BINS = 72  # directions
@@ -125,12 +126,12 @@ def _edges(image: np.ndarray) -> np.ndarray:
             for each in (along_u, along_v, strength)
         )
     edges = np.empty((image.shape[0] * image.shape[1] // 2, 4))
-    low = MIN_GRADIENT
-    count = thin_edges(along_u, along_v, strength, low, edges)
-    while count > MAX_EDGES:  # The weak ones are texture.
-        low *= 1.3
-        count = thin_edges(along_u, along_v, strength, low, edges)
-    return edges[:count].copy()
+    edges = edges[: thin_edges(along_u, along_v, strength, MIN_GRADIENT, edges)]
+    if len(edges) > MAX_EDGES:  # The weak ones are texture.
+        columns, rows = edges[:, :2].T.astype(int)
+        strongest = np.argsort(strength[rows, columns], kind="stable")[-MAX_EDGES:]
+        edges = edges[np.sort(strongest)]
+    return edges.copy()
 
 
 def _candidates(
@@ -187,10 +188,12 @@ def _around(
         near = facing & (np.abs(away - radius) < BAND * radius)
         if near.sum() < 20:
             continue
-        angles = np.arctan2(offset[near, 1], offset[near, 0])
+        some = np.flatnonzero(near)
+        some = some[:: 1 + len(some) // MAX_FITTED]
+        angles = np.arctan2(offset[some, 1], offset[some, 0])
         best = np.zeros(5)
         tolerance = max(0.8, AGREEMENT * radius)
-        if not fit_harmonics(angles, away[near], tolerance, TRIES, BINS, best):
+        if not fit_harmonics(angles, away[some], tolerance, TRIES, BINS, best):
             continue
         turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
         points = centre + (_harmonics(turns) @ best)[:, None] * np.column_stack([np.cos(turns), np.sin(turns)])

@@ -12,6 +12,8 @@ RAYS = 180
 SHARE_OF_RAYS = 0.6  # of the rays must meet the fitted circle
 AGREEMENT_PX = 2.0
 GUESS_SIDES = (60, 120)  # the first guess is made in images of about this many rows; the second only if the first fails
+EDGE_LEVEL = 60  # of the circle transform, as of Canny's upper threshold; the lower one is half of it
+MAX_EDGE_SHARE = 0.3  # of the pixels; where more are edges all is texture, in which circles agree by chance
 MIN_CONTRAST = 12.0  # grey levels
 CONTRAST = 0.15  # of the floor's brightness, at least, between floor and rim
 SATURATED, SATURATED_SHARE = 253, 0.15  # grey level, and share of a ring on the floor
@@ -96,13 +98,15 @@ def _first_guess(gray: np.ndarray, rows: int) -> tuple[float, float, float] | No
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if factor > 1 else gray
     size = (gray.shape[1] // factor, gray.shape[0] // factor)
     small = cv2.resize(half, size, interpolation=cv2.INTER_AREA)
+    if np.count_nonzero(cv2.Canny(small, EDGE_LEVEL // 2, EDGE_LEVEL)) > MAX_EDGE_SHARE * small.size:
+        return None
     minimum = min(small.shape)
     circles = cv2.HoughCircles(
         small,
         cv2.HOUGH_GRADIENT,
         dp=1,
         minDist=minimum,
-        param1=60,
+        param1=EDGE_LEVEL,
         param2=0.2 * rows,
         minRadius=int(0.25 * minimum),
         maxRadius=int(0.55 * minimum),

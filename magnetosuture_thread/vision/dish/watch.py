@@ -14,6 +14,7 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 AGREEING = 3  # frames in a row that must agree on a new view
 AGREEMENT_PX, AGREEMENT = 1.0, 0.005  # of centres, and of scales
+LONG_SEARCH = 4  # frames without a dish, in one of which it is looked for as in a photograph
 
 
 class DishWatch:
@@ -36,6 +37,7 @@ class DishWatch:
         self._fixed = settings.fixed_view()
         self.found: FoundDish | None = None
         self._anew: list[FoundDish] = []
+        self._searched = 0  # frames in a row without a dish
 
     @property
     def view(self) -> DishView | None:
@@ -44,7 +46,7 @@ class DishWatch:
 
     def forget(self) -> None:
         """Begin anew, as with a camera of another size."""
-        self.found, self._anew = None, []
+        self.found, self._anew, self._searched = None, [], 0
 
     def look(self, image: np.ndarray) -> tuple[str, np.ndarray]:
         """Look at the rim in a frame.
@@ -57,7 +59,7 @@ class DishWatch:
             `FoundDish.prepared`.
         """
         if self._fixed is not None or self.found is None:
-            self.found = see_dish(image, self._settings, self._diameter)
+            self.found = self._search(image)
             if self.found is None:
                 return "no dish in the image", image
             return "", self.found.prepared(image)
@@ -66,9 +68,9 @@ class DishWatch:
         shift, rays = rim_shift(gray, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
         seen = rays >= RIM_SHARE * RIM_RAYS
         if seen and shift < STILL_PX:
-            self._anew = []
+            self._anew, self._searched = [], 0
             return "", prepared
-        found = see_dish(image, self._settings, self._diameter)
+        found = self._search(image)
         if found is None:
             self._anew = []
             return "too little of the dish is seen", prepared
@@ -79,6 +81,13 @@ class DishWatch:
             return "the dish is not where it was", prepared
         self.found, self._anew = found, []
         return "", found.prepared(image)
+
+    def _search(self, image: np.ndarray) -> FoundDish | None:
+        """Look for the dish; in most frames only as long as a live node has time for, until one was found."""
+        long = bool(self._anew) or self._searched % LONG_SEARCH == 0
+        found = see_dish(image, self._settings, self._diameter, photographed=long)
+        self._searched = 0 if found is not None else self._searched + 1
+        return found
 
 
 def _agree(one: DishView, other: DishView) -> bool:

@@ -10,7 +10,8 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_dish, rim_shift
-from magnetosuture_thread.vision.dish.watch import AGREEING, DishWatch
+from magnetosuture_thread.vision.dish.watch import AGREEING, LONG_SEARCH, DishWatch
+from magnetosuture_thread.vision.look import see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import NOWHERE, Pose, finger, render
 
@@ -80,6 +81,24 @@ def test_a_dark_frame_gives_no_view_and_changes_none():
     assert watch.look(0 * gray)[0] == "too little of the dish is seen"
     assert watch.look(gray)[0] == ""
     assert watch.view is view
+
+
+def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
+    bright = np.full((480, 640), 128, np.uint8)
+    cv2.circle(bright, (322, 238), 200, 255, -1, cv2.LINE_AA)  # saturated, so that the rim's dark is not told
+    assert see_dish(bright, VisionTrackerSettings(), 0.035, photographed=False) is None
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
+    for _ in range(2):
+        assert watch.look(0 * bright)[0] != ""
+    reasons = [watch.look(bright)[0] for _ in range(LONG_SEARCH)]
+    assert reasons[0] != ""
+    assert reasons[-1] == ""
+
+
+def test_what_is_all_texture_shows_no_dish():
+    for seed in range(3):
+        noise = np.random.default_rng(seed).integers(0, 256, (480, 640)).astype(np.uint8)
+        assert find_dish(noise, 0.035) is None
 
 
 def test_a_given_view_needs_no_dish():
