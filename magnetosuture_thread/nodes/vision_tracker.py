@@ -60,6 +60,7 @@ class VisionTrackerNode(PackageNode):
         self._camera = CAMERA[settings.image_transport].name
         self._words = "nothing seen"
         self._lens: Lens | None = None
+        self._lens_problem = ""  # stays in the state until valid parameters come, as frames keep coming
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._last_frame = self._arrival()
@@ -103,10 +104,10 @@ class VisionTrackerNode(PackageNode):
     def on_camera_info(self, message: CameraInfo) -> None:
         """Undo the distortion of the camera's lens; frames are taken as they are where its parameters are invalid."""
         try:
-            self._lens = lens_of(message)
+            self._lens, self._lens_problem = lens_of(message), ""
         except InvalidInputError as error:
+            self._lens, self._lens_problem = None, str(error)
             self.health.refuse(error)
-            self._lens = None
         if self._session is not None:
             self._session.set_lens(self._lens)
 
@@ -117,7 +118,7 @@ class VisionTrackerNode(PackageNode):
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
             self._states.publish(MESSAGES.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
-            self.health.warn(f"{reason}; before that {self._words}")
+            self.health.warn("; ".join(filter(None, (reason, f"before that {self._words}", self._lens_problem))))
 
     def _arrival(self) -> float:
         return float(self._steady.now().nanoseconds * 1e-9)
@@ -164,7 +165,10 @@ class VisionTrackerNode(PackageNode):
         elif seen.tracked:
             values["confidence"] = round(track.confidence, 3)
             self._words = f"tracking; {track.warning}" if track.warning else "tracking"
-            (self.health.warn if track.warning else self.health.ok)(self._words, **values)
+            if self._lens_problem:
+                self.health.warn(f"{self._words}; {self._lens_problem}", **values)
+            else:
+                (self.health.warn if track.warning else self.health.ok)(self._words, **values)
         else:
             self._words = f"{track.state.value}: {track.reason}"
             self.health.warn(self._words, **values)

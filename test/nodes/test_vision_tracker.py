@@ -249,3 +249,5 @@ def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_no
     message.d = [float("nan")] * 5
     graph.publish(topics.CAMERA_INFO, message)
     graph.wait(lambda: any("camera_info.d" in state for state in states(diagnostics)), "a refusal")
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
+    graph.wait(lambda: any("tracking; camera_info.d" in state for state in states(diagnostics)), "the reason to stay")
