@@ -30,7 +30,7 @@ from magnetosuture_thread.vision.thread.ridge import (
     faint_ridge,
     shrunk_hidden,
 )
-from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, least_confidence, refine
+from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, least_confidence, refine, strengths_along
 
 COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
 BEYOND_PX = 3.0  # its tip, that is not seen either
@@ -56,7 +56,10 @@ OTHER_COLOUR = 0.5  # weight of what a pixel has of another colour, against it
 BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
 MIN_CENTRED = 4  # vertices
 FAINT_SHARE = 0.8  # of enough, that a faint or pale thread must show: less may be another thread, or glare
-LEAVING_STEPS, BEGINNING_SHARE = 8, 0.4  # vertices at the beginning, and their share of the walk's usual strength
+LEAVING, NEXT = 5, 20  # vertices that are seen first, and up to which those lie that they are held against
+BEGINNING_SHARE = 0.4  # of the strength of the next ones, that the first must have
+BESIDE, BESIDE_SHARE = 13, 3.0  # window about a faint walk, and of its strength, that what it lies beside has there
+SIGNIFICANT = 2.5  # deviations of noise, above the 1.7 to 2.2 that the best of all walks over noise shows
 SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
 WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
 
@@ -71,20 +74,28 @@ class _Walk:
         strength: median of the ridge along it [grey levels].
         ridge: that was followed.
         path: the walk in the ridge's pixels; see `walk_on`.
+        seen: strength of the ridge at each vertex that is not hidden.
     """
 
     points: np.ndarray
     shown: float
     strength: float
-    ridge: Ridge | None
+    ridge: Ridge
     path: np.ndarray
+    seen: np.ndarray
 
     @property
-    def begins_alike(self) -> bool:
-        """Whether it is as strong where it leaves the needle as further on: else it has gone over to something else."""
-        strengths = self.path[1:, 4]
-        beginning = strengths[:LEAVING_STEPS]
-        return bool(len(beginning) and beginning.min() > BEGINNING_SHARE * np.median(strengths))
+    def is_significant(self) -> bool:
+        """Whether a walk along a signed ridge shows more than the best walk over noise, from the needle on.
+
+        A walk looks for the strongest way, and so finds more than the mean of noise where nothing is. One that begins
+        much fainter than it goes on has gone over such noise to something that does not leave the needle.
+        """
+        if len(self.seen) <= LEAVING:
+            return False
+        first, following = np.median(self.seen[:LEAVING]), np.median(self.seen[LEAVING:NEXT])
+        least = min(np.median(self.seen[:NEXT]), np.median(self.seen))
+        return bool(least > SIGNIFICANT * LEVELS and first > BEGINNING_SHARE * following)
 
 
 @dataclass(frozen=True)
@@ -145,7 +156,7 @@ def follow_thread(
         wall: see there.
     """
     walk = _followed(picture, needle, max_length, centre, wall)
-    if walk.ridge is None or len(walk.path) < MIN_CENTRED:
+    if len(walk.path) < MIN_CENTRED:
         return FollowedThread(walk.points, 1.0 if len(walk.points) > 1 else 0.0, None)
     ridge, path = walk.ridge, walk.path
     confidence, vertex = least_confidence(
@@ -180,7 +191,7 @@ def _is_strong(dark: _Walk, enough: float) -> bool:
 
 
 def _best_of(dark: _Walk, faint: list[_Walk], enough: float) -> _Walk:
-    sure = [walk for walk in faint if walk.shown > FAINT_SHARE * enough and walk.begins_alike]
+    sure = [walk for walk in faint if walk.shown > FAINT_SHARE * enough and walk.is_significant]
     if not sure:
         return dark
     return max(sure, key=lambda walk: walk.shown * walk.strength)
@@ -263,16 +274,23 @@ class _Search:
                 self._clear_shade(ridge, shade * LEVELS / deviation)
                 self._clear_wall(ridge)
                 walk, sign = self._walked(ridge), -1.0 if pale else 1.0
-                walk = replace(walk, strength=sign * self._median_along(walk.points, difference, scale))
                 if scale == 1:
                     thin[pale] = ridge, difference
-                elif len(walk.points) > MIN_CENTRED:
+                walk = replace(walk, strength=sign * self._median_along(walk.points, difference, scale))
+                if walk.is_significant and self._is_beside(walk, difference, scale):
+                    continue
+                if scale > 1 and len(walk.points) > MIN_CENTRED:
                     # Among larger pixels a thread and its shadow are one: where it is thin, its own middle is taken.
                     ridge, difference_1 = thin[pale]
                     if sign * self._median_along(walk.points, difference_1, 1) > THIN_SHARE * walk.strength:
                         walk = replace(walk, points=self._recentred(walk.points, ridge))
                 walks.append(walk)
         return walks
+
+    def _is_beside(self, walk: _Walk, difference: np.ndarray, scale: int) -> bool:
+        """Say whether a walk runs beside something that differs far more, which makes its surroundings look so."""
+        near = cv2.dilate(np.abs(difference), np.ones((BESIDE, BESIDE), np.uint8))
+        return self._median_along(walk.points, near, scale) > BESIDE_SHARE * walk.strength
 
     @cached_property
     def _coarse(self) -> np.ndarray:
@@ -395,9 +413,8 @@ class _Search:
             strong,
         )
         points = path[:count, :2].copy()
-        kept = count
-        if ridge.signed:
-            kept = count_to_end(ridge.strength, ridge.hidden, ridge.factor, ridge.noise, ridge.faintest, path, count)
+        values = strengths_along(ridge.strength, ridge.hidden, ridge.factor, ridge.noise, path, count)
+        kept = count_to_end(values, ridge.faintest, path) if ridge.signed else count
         if self._picture.mask is not None:
             full = cv2.resize(ridge.strength, None, fx=scale, fy=scale) if scale > 1 else ridge.strength
             above = cv2.subtract(full, ridge.noise)
@@ -407,7 +424,8 @@ class _Search:
         for _ in range(FAINT_ROUNDS if ridge.signed else 1):
             refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
         strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
-        return _Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy())
+        seen = values[1:kept][~np.isnan(values[1:kept])]
+        return _Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy(), seen)
 
     def _clear_wall(self, ridge: Ridge) -> None:
         """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""

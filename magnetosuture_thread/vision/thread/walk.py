@@ -178,18 +178,33 @@ def walk_on(
 
 
 @compiled
-def count_to_end(ridge, hidden, factor, noise, faintest, path, count):
+def strengths_along(ridge, hidden, factor, noise, path, count):
+    """Return how strong the ridge is at each vertex of a path, NaN where it is hidden, shape (count,)."""
+    values = np.empty(count)
+    for index in range(count):
+        u, v = path[index, 0], path[index, 1]
+        _, values[index] = centred(ridge, noise, u, v, path[index, 2], 0.7)
+        if is_hidden(hidden, factor, u, v):
+            values[index] = np.nan
+    return values
+
+
+@compiled
+def count_to_end(values, faintest, path):
     """Return how many vertices of a path show a faint thread, where the walk may have gone on along noise.
 
     The thread ends where the sum of what is stronger than `END` of its usual strength, less that, is greatest.
+
+    Args:
+        values: see `strengths_along`.
+        faintest: a strength above noise that is no noise.
+        path: see `walk_on`.
     """
-    values = np.empty(count)
-    for index in range(count):
-        _, values[index] = centred(ridge, noise, path[index, 0], path[index, 1], path[index, 2], 0.7)
+    count = len(values)
     bound = max(END_FAINTEST * faintest, END * np.median(path[1:count, 4])) if count > 1 else 0.0
     total, greatest, kept = 0.0, 0.0, 1
     for index in range(1, count):
-        if is_hidden(hidden, factor, path[index, 0], path[index, 1]):
+        if np.isnan(values[index]):
             continue
         total += min(values[index], STRONGEST * path[index, 4]) - bound
         if total >= greatest:
