@@ -30,7 +30,7 @@ from magnetosuture_thread.vision.thread.ridge import (
     faint_ridge,
     shrunk_hidden,
 )
-from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, least_confidence, refine, strengths_along
+from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, min_confidence, refine, strengths_along
 
 COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
 BEYOND_PX = 3.0  # its tip, that is not seen either
@@ -145,7 +145,7 @@ def follow_thread(
     """Follow the thread as `find_centreline` does, and judge where it may have gone on along another way.
 
     At each vertex the arc ahead that was taken is held against the best other one that lies on a ridge too: a thread
-    that crosses, or an own loop. The confidence is the least of all vertices, see `least_confidence`: it falls with the
+    that crosses, or an own loop. The confidence is the least of all vertices, see `min_confidence`: it falls with the
     strength of the other way and rises with the bend that the other needs more.
 
     Args:
@@ -159,7 +159,7 @@ def follow_thread(
     if len(walk.path) < MIN_CENTRED:
         return FollowedThread(walk.points, 1.0 if len(walk.points) > 1 else 0.0, None)
     ridge, path = walk.ridge, walk.path
-    confidence, vertex = least_confidence(
+    confidence, vertex = min_confidence(
         ridge.strength, ridge.hidden, ridge.factor, ridge.noise, ridge.faintest, ridge.stiffness, path
     )
     if vertex < 0:

@@ -26,7 +26,7 @@ SMOOTHING = 0.05  # weight of the newest strength in the usual one
 ASIDE_PX, ACROSS = 0.5, 9  # between samples across a ridge, and how many
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
 FORK = 0.75  # of the usual strength, at least, along the other way
-END, END_FAINTEST = 0.5, 1.2  # of the usual strength, and of the faintest, that a faint thread shows to its end
+END, END_FAINTEST = 0.6, 1.2  # of the usual strength, and of the faintest, that a faint thread shows to its end
 TELLING_BEND = 0.06  # 1/px; a way that bends more by this is less likely by a factor e
 FORCED = 4  # steps that a walk is held to the other way
 
@@ -213,7 +213,7 @@ def count_to_end(values, faintest, path):
 
 
 @compiled
-def least_confidence(ridge, hidden, factor, noise, faintest, stiffness, path):
+def min_confidence(ridge, hidden, factor, noise, faintest, stiffness, path):
     """Return the least confidence of all places where a path could have gone another way, and the vertex there.
 
         1 - min(1, s_other / s_taken) exp(-(|k_other - k| - |k_taken - k|) / TELLING_BEND)
