@@ -232,8 +232,8 @@ def at_wall(end: str, gap: float, angle: float) -> tuple[np.ndarray, float]:
 @pytest.mark.parametrize("gap", [0.0, 1e-4, 3e-4])
 @pytest.mark.parametrize("end", ["tip", "tail", "side"])
 def test_a_needle_at_the_wall_is_found(camera: DishCamera, thread_arc, end: str, gap: float):
-    """At once with an end at the wall; along it, where both ends may look alike, if it was seen on its way there."""
-    way = np.arange(5e-4, 0.0, -1e-4) if end == "side" else np.empty(0)
+    """At once near the wall; along it, or with the tip on it, where both ends may look alike, if it was seen before."""
+    way = np.arange(5e-4, 0.0, -1e-4) if end == "side" or (end == "tip" and gap == 0.0) else np.empty(0)
     lost = followed = 0
     for angle in np.linspace(0.1, 6.2, 8):
         tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)

@@ -9,18 +9,11 @@ import numpy as np
 
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.axis_guesses import axis_guesses
+from magnetosuture_thread.vision.needle.comparison import bluntness, excess, steel_rows
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
-from magnetosuture_thread.vision.needle.template import (
-    BLOOM_PX,
-    THIN,
-    TemplateFit,
-    bluntness,
-    excess,
-    fit_template,
-    steel_rows,
-)
+from magnetosuture_thread.vision.needle.template import BLOOM_PX, THIN, TemplateFit, fit_template
 from magnetosuture_thread.vision.sampling import middle, straighten
 
 FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this

@@ -151,7 +151,7 @@ def _across(own, aside, share, slope):
 
 
 @compiled
-def _draw(along, aside, length, half, bloom, thin, drawn):
+def draw_needle(along, aside, length, half, bloom, thin, drawn):
     """Fill in the share of steel of a drawn needle at places along and aside of its axis."""
     across, slope = np.empty(len(aside)), np.empty(len(aside))
     before = -1.0
@@ -219,9 +219,9 @@ def _sample_both(surely, perhaps, state, along, aside, least, most):
 
 
 @compiled
-def _sample(steel, state, along, aside, seen):
+def sample_along(steel, state, along, aside, values):
     """Fill in the image along and aside of the arc that a state begins with."""
-    straighten(steel, (state[0], state[1], state[2], state[3]), along, aside, seen)
+    straighten(steel, (state[0], state[1], state[2], state[3]), along, aside, values)
 
 
 @compiled
@@ -327,119 +327,3 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal)
             break
     state[:] = best_state
     return best, best_missing, samples
-
-
-@compiled
-def excess(surely, start, length, half, result):
-    """Fill in how much darker than a drawn needle the image is around it, as shares of what it could be.
-
-    Args:
-        surely: see `SteelMap`.
-        start: u, v, angle, curvature of the axis and half of the drawn width.
-        length: of the needle [px].
-        half: of its body's width [px].
-        result: filled, shape (6,): left and right of the taper, within the body's width; beyond the tip and beyond the
-            tail; rows that are dark from the body on, left and right: what is as wide is no thread.
-    """
-    rows, columns = int(length + 2.0 * BESIDE_PX) + 1, 2 * int((half + BESIDE_PX) / STEP_PX) + 1
-    along, aside = np.arange(rows) - BESIDE_PX, (np.arange(columns) - columns // 2) * STEP_PX
-    seen, drawn = np.empty((rows, columns)), np.empty((rows, columns))
-    _sample(surely, start, along, aside, seen)
-    _draw(along, aside, length, half, start[4] - half, THIN, drawn)
-    total = np.zeros(6)
-    result[:] = 0.0
-    for row in range(rows):
-        s = along[row]
-        least = np.ones(2)
-        for column in range(columns):
-            d = aside[column]
-            side = 0 if d < 0.0 else 1
-            more = max(seen[row, column] - drawn[row, column], 0.0)
-            zone = -1
-            if abs(d) < half + 0.5:
-                if s > length + 1.0:
-                    zone = 2
-                elif s < -1.5:
-                    zone = 3
-                elif s > (1.0 - 0.8 * TAPER) * length and drawn[row, column] < 0.5:
-                    zone = side
-            elif abs(d) > half + 1.5:
-                least[side] = min(least[side], more)
-            if zone >= 0:
-                result[zone] += more
-                total[zone] += 1.0 - drawn[row, column]
-        if 0.0 < s < length:
-            for side in range(2):
-                result[4 + side] += least[side] > 0.5
-                total[4 + side] += 1.0
-    result /= np.maximum(total, 1e-9)
-
-
-@compiled
-def steel_rows(surely, perhaps, start, length, half, thin, result):
-    """Fill in what of its steel each row of a drawn needle has in the image, from tail to tip.
-
-    Args:
-        surely: see `SteelMap`.
-        perhaps: see there.
-        start: u, v, angle, curvature of the axis and half of the drawn width.
-        length: of the needle [px].
-        half: of its body's width [px].
-        thin: of it, to which its end tapers; 1 for a rod.
-        result: filled, shape (rows, 3): which share is missing, how much there should be [px], and the greatest share
-            of any place of the row, for sure.
-    """
-    rows, columns = len(result), 2 * int((half + BESIDE_PX) / STEP_PX) + 1
-    along, aside = np.arange(rows) + 0.5, (np.arange(columns) - columns // 2) * STEP_PX
-    least, most = np.empty((rows, columns)), np.empty((rows, columns))
-    drawn = np.empty((rows, columns))
-    _sample(surely, start, along, aside, least)
-    _sample(perhaps, start, along, aside, most)
-    _draw(along, aside, length, half, start[4] - half, thin, drawn)
-    for row in range(rows):
-        missing, total, greatest = 0.0, 0.0, 0.0
-        for column in range(columns):
-            missing += max(drawn[row, column] - most[row, column], 0.0)
-            total += drawn[row, column]
-            if abs(aside[column]) < half:
-                greatest = max(greatest, least[row, column])
-        result[row, 0], result[row, 1], result[row, 2] = missing / max(total, 1e-9), total * STEP_PX, greatest
-
-
-@compiled
-def bluntness(surely, start, length, half, result):
-    """Fill in how blunt both ends of a needle look, on either side of its axis.
-
-        b = sum w (surely - tapered) / sum w (blunt - tapered),    w = blunt - tapered
-
-    over the corners that a blunt end has and a tapered one lacks: 0 for a point, 1 for a blunt end. A thread that
-    leaves an end, or lies over it, makes one side look blunter than it is; so the lesser one tells.
-
-    Args:
-        surely: see `SteelMap`.
-        start: u, v, angle, curvature of the axis and half of the drawn width.
-        length: of the needle [px].
-        half: of its body's width [px].
-        result: filled, shape (2, 2): at the axis' start and its end, left and right.
-    """
-    rows, columns = int(length + 2.0 * BESIDE_PX) + 1, 2 * int((half + BESIDE_PX) / STEP_PX) + 1
-    along, aside = np.arange(rows) - BESIDE_PX, (np.arange(columns) - columns // 2) * STEP_PX
-    seen, blunt = np.empty((rows, columns)), np.empty((rows, columns))
-    forward, backward = np.empty((rows, columns)), np.empty((rows, columns))
-    bloom = start[4] - half
-    _sample(surely, start, along, aside, seen)
-    _draw(along, aside, length, half, bloom, 1.0, blunt)
-    _draw(along, aside, length, half, bloom, THIN, forward)
-    _draw(length - along, aside, length, half, bloom, THIN, backward)
-    more, total = np.zeros((2, 2)), np.zeros((2, 2))
-    for row in range(rows):
-        end = 0 if along[row] < 0.5 * length else 1
-        for column in range(columns):
-            if column == columns // 2:
-                continue
-            tapered = backward[row, column] if end == 0 else forward[row, column]
-            weight = blunt[row, column] - tapered
-            side = 0 if column < columns // 2 else 1
-            more[end, side] += weight * (seen[row, column] - tapered)
-            total[end, side] += weight * weight
-    result[:] = more / np.maximum(total, 1e-9)

@@ -12,7 +12,8 @@ from magnetosuture_thread.vision.images import prepare
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.centreline import WALL_PX, FollowedThread, find_centreline, follow_thread
+from magnetosuture_thread.vision.thread.centreline import FollowedThread, find_centreline, follow_thread
+from magnetosuture_thread.vision.thread.search import WALL_PX
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
 

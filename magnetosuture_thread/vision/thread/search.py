@@ -1,0 +1,370 @@
+"""Walks along the ridges of one frame from the needle's tail on: dark, faint, pale and wide threads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
+from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, shrunk, without_wall
+from magnetosuture_thread.vision.needle.erase import without_needle
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.thread.forks import follow
+from magnetosuture_thread.vision.thread.outlines import count_off_outline
+from magnetosuture_thread.vision.thread.ridge import (
+    DEVIATION,
+    FAINT_DEVIATIONS,
+    FAINTEST,
+    INNER_PX,
+    LEVELS,
+    WINDOW_PX,
+    ZERO,
+    Ridge,
+    black_hat,
+    darker_than_around,
+    faint_ridge,
+    shrunk_hidden,
+)
+from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, refine, strengths_along
+
+COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
+BEYOND_PX = 3.0  # its tip, that is not seen either
+MAX_BEYOND_PX = 12.0  # hidden by the needle and what is next to it, beside its length
+SHADE, SHADE_PX = 0.12, 10.0  # of steel's darkness, that its shadow has, and how far beside it that lies
+WALL_PX = 4.0  # before which the walk ends
+AT_WALL_PX = 40.0  # from the wall, where its rim may look like the thread's beginning
+BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can leave
+ENOUGH = 0.85  # of the greatest length: so much thread seen, dark and strong, needs no other search
+FAINT = 25.0  # grey levels; a black-hat fainter than this may be a pale thread's shadow
+STRONG_SHARE = 0.08  # of enough, that a strong dark thread must show to be the thread: the rest of it is covered
+SCALES = (1, 2)  # how much smaller the image is in which a faint, a pale or a wide thread is looked for
+RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
+THIN_SHARE = 0.5  # of its strength among larger pixels, that a thin thread shows at full size
+FAINT_ROUNDS, FAINT_HALF = 3, 3  # how often a faint walk is centred, and over how many vertices to both sides
+COARSE, COARSE_MEDIAN = 4, 15  # how much smaller an image shows what is wide, and the window of its surroundings [px]
+COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
+WIDE_SHARE = 1.2  # of a walk's contrast, that what is wide has beside it in the shrunk image
+WIDE_FAINTEST = 0.3  # of the contrast at the tail, that it shows everywhere
+WIDE_STIFFNESS = 3.0  # of a wide thread, that bends in many of its widths, in the shrunk image
+OTHER_COLOUR = 0.5  # weight of what a pixel has of another colour, against it
+BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
+MIN_CENTRED = 4  # vertices
+LEAVING, NEXT = 5, 20  # vertices that are seen first, and up to which those lie that they are held against
+BEGINNING_SHARE = 0.4  # of the strength of the next ones, that the first must have
+BESIDE, BESIDE_SHARE = 13, 3.0  # window about a faint walk, and of its strength, that what it lies beside has there
+SIGNIFICANT = 2.5  # deviations of noise, above the 1.7 to 2.2 that the best of all walks over noise shows
+SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
+WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A walk along a ridge.
+
+    Attributes:
+        points: vertices in pixels of the picture, shape (m, 2).
+        shown: how much thread they show [px].
+        strength: median of the ridge along it [grey levels].
+        ridge: that was followed.
+        path: the walk in the ridge's pixels; see `walk_on`.
+        shown_strengths: strength of the ridge at each vertex that is not hidden.
+    """
+
+    points: np.ndarray
+    shown: float
+    strength: float
+    ridge: Ridge
+    path: np.ndarray
+    shown_strengths: np.ndarray
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether a walk along a signed ridge shows more than the best walk over noise, from the needle on.
+
+        A walk looks for the strongest way, and so finds more than the mean of noise where nothing is. One that begins
+        much fainter than it goes on has gone over such noise to something that does not leave the needle.
+        """
+        if len(self.shown_strengths) <= LEAVING:
+            return False
+        first, following = np.median(self.shown_strengths[:LEAVING]), np.median(self.shown_strengths[LEAVING:NEXT])
+        least = min(np.median(self.shown_strengths[:NEXT]), np.median(self.shown_strengths))
+        return bool(least > SIGNIFICANT * LEVELS and first > BEGINNING_SHARE * following)
+
+
+def is_strong(dark: Walk, enough: float) -> bool:
+    """Say whether a dark walk shows a thread beyond doubt, be it that the rest of it is covered."""
+    return dark.strength > FAINT and dark.shown > STRONG_SHARE * enough
+
+
+class ThreadSearch:
+    """Walks along one frame's ridges, each from the needle's tail on.
+
+    Args:
+        picture: the frame or a part of it.
+        needle: in the picture's pixels.
+        max_length: of a walk [px].
+        centre: the dish's [px].
+        reach: how far from it a walk may go [px].
+    """
+
+    def __init__(
+        self,
+        picture: Picture,
+        needle: MeasuredNeedle,
+        max_length: float,
+        centre: tuple[float, float],
+        reach: float,
+    ) -> None:
+        self._picture, self._needle, self._max_length = picture, needle, max_length
+        self._centre, self._reach = centre, reach
+        self._at_wall = bool(np.hypot(*(needle.tail_px - centre)) > reach - AT_WALL_PX)
+        rows, columns = picture.shape
+        left, top = (max(0, int(c - reach - WINDOW_PX)) for c in centre)
+        right, bottom = (int(c + reach + WINDOW_PX) + 1 for c in centre)
+        left, top = min(left, columns - 1), min(top, rows - 1)
+        right, bottom = max(1, min(right, columns)), max(1, min(bottom, rows))
+        factor = picture.factor
+        left, top = left // factor * factor, top // factor * factor  # a whole pixel of the small image
+        self._origin, self._box = (left, top), (slice(top, bottom), slice(left, right))
+        hidden = glare_mask(picture)[top // factor : -(-bottom // factor), left // factor : -(-right // factor)]
+        # Copied: a slice of the mask is handed to compiled code and to drawing, which want their own memory.
+        self._hidden = np.ascontiguousarray(hidden)
+        self._covered = np.zeros_like(self._hidden)
+        _cover(self._covered, factor, needle, self._origin)
+        self._hidden |= self._covered
+
+    def dark(self) -> Walk:
+        """Return the walk along the black-hat, at full size or at half of it."""
+        window = self._cleared(self._picture.darkest)
+        shade = SHADE * self._needle.contrast * middle(self._picture.darkest.floor)
+
+        def at(scale: int) -> Walk:
+            ridge = black_hat(window, self._hidden, self._picture.factor, scale)
+            self._clear_shade(ridge, shade)
+            return self._walked(ridge)
+
+        thin, enough = at(1), ENOUGH * self._max_length
+        if thin.shown > enough or is_strong(thin, enough) or self._at_wall:  # The rim is wide, as covers are.
+            return thin
+        best = thin
+        for scale in SCALES[1:]:
+            wide = at(scale)
+            if wide.shown > max(WIDER_SHARE * best.shown, SURE_SHARE * enough):
+                best = wide
+            if best.shown > enough:
+                break
+        return best
+
+    def faint(self) -> list[Walk]:
+        """Return the walks along what is a little darker or paler than its surroundings, at full size and at half."""
+        window = self._cleared(self._picture.luminance)
+        shade = SHADE * self._needle.contrast * middle(self._picture.luminance.floor)
+        walks: list[Walk] = []
+        thin: dict[bool, tuple[Ridge, np.ndarray]] = {}
+        for scale in SCALES:
+            small = shrunk(window, scale)
+            difference, deviation = darker_than_around(small)
+            for pale in (False, True):
+                # A pale thread may be as bright as the lamp's reflection.
+                hidden, factor = shrunk_hidden(
+                    self._covered if pale else self._hidden, self._picture.factor, small, scale
+                )
+                ridge = faint_ridge(difference, deviation, hidden, factor, scale, pale=pale)
+                self._clear_shade(ridge, shade * LEVELS / deviation)
+                self._clear_wall(ridge)
+                walk, sign = self._walked(ridge), -1.0 if pale else 1.0
+                if scale == 1:
+                    thin[pale] = ridge, difference
+                walk = replace(walk, strength=sign * self._median_along(walk.points, difference, scale))
+                if walk.is_significant and self._is_beside(walk, difference, scale):
+                    continue
+                if scale > 1 and len(walk.points) > MIN_CENTRED:
+                    # Among larger pixels a thread and its shadow are one: where it is thin, its own middle is taken.
+                    ridge, difference_1 = thin[pale]
+                    if sign * self._median_along(walk.points, difference_1, 1) > THIN_SHARE * walk.strength:
+                        walk = replace(walk, points=self._recentred(walk.points, ridge))
+                walks.append(walk)
+        return walks
+
+    def _is_beside(self, walk: Walk, difference: np.ndarray, scale: int) -> bool:
+        """Say whether a walk runs beside something that differs far more, which makes its surroundings look so."""
+        near = cv2.dilate(np.abs(difference), np.ones((BESIDE, BESIDE), np.uint8))
+        return self._median_along(walk.points, near, scale) > BESIDE_SHARE * walk.strength
+
+    @cached_property
+    def _coarse(self) -> np.ndarray:
+        """How much darker than around each colour of the shrunk image is, shape (rows, columns, 1 or 3)."""
+        small = shrunk(self._picture.image[self._box], COARSE)
+        around = cv2.medianBlur(small, COARSE_MEDIAN)
+        return cv2.subtract(around, small, dtype=cv2.CV_32F).reshape(*small.shape[:2], -1)
+
+    def is_edge(self, walk: Walk) -> bool:
+        """Say whether a walk runs along something far wider than itself: its edge, its shadow, or its texture.
+
+        What is wide keeps its contrast in a shrunk image, what is thin loses it.
+        """
+        contrast = None
+        for layer in (self._picture.darkest, self._picture.brightest):
+            small = shrunk(layer.pixels[self._box], COARSE)
+            factor = self._picture.factor
+            box = tuple(slice(side.start // factor, -(-side.stop // factor)) for side in self._box)
+            floor = cv2.resize(layer.floor[box], small.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            differs = cv2.absdiff(small, floor)
+            contrast = differs if contrast is None else cv2.max(contrast, differs)
+        near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
+        usual = middle(near[::3, ::3])
+        return self._median_along(walk.points, near, COARSE) - usual > WIDE_SHARE * walk.strength
+
+    def wide(self) -> Walk:
+        """Return the walk along what is wide and differs from around in colour as it does where it begins.
+
+            r = d . c - k |d - (d . c) c|
+
+        with the difference d in colour of a pixel from what is around it, and the colour c of what leaves the tail:
+        first right behind it, then along a walk there.
+        """
+        difference = cv2.GaussianBlur(self._coarse, (0, 0), INNER_PX).reshape(self._coarse.shape)
+        walk = self._along(self._same_colour(difference, self._beginning(difference)))
+        if len(walk.points) < MIN_CENTRED:
+            return walk
+        at = ((walk.points[2:BEGINNING] - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(np.float32)
+        begun = cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR).reshape(len(at), -1)
+        return self._along(self._same_colour(difference, np.median(begun, axis=0)))
+
+    def _beginning(self, difference: np.ndarray) -> np.ndarray:
+        """Return the difference in colour right behind the tail."""
+        behind = (self._needle.tail_px - self._origin - 0.5 * (COARSE - 1)) / COARSE - self._needle.direction_px
+        rows, columns = difference.shape[:2]
+        u, v = np.clip(np.round(behind).astype(int), 0, (columns - 1, rows - 1))
+        return np.asarray(difference[v, u])
+
+    @staticmethod
+    def _same_colour(difference: np.ndarray, colour: np.ndarray) -> np.ndarray:
+        """Return how much of a colour each pixel has, less what it has of others."""
+        colour = colour / max(1e-6, float(np.linalg.norm(colour)))
+        same = difference @ colour
+        return np.asarray(same - OTHER_COLOUR * np.linalg.norm(difference - same[..., None] * colour, axis=2))
+
+    def _along(self, contrast: np.ndarray) -> Walk:
+        """Return the walk along a contrast in the image that is shrunk by `COARSE`."""
+        tail = np.round((self._needle.tail_px - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(int)
+        u, v = np.maximum(tail - 2, 0)
+        strongest = float(contrast[v : v + 5, u : u + 5].max(initial=FAINTEST))
+        noise = DEVIATION * middle(np.abs(contrast[::3, ::3]))
+        gain = COARSE_LEVELS / max(strongest, FAINTEST)
+        strength = np.clip(ZERO + gain * contrast, 0.0, 255.0).astype(np.uint8)
+        window = strength
+        hidden, factor = shrunk_hidden(self._covered, self._picture.factor, window, COARSE)
+        faintest = max(WIDE_FAINTEST * COARSE_LEVELS, gain * FAINT_DEVIATIONS * noise)
+        ridge = Ridge(strength, hidden, factor, COARSE, ZERO, faintest, faintest, signed=True, stiffness=WIDE_STIFFNESS)
+        ridge.strength[(hidden > 0) & (ridge.strength > ZERO)] = ZERO
+        self._clear_wall(ridge)
+        walk = self._walked(ridge)
+        return replace(walk, strength=self._median_along(walk.points, contrast, COARSE))
+
+    def _median_along(self, points: np.ndarray, difference: np.ndarray, scale: int) -> float:
+        """Return the median along a walk of a difference that is shrunk by a scale."""
+        at = ((points - self._origin - 0.5 * (scale - 1)) / scale).astype(np.float32)
+        return float(np.median(cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)))
+
+    def _recentred(self, points: np.ndarray, ridge: Ridge) -> np.ndarray:
+        """Return a walk in the middle of a ridge at full size, with vertices as close as the walk's steps there."""
+        length = float(arc_lengths(points)[-1])
+        fine = points_at(points, np.linspace(0.0, length, max(2, round(length / STEP_PX) + 1))) - self._origin
+        seen = np.ones(len(fine), np.bool_)
+        for _ in range(FAINT_ROUNDS):
+            refine(ridge.strength, ridge.noise, fine, seen, FAINT_HALF)
+        return np.asarray(fine + self._origin)
+
+    def _cleared(self, layer: Layer) -> np.ndarray:
+        """Return a layer's pixels in the search's window, without the needle and what is beyond the wall beside it."""
+        tail, factor = self._needle.tail_px, self._picture.factor
+        pixels = without_needle(layer, factor, self._needle)
+        if self._at_wall:  # else the walk would leave along the rim
+            wall = Wall(self._centre, self._reach + WALL_PX - RIM_PX)
+            pixels = without_wall(layer.replaced(pixels), factor, wall, tail - AT_WALL_PX, tail + AT_WALL_PX)
+        return np.asarray(pixels[self._box])
+
+    def _walked(self, ridge: Ridge) -> Walk:
+        """Walk along a ridge."""
+        scale = ridge.scale
+        shift = 0.5 * (scale - 1)
+        max_length = self._max_length / scale
+        max_steps = int(max_length) + 16  # steps are longer than a pixel
+        path, strong = np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
+        needle, origin = self._needle, self._origin
+        tail, direction = (needle.tail_px - origin - shift) / scale, needle.direction_px
+        dish = (np.append(np.subtract(self._centre, origin) - shift, self._reach) / scale).tolist()
+        count, shown = follow(
+            ridge.strength,
+            ridge.hidden,
+            ridge.factor,
+            ridge.noise,
+            ridge.faintest,
+            ridge.single,
+            ridge.stiffness,
+            np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
+            (dish[0], dish[1], dish[2]),
+            max_length,
+            (needle.length_px + MAX_BEYOND_PX) / scale,
+            self._at_wall,
+            path,
+            strong,
+        )
+        points = path[:count, :2].copy()
+        values = strengths_along(ridge.strength, ridge.hidden, ridge.factor, ridge.noise, path, count)
+        kept = count_to_end(values, ridge.faintest, path) if ridge.signed else count
+        if self._picture.mask is not None:
+            full = cv2.resize(ridge.strength, None, fx=scale, fy=scale) if scale > 1 else ridge.strength
+            above = cv2.subtract(full, ridge.noise)
+            kept = count_off_outline(points[:kept] * scale + shift, above, self._picture.mask, origin, ridge.faintest)
+        shown = max(0.0, shown - (path[count - 1, 5] - path[kept - 1, 5]))
+        points = points[:kept]
+        for _ in range(FAINT_ROUNDS if ridge.signed else 1):
+            refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
+        strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
+        seen = values[1:kept][~np.isnan(values[1:kept])]
+        return Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy(), seen)
+
+    def _clear_wall(self, ridge: Ridge) -> None:
+        """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""
+        scale, shift = ridge.scale, 0.5 * (ridge.scale - 1)
+        u, v = ((np.subtract(self._centre, self._origin) - shift) / scale).tolist()
+        width = (WALL_PX + RIM_PX) / scale + RIM_REACH_PX
+        kept = None
+        if self._at_wall:
+            tail = (self._needle.tail_px - self._origin - shift) / scale
+            low = np.maximum(0.0, tail - (AT_WALL_PX / scale - RIM_REACH_PX)).astype(int)
+            high = np.maximum(0.0, tail + (AT_WALL_PX / scale - RIM_REACH_PX)).astype(int)
+            box = slice(low[1], high[1]), slice(low[0], high[0])
+            kept = ridge.strength[box].copy()
+        radius = (self._reach + WALL_PX) / scale
+        # A ring from where the rim shows up to its outer side.
+        at = round(u * 16.0), round(v * 16.0)
+        cv2.circle(ridge.strength, at, round(radius * 16.0), ridge.noise, round(2.0 * width), cv2.LINE_8, 4)
+        if kept is not None:
+            ridge.strength[box] = kept
+
+    def _clear_shade(self, ridge: Ridge, shade: float) -> None:
+        """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
+        scale = ridge.scale
+        axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24)) - self._origin
+        at = np.round((axis - 0.5 * (scale - 1)) / scale * 16.0).astype(np.int32)
+        zone = np.zeros_like(ridge.strength)
+        thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / scale)
+        cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
+        floor = ridge.noise if ridge.signed else 0.0
+        ridge.strength[(zone > 0) & (ridge.strength < floor + shade)] = floor
+
+
+def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
+    """Mark where the needle hides the thread."""
+    axis = needle.arc.at(np.linspace(BEHIND_TAIL_PX, needle.length_px + BEYOND_PX, 24)) - origin
+    small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
+    thickness = needle.width_px + 2.0 * COVERED_PX
+    cv2.polylines(hidden, [small], False, 255, max(1, round(thickness / factor)), cv2.LINE_8, 4)
