@@ -108,6 +108,8 @@ def _axis_of(points: np.ndarray, width: float) -> tuple[Arc, float, float] | Non
         arc = fit_arc(kept)
         along, aside = arc.coordinates(points)
         near = np.abs(aside) < max(0.5 * width, 1.5 * middle(np.abs(aside)))
+        if near.sum() == len(kept):
+            break
         kept = points[near]
     return arc, float(along[near].min()), float(along[near].max())
 

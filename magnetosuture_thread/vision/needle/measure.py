@@ -13,7 +13,7 @@ from magnetosuture_thread.vision.needle.comparison import bluntness, excess, ste
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
-from magnetosuture_thread.vision.needle.template import BLOOM_PX, THIN, TemplateFit, fit_template
+from magnetosuture_thread.vision.needle.template import BLOOM_PX, FIRST_ROUNDS, THIN, TemplateFit, fit_template
 from magnetosuture_thread.vision.sampling import middle, straighten
 
 FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this
@@ -25,7 +25,6 @@ MIN_CHANGE = 0.4  # of the tolerance, by which what is dark is longer or shorter
 GLARE_PX = 4.0  # beyond an end, that the lamp may not be reflected at
 ROUGH, MORE_PX = 0.08, 3.0  # of the length, that a first guess may be off; more than is dark, to begin a fit with
 SAME_PX = 1.5  # that both ends of two guesses may differ by
-FIRST_ROUNDS = 4
 MAX_COST = 0.11  # of the length, in squared pixels
 MAX_MISSING, MISSING_ROWS = 0.13, 5  # of the steel of so many rows, that the image may lack
 MAX_MISSING_TAIL, TAIL_ROWS = 0.15, 3  # of these, next to the tail
@@ -38,6 +37,8 @@ AXIS_POINTS, MAX_HIDDEN = 100, 0.02  # along the axis, and the share of them tha
 MAX_BESIDE = 0.1  # of the rows with something as dark as steel off the body's side
 BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
 NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and of what is no tip at least
+HOPELESS = 4.0  # times the cost of one fit, that another has after its first rounds if it cannot be as good
+CLEAR_COST = 0.03  # of the length, in squared pixels: a needle that nothing else can be better than
 CLEARLY = 1.25  # times the cost that the other way has if both could be
 ROD = 0.87  # bluntness of both ends of a rod
 ROD_GAIN = (
@@ -74,12 +75,15 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
         return "too faint"
     length, width = size.length_px, size.width_px
     guesses: list[Arc] = []
+    fits: list[TemplateFit] = []
     for level in LEVELS:
         for guess in axis_guesses(steel.surely > level, length, width):
             if not any(_is_same(guess, other, length) for other in guesses):
                 guesses.append(guess)
-    fits = [fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS) for guess in guesses]
-    fits.sort(key=lambda fit: fit.cost)
+                fits.append(fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS))
+        fits.sort(key=lambda fit: fit.cost)
+        if fits and fits[0].cost < CLEAR_COST * length:
+            break
     found: MeasuredNeedle | str = "no arc"
     for rough in fits[:MAX_FITS]:
         found = _checked(steel, rough, size, toward)
@@ -130,6 +134,9 @@ def _checked(
     is_rod = rod.cost < pointed.cost - ROD_GAIN * rod.length * rod.width and _is_rod(steel, rod)
     fit = None if is_rod else _pointed_way(steel, one, other)
     if fit is None:
+        if rod.cost > HOPELESS * pointed.cost:  # and so was given up
+            tolerance = size.tolerance if is_measured else 0.0
+            rod = fit_template(steel, rod.arc, size.length_px, width, tolerance=tolerance, start=rod.length, rod=True)
         settled = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
         if settled is None:
             return ALIKE
@@ -175,11 +182,12 @@ def _fits(
             starts.append(part)
     ones = [fit_template(steel, arc, length, width, tolerance=tolerance, start=start) for arc, start in starts]
     one = min(ones, key=lambda each: each.cost)
-    other = fit_template(steel, one.reversed(), length, width, tolerance=tolerance, start=one.length)
+    bound = HOPELESS * one.cost
+    other = fit_template(steel, one.reversed(), length, width, tolerance=tolerance, start=one.length, hopeless=bound)
     if other.cost < one.cost:  # which then may be caught beside the best place
         again = fit_template(steel, other.reversed(), length, width, tolerance=tolerance, start=other.length)
         one = min((one, again), key=lambda each: each.cost)
-    rod = fit_template(steel, one.arc, length, width, tolerance=tolerance, start=one.length, rod=True)
+    rod = fit_template(steel, one.arc, length, width, tolerance=tolerance, start=one.length, rod=True, hopeless=bound)
     return one, other, rod
 
 
@@ -199,7 +207,7 @@ def _fading(steel: SteelMap, fit: TemplateFit) -> float:
     for side in (-1.0, 1.0):
         share = np.empty((len(body), len(outside)))
         straighten(steel.surely, axis, body, side * outside, share)
-        sides.append(_fade(-outside, np.median(share, axis=0)))
+        sides.append(_fade(-outside, np.partition(share, 6, axis=0)[6]))
     return tail - min(sides)
 
 

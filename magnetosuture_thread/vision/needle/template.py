@@ -27,6 +27,7 @@ OTHER = 0.2  # of steel, at which dark beyond the drawn needle counts a quarter 
 BLOOM_PX = 0.22  # that shadow and lens let an edge seem to lie outside of where it is
 WIDTH_SLACK_PX, WIDTH_SLACK = 0.2, 0.03  # standard deviation of the body's width, and share of it
 MAX_STEP_PX, LAST_STEP_PX = 1.5, 0.02  # of a round; after a smaller one the fit is done
+FIRST_ROUNDS = 4  # that tell which of several fits is worth more
 PULL = 3.5  # times the variance by noise alone, as a thread beside the needle pulls all rows to one side
 DAMPING = 0.05  # of places along and aside, that of all others accordingly
 PARAMETERS = 6
@@ -83,6 +84,7 @@ def fit_template(
     start: float = 0.0,
     rod: bool = False,
     rounds: int = 12,
+    hopeless: float = math.inf,
 ) -> TemplateFit:
     """Fit a drawn needle to an image of steel.
 
@@ -101,13 +103,16 @@ def fit_template(
         start: length to begin with [px]; 0: as known.
         rod: whether both ends are blunt.
         rounds: steps at most.
+        hopeless: cost above which, after `FIRST_ROUNDS`, the fit is given up: what it then is, is no minimum.
     """
     half = 0.5 * width
     state = np.array([guess.start[0], guess.start[1], guess.angle, guess.curvature, half + BLOOM_PX, start or length])
     normal = np.zeros((PARAMETERS, PARAMETERS))
     deviations = 0.5 * (WIDTH_SLACK_PX + WIDTH_SLACK * width), 0.5 * tolerance * length
     thin = 1.0 if rod else THIN
-    cost, missing, count = _fit(steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, normal)
+    cost, missing, count = _fit(
+        steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, hopeless, normal
+    )
     arc, fitted = Arc(state[:2].copy(), float(state[2]), float(state[3])), float(state[5])
     return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, normal, count, thin)
 
@@ -225,7 +230,7 @@ def sample_along(steel, state, along, aside, values):
 
 
 @compiled
-def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal):
+def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeless, normal):
     """Fit; `state` (u, v, angle, curvature, half width, length) is changed, `normal` filled.
 
     The latter is that of (along, aside, angle, bend, half width, length).
@@ -248,7 +253,7 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal)
     best, best_missing, best_state, samples = np.inf, 0.0, state.copy(), 1
     prior = OTHER * OTHER / (deviations[0] * deviations[0])
     length_prior = OTHER * OTHER / (deviations[1] * deviations[1]) if free else 1.0
-    for _ in range(rounds):
+    for done in range(rounds):
         bloom, own_length = state[4] - half, state[5]
         middle = 0.5 * own_length
         rows = min(int(own_length + 2.0 * BESIDE_PX) + 1, most_rows)
@@ -309,6 +314,8 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, normal)
             best, best_missing, samples = cost, missing * STEP_PX, rows * columns
             best_state[:] = state
             normal[:] = own
+        if done >= FIRST_ROUNDS and best > hopeless:
+            break
         change = np.linalg.solve(own, right)
         largest = max(abs(change[0]), abs(change[1]), abs(change[2]) * middle, abs(change[3]) * 0.5 * middle * middle)
         largest = max(largest, abs(change[5]))
