@@ -33,6 +33,9 @@ from test.vision.scenes import (
 
 SAMPLES = Path(__file__).parent / "samples"
 TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
+GIVEN_VIEW = VisionTracker(
+    VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=VIEW.metres_per_pixel), SCENE
+)
 LIGHTS = {
     "usual": Lighting(),
     "dark": Lighting(gain=0.5, slope=3.0, tint_bgr=(0.9, 0.95, 1.0)),
@@ -74,7 +77,8 @@ def test_rendered_needles_are_measured_in_any_light(light: str, curved: bool):
         random = np.random.default_rng(seed)
         pose = random_pose(random, curved=curved)
         thread = random_thread(random, pose)
-        seen = TRACKER.look(render(pose, thread, lighting=LIGHTS[light]))
+        image = render(pose, thread, lighting=LIGHTS[light])
+        seen = TRACKER.look(image)
         assert seen.reason == ""
         apart, turned = pose.error(seen)
         tails.append(apart)
@@ -82,15 +86,16 @@ def test_rendered_needles_are_measured_in_any_light(light: str, curved: bool):
         tips.append(np.linalg.norm(seen.tip - pose.at(1.0)) / PIXEL)
         lines.append(line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread)))
         assert seen.curvature == pytest.approx(pose.curvature, abs=15.0)
-        error = np.array([*(seen.tail - pose.tail), turned])
-        scaled.append(error @ np.linalg.solve(seen.covariance, error) / 3.0)
         assert 0.0 < seen.confidence <= 1.0
+        known = GIVEN_VIEW.look(image)  # A view that is found leaves the camera's tilt unknown, and this one has none.
+        error = np.array([*(known.tail - pose.tail), pose.error(known)[1]])
+        scaled.append(error @ np.linalg.solve(known.covariance, error) / 3.0)
     assert np.sqrt(np.mean(np.square(tails))) < 0.5
     assert np.degrees(np.sqrt(np.mean(np.square(angles)))) < 1.0
     assert np.sqrt(np.mean(np.square(tips))) < 1.2
     assert np.mean([mean for mean, _ in lines]) < 1.0
     assert np.mean([share for _, share in lines]) > 0.95
-    assert np.mean(scaled) < 5.0  # 1 for errors as large as the covariance says; less under a camera that is straight
+    assert 0.05 < np.mean(scaled) < 5.0  # 1 for errors as large as the covariance says
 
 
 def test_over_curvatures_lights_and_noise_tail_heading_and_thread_are_accurate():
@@ -123,12 +128,11 @@ def test_over_curvatures_lights_and_noise_tail_heading_and_thread_are_accurate()
 
 def test_over_many_poses_the_covariance_is_about_right():
     """With a view that is given: one that is found leaves the camera's tilt unknown, and this camera has none."""
-    given = VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=VIEW.metres_per_pixel)
-    tracker, scaled = VisionTracker(given, SCENE), []
+    scaled = []
     for seed in range(10):
         random = np.random.default_rng(100 + seed)
         pose = random_pose(random, curved=True)
-        seen = tracker.look(render(pose, random_thread(random, pose)))
+        seen = GIVEN_VIEW.look(render(pose, random_thread(random, pose)))
         error = np.array([*(seen.tail - pose.tail), pose.error(seen)[1]])
         scaled.append(error @ np.linalg.solve(seen.covariance, error) / 3.0)
     assert 0.3 < np.mean(scaled) < 2.0
@@ -232,8 +236,8 @@ def at_wall(end: str, gap: float, angle: float) -> tuple[np.ndarray, float]:
 @pytest.mark.parametrize("gap", [0.0, 1e-4, 3e-4])
 @pytest.mark.parametrize("end", ["tip", "tail", "side"])
 def test_a_needle_at_the_wall_is_found(camera: DishCamera, thread_arc, end: str, gap: float):
-    """At once near the wall; along it, or with the tip on it, where both ends may look alike, if it was seen before."""
-    way = np.arange(5e-4, 0.0, -1e-4) if end == "side" or (end == "tip" and gap == 0.0) else np.empty(0)
+    """At once with an end at the wall; along it, where both ends may look alike, if it was seen on its way there."""
+    way = np.arange(5e-4, 0.0, -1e-4) if end == "side" else np.empty(0)
     lost = followed = 0
     for angle in np.linspace(0.1, 6.2, 8):
         tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)

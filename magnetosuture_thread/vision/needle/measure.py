@@ -36,6 +36,7 @@ SHARP = 0.2  # bluntness of both sides of a tip if the thread is so thick
 AXIS_POINTS, MAX_HIDDEN = 100, 0.02  # along the axis, and the share of them that wall and shapes may hide
 MAX_BESIDE = 0.1  # of the rows with something as dark as steel off the body's side
 BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
+NEARLY_POINTED = 0.45  # bluntness of a tip at most, of a needle that can only point this way
 NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and of what is no tip at least
 HOPELESS = 4.0  # times the cost of one fit, that another has after its first rounds if it cannot be as good
 CLEAR_COST = 0.03  # of the length, in squared pixels: a needle that nothing else can be better than
@@ -114,11 +115,15 @@ def _checked(
     width = size.width_px
     one, other, rod = _fits(steel, rough, size, size.tolerance)
     best = min((one, other, rod), key=lambda each: each.cost)
-    is_measured = size.tolerance > 0.0
-    if is_measured and not (_shows_ends(steel, best, size) and _needs_length(steel, best, size)):
-        is_measured = False
+    apart = abs(best.length / size.length_px - 1.0)
+    shows_ends = size.tolerance > 0.0 and _shows_ends(steel, best, size)
+    is_measured = shows_ends and _needs_length(steel, best, size)
+    if size.tolerance > 0.0 and not is_measured:
         one, other, rod = _fits(steel, rough, size, 0.0)
         best = min((one, other, rod), key=lambda each: each.cost)
+    # An end that is hidden would make the needle look shorter: where it looks as long as it is set, it is so.
+    agrees = shows_ends or apart < SAME_LENGTH
+    length_error = 0.5 * (min(size.tolerance, max(SAME_LENGTH, apart)) if agrees else size.tolerance)
     reason = _what_covers(steel, best, width)
     if reason:
         return reason
@@ -149,7 +154,7 @@ def _checked(
     confidence *= max(0.2, 1.0 - 2.0 * float(covariance[1, 1]))
     pull = PULL_PX * max(0.0, float(_excess(steel, fit, width)[3]))
     if not is_measured:
-        pull = math.hypot(pull, 0.5 * size.tolerance * size.length_px)
+        pull = math.hypot(pull, length_error * size.length_px)
     lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
     covariance = covariance + pull**2 * np.outer(lengthwise, lengthwise)
     if not is_known:
@@ -268,10 +273,15 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if fit.cost > CLEARLY * against.cost:
             continue
         tail, tip = _bluntness(steel, fit.arc, fit.length, fit.width)
-        if tail < BLUNT or tip > POINTED:
+        if tail < BLUNT or tip > NEARLY_POINTED:
             continue
-        tail, tip = _bluntness(steel, against.arc, against.length, against.width)
-        if tail < NOT_BLUNT or tip > NOT_POINTED or against.cost > CLEARLY * fit.cost:
+        their_tail, their_tip = _bluntness(steel, against.arc, against.length, against.width)
+        is_other = their_tail < NOT_BLUNT or their_tip > NOT_POINTED
+        if tip > POINTED:  # as beside the wall, which is mixed into it: all else must speak against the other way
+            is_sure = their_tail < NOT_BLUNT and their_tip > NOT_POINTED and against.cost > HOPELESS * fit.cost
+            if not is_sure:
+                continue
+        if is_other or against.cost > CLEARLY * fit.cost:
             return fit
     return None
 
