@@ -42,17 +42,12 @@ HOPELESS = 4.0  # times the cost of one fit, that another has after its first ro
 CLEAR_COST = 0.03  # of the length, in squared pixels: a needle that nothing else can be better than
 CLEARLY = 1.25  # times the cost that the other way has if both could be
 ROD = 0.87  # bluntness of both ends of a rod
-ROD_GAIN = (
-    0.003  # of the body's area, by which a rod costs less than a pointed needle; corners of a small tip tell less
-)
+ROD_GAIN = 0.003  # of the body's area, by which a rod costs less; corners of a small tip tell less
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 LENGTH_GAIN = 0.1  # px; times the width, that the fit of another length must cost less by
 FADES_PX = 0.7  # over which a tail may fade more than the sides do
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
-PASSES, PASSES_PX = (
-    0.3,
-    0.3,
-)  # of the width and beside it, off an end's middle: a thread passes, and does not leave
+PASSES, PASSES_PX = 0.3, 0.3  # of the width, and more, off an end's middle: a thread passes, and does not leave
 VISIBLE_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
 ALIKE = "ends that look alike"
 TOWARD = 0.8  # cosine between a needle and where it must point
@@ -267,7 +262,8 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
 def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> TemplateFit | None:
     """Return which of two opposite needles has a blunt tail and a pointed tip; None unless the other clearly has not.
 
-    A thread may lie over the point, and another axis make it look blunt: each is judged by its own fit.
+    A thread may lie over the point, and another axis make it look blunt: each is judged by its own fit, and where both
+    fit alike, one blunt or pointed end alone may be the thread's doing.
     """
     for fit, against in ((one, other), (other, one)):
         if fit.cost > CLEARLY * against.cost:
@@ -276,11 +272,9 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if tail < BLUNT or tip > NEARLY_POINTED:
             continue
         their_tail, their_tip = _bluntness(steel, against.arc, against.length, against.width)
-        is_other = their_tail < NOT_BLUNT or their_tip > NOT_POINTED
-        if tip > POINTED:  # as beside the wall, which is mixed into it: all else must speak against the other way
-            is_sure = their_tail < NOT_BLUNT and their_tip > NOT_POINTED and against.cost > HOPELESS * fit.cost
-            if not is_sure:
-                continue
+        is_other = their_tail < NOT_BLUNT and their_tip > NOT_POINTED
+        if tip > POINTED and not (is_other and against.cost > HOPELESS * fit.cost):  # as the wall blunts a tip
+            continue
         if is_other or against.cost > CLEARLY * fit.cost:
             return fit
     return None
@@ -353,10 +347,11 @@ def _settled(
     blunt = np.empty((2, 2))
     bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
     bound = PASSES * rod.width + PASSES_PX
+    is_pointed = rod.cost > CLEARLY * fit.cost  # else it may be a rod that something beside it makes look so
     for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
         here, there = offsets[end], offsets[1 - end]
         leaves = is_rod and there is None and here is not None and here < bound
-        passes = not is_rod and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
+        passes = is_pointed and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
         if leaves or passes:
             return _pointing(fit, tail_first.direction(0.5 * rod.length)), True
     if toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD:
