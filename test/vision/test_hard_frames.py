@@ -156,3 +156,17 @@ def test_a_view_that_cannot_be_gives_no_pose_and_no_error(centre: tuple[float, f
 def test_a_scale_that_no_camera_has_is_refused():
     with pytest.raises(ConfigurationError, match="at least 1e-07 m"):
         VisionTrackerSettings(metres_per_pixel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "seed"),
+    [
+        ("fold_4_15_2.5mm", 3, 14001),  # both directions fit alike
+        ("rod_in_path", 0, 12001),  # a line passes beside one end of a rod
+        ("rod_in_path", 28, 12001),
+        ("decoy_needle", 19, 14001),  # the thread passes beside its tip
+        ("decoy_needle", 8, 6003),
+    ],
+)
+def test_poses_that_were_reversed_once_are_not(name: str, index: int, seed: int):
+    assert not measure(*frame_of(name, index, seed)).is_wrong

@@ -40,7 +40,7 @@ NEARLY_POINTED = 0.45  # bluntness of a tip at most, of a needle that can only p
 NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and of what is no tip at least
 HOPELESS = 4.0  # times the cost of one fit, that another has after its first rounds if it cannot be as good
 CLEAR_COST = 0.03  # of the length, in squared pixels: a needle that nothing else can be better than
-CLEARLY = 1.25  # times the cost that the other way has if both could be
+CLEARLY, DEARER = 1.25, 1.15  # times the cost that the other way has if both could be; if one end speaks against it
 ROD = 0.87  # bluntness of both ends of a rod
 ROD_GAIN = 0.003  # of the body's area, by which a rod costs less; corners of a small tip tell less
 SAME_LENGTH = 0.015  # share of the length, that need no proof
@@ -262,8 +262,7 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
 def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> TemplateFit | None:
     """Return which of two opposite needles has a blunt tail and a pointed tip; None unless the other clearly has not.
 
-    A thread may lie over the point, and another axis make it look blunt: each is judged by its own fit, and where both
-    fit alike, one blunt or pointed end alone may be the thread's doing.
+    A thread may lie over the point: each is held to its own fit. Where both fit alike, one end alone tells nothing.
     """
     for fit, against in ((one, other), (other, one)):
         if fit.cost > CLEARLY * against.cost:
@@ -272,10 +271,11 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if tail < BLUNT or tip > NEARLY_POINTED:
             continue
         their_tail, their_tip = _bluntness(steel, against.arc, against.length, against.width)
-        is_other = their_tail < NOT_BLUNT and their_tip > NOT_POINTED
-        if tip > POINTED and not (is_other and against.cost > HOPELESS * fit.cost):  # as the wall blunts a tip
-            continue
-        if is_other or against.cost > CLEARLY * fit.cost:
+        signs = (their_tail < NOT_BLUNT) + (their_tip > NOT_POINTED)
+        needed = (CLEARLY, DEARER, 0.0)[signs]  # times the cost, for as many signs against the other way
+        if tip > POINTED:  # as the wall blunts a tip
+            needed = HOPELESS if signs == 2 else math.inf
+        if against.cost > needed * fit.cost:
             return fit
     return None
 
