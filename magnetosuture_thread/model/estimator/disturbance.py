@@ -41,6 +41,22 @@ class Disturbance:
     significance: float
     since: float
 
+    def __str__(self) -> str:
+        """Return it in words, with directions as in the dish frame: right is x, up is y."""
+        return f"held at {1e3 * self.arc_length:.0f} mm of the thread: {_amount(self.force)} {_way(*self.direction)}"
+
+
+def _amount(force: float) -> str:
+    value, unit = (1e3 * force, "mN") if force >= 1e-4 else (1e6 * force, "uN")
+    return f"{value:.0f} {unit}" if value >= 10.0 else f"{value:.2g} {unit}"
+
+
+def _way(x: float, y: float) -> str:
+    """Return a direction in words, to an eighth of a turn."""
+    words = ["to the right" if x > 0.0 else "to the left"] if abs(x) > math.sin(math.pi / 8.0) else []
+    words += ["up" if y > 0.0 else "down"] if abs(y) > math.sin(math.pi / 8.0) else []
+    return " and ".join(reversed(words))
+
 
 def force_density(
     rate: Points, positions: Points, drag_across: float, drag_along: float, bending: float = 0.0
