@@ -75,8 +75,8 @@ class BarrierMargins:
         value: h, safe at >= 0, shape (m,); [m] for an obstacle and the wall, [m^4] for stiffness, [m^2] for
             connectivity and compression, else the barrier's own unit.
         clearance: the same margin as a distance, shape (m,) [m].
-        bound: the clearance is greater than this with a probability of 99 %, shape (m,) [m]; NaN where the thread's
-            covariance is not known.
+        bound: the clearance is greater than this with a probability of 99 %, shape (m,) [m]; -inf where nothing is known
+            of the thread's covariance.
     """
 
     barrier: str
@@ -84,12 +84,12 @@ class BarrierMargins:
     obstacle: NDArray[np.int32]
     value: NDArray[np.float64]
     clearance: NDArray[np.float64]
-    bound: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]  # NaN
+    bound: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]  # -inf
 
     def __post_init__(self) -> None:
         """Without a bound there is none."""
         if self.bound is None:
-            object.__setattr__(self, "bound", np.full(len(self.clearance), np.nan))
+            object.__setattr__(self, "bound", np.full(len(self.clearance), -np.inf))
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -107,8 +107,8 @@ class BarrierMargins:
 
     @property
     def minimum_bound(self) -> float:
-        """Least bound of all rows [m]; NaN where there is none."""
-        return float(np.fmin.reduce(self.bound, initial=math.nan))
+        """Least bound of all rows [m]; inf where the barrier has no rows."""
+        return float(self.bound.min(initial=math.inf))
 
     @property
     def closest(self) -> int:
@@ -250,7 +250,7 @@ class FrictionLaw:
         obstacle = margins[OBSTACLE]
         clearance = obstacle.clearance
         if self.by_bound:
-            clearance = np.fmin(clearance, obstacle.bound)
+            clearance = np.where(np.isfinite(obstacle.bound), obstacle.bound, clearance)
         close = np.bincount(obstacle.node[clearance < self.threshold], minlength=len(speeds))
         close[0] = 0  # the needle: what holds it back is no friction of the thread
         index = np.flatnonzero(close >= 2)

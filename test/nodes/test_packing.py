@@ -241,7 +241,7 @@ def test_margins_of_an_estimate_have_bounds_and_go_there_and_back():
         assert (read["obstacle"].bound <= read["obstacle"].clearance).all()
         least = {each.barrier: each.clearance_bound for each in message.minimum}
         assert least["obstacle"] == margins["obstacle"].bound.min()
-        assert math.isnan(least["connectivity"])
+        assert least["connectivity"] == -math.inf
     none: Any = deserialize_message(packed_margins(WHEN, None, "no pose"), SafetyMargins)
     assert (none.valid, none.source) == (False, SafetyMargins.OF_NOTHING)
 

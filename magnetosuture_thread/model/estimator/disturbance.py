@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,8 +43,17 @@ class Disturbance:
     since: float
 
     def __str__(self) -> str:
-        """Return it in words, with directions as in the dish frame: right is x, up is y."""
-        return f"held at {1e3 * self.arc_length:.0f} mm of the thread: {_amount(self.force)} {_way(*self.direction)}"
+        """Return it in words."""
+        return disturbance_text(self.arc_length, self.force, self.direction)
+
+
+def disturbance_text(arc_length: float, force: float, direction: Sequence[float] | Points) -> str:
+    """Return a disturbance in words, with directions as in the dish frame: right is x, up is y.
+
+    >>> disturbance_text(0.031, 2e-4, (-1.0, 0.0))
+    'held at 31 mm of the thread: 0.2 mN to the left'
+    """
+    return f"held at {1e3 * arc_length:.0f} mm of the thread: {_amount(force)} {_way(*direction)}"
 
 
 def _amount(force: float) -> str:
