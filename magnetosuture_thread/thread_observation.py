@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
 
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 
 
 class PieceEnd(IntEnum):
@@ -70,3 +70,27 @@ class ThreadObservation:
         if self.pieces and self.pieces[0].first_end is PieceEnd.TAIL:
             return self.pieces[0].points
         return None
+
+    def measured_from(self, offset: float) -> ThreadObservation:
+        """Return the same with arc lengths measured from where the thread is fixed, this far along it from the tail.
+
+        Args:
+            offset: [m]; what a piece that leaves the needle shows before that is no thread. Negative where the thread
+                is fixed in front of the tail, so that it is hidden by the needle at first.
+        """
+        return replace(self, pieces=tuple(_measured_from(piece, offset) for piece in self.pieces))
+
+
+def _measured_from(piece: ThreadPiece, offset: float) -> ThreadPiece:
+    low, high = piece.arc_length
+    if piece.first_end is not PieceEnd.TAIL:
+        return replace(piece, arc_length=(low - offset, high - offset))
+    if offset <= 0.0:
+        return replace(piece, first_end=PieceEnd.COVERED, arc_length=(-offset, -offset))
+    arcs = arc_lengths(piece.points)
+    rest = arcs > offset
+    if not rest.any():
+        return replace(piece, first_end=PieceEnd.UNKNOWN, arc_length=(np.nan, np.nan), confidence=0.0)
+    first = int(rest.argmax())
+    points = np.vstack([points_at(piece.points, np.array([offset])), piece.points[first:]])
+    return replace(piece, points=points, deviation=piece.deviation[first - 1 :], arc_length=(0.0, 0.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ def replay_with_parameters(run: RecordedRun, settings: ThreadModelSettings) -> P
     """
     nothing = np.full((settings.segments + 1, 2), np.nan)
     kept = np.repeat(nothing[None], len(run.frames), axis=0)
+    settings = replace(settings, estimator=False)  # what is fitted is the prediction alone
     slots = {int(frame): slot for slot, frame in enumerate(run.frames)}
     stamps = run.stamps.tolist()
     try:

@@ -246,6 +246,13 @@ class NodeMotion:
         self._last: Points | None = None
         self._velocity: Points | None = None
 
+    @property
+    def speeds(self) -> NDArray[np.float64]:
+        """Each node's speed, shape (n + 1,) [m/s]; empty before the first time."""
+        if self._velocity is None:
+            return np.empty(0)
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", self._velocity, self._velocity)))
+
     def update(self, vertices: Points, interval: float) -> NDArray[np.float64]:
         """Return each node's speed, shape (n + 1,) [m/s].
 
@@ -260,7 +267,7 @@ class NodeMotion:
             share = 1.0 - math.exp(-interval / self._averaging) if self._averaging > 0.0 else 1.0
             velocity = velocity + share * ((vertices - last) / interval - velocity)
         self._last, self._velocity = vertices, velocity
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", velocity, velocity)))
+        return self.speeds
 
     def follow_on(self, other: NodeMotion) -> None:
         """Continue from the motion of the thread that this one replaces."""

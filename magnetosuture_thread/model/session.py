@@ -1,11 +1,11 @@
-"""Streaming thread prediction from needle poses and measured centrelines; the core of the node `thread_model`."""
+"""Streaming prediction and estimation from poses and observations; the core of the node `thread_model`."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
+from magnetosuture_thread.model.estimator import ThreadEstimate
+from magnetosuture_thread.model.estimator.session import observation_of
 from magnetosuture_thread.model.margins import FrictionLaw, Margins
 from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction
 from magnetosuture_thread.model.settings import ThreadModelSettings
@@ -30,36 +32,48 @@ _OBSTACLES = (Disc((0.0, 0.0), 1e-3), Polygon(((0.0, 0.0), (1e-3, 0.0), (0.0, 1e
 
 @dataclass(frozen=True)
 class PredictionResult:
-    """What came of one needle pose.
+    """What came of one needle pose, or of an observation that came after the pose of its frame.
 
     Attributes:
         stamp: of the pose [ns].
-        prediction: of the thread; None where there is none.
+        prediction: of the thread by the model alone; None where there is none.
         problem: why there is none; None while the thread is waited for.
+        estimate: the thread by model and camera; None until the camera has measured the thread, and where thread or
+            settings are not for the estimator.
+        estimate_problem: why there is none, or why an observation was refused; None if nothing is wrong.
+        late: whether an observation came after the pose of this stamp. There is no new prediction then, and the
+            estimate takes the place of the one before.
         scene_version: of the scene in force; empty where there is none.
         law: of friction.
-        speeds: of each node, shape (n + 1,) [m/s]; empty where there is no prediction.
+        speeds: of each node of the estimate, else of the prediction, shape (n + 1,) [m/s]; empty where there is none.
     """
 
     stamp: int
     prediction: Prediction | None = None
     problem: InvalidInputError | SolverError | None = None
+    estimate: ThreadEstimate | None = None
+    estimate_problem: InvalidInputError | SolverError | None = None
+    late: bool = False
     scene_version: str = ""
     law: FrictionLaw | None = field(default=None, repr=False, compare=False)
     speeds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
 
     @cached_property
     def margins(self) -> Margins | None:
-        """All margins, with the friction; None where they prove nothing, as the step did not converge."""
-        if self.prediction is None or self.law is None or not self.prediction.converged:
+        """All margins, with the friction; None where they prove nothing, as the step did not converge.
+
+        Of the estimate where there is one, with their bounds; else of the prediction.
+        """
+        thread = self.prediction if self.estimate is None else self.estimate
+        if thread is None or self.law is None or not thread.converged:
             return None
-        margins = self.prediction.margins
+        margins = thread.margins
         return margins.with_friction(self.law.classify(margins, self.speeds))
 
     @property
     def waiting(self) -> bool:
         """Whether the pose waits for the first measured thread."""
-        return self.prediction is None and self.problem is None
+        return self.prediction is None and self.problem is None and not self.late
 
 
 class InitialObservation:
@@ -100,10 +114,12 @@ class InitialObservation:
 
 
 class ThreadSession:
-    """Predicts the thread over one run: starts from its first measured centreline, then follows the poses.
+    """Predicts and estimates the thread over one run.
 
-    The node `thread_model` and the replay without a graph are both a shell around this, so that the same poses
-    give the same predictions to the last bit.
+    The prediction starts from the first measured centreline, and follows the poses alone after. The estimate, by an
+    estimator with a predictor of its own, is corrected by every observation; see `EstimatorSession`. The node
+    `thread_model` and the replay without a graph are both a shell around this, so that the same poses and
+    observations give the same predictions and estimates to the last bit.
 
     Args:
         settings: of thread and liquid.
@@ -120,13 +136,17 @@ class ThreadSession:
     def __init__(self, settings: ThreadModelSettings, scene: Scene | None) -> None:
         self.settings, self.scene = settings, scene
         self._predictor = settings.predictor(scene)
+        self._estimator = settings.estimator_session(scene)
+        self._last_pose: int | None = None  # stamp of the last pose of the estimate [ns]
+        self._late_estimates: list[PredictionResult] = []
+        self._measured = False  # whether the camera ever measured the thread that is estimated
         # Obstacles may come later, and no callback shall wait for the compiler of what they need.
         Workspace(_OBSTACLES, settings.margin_range)
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
         self._initial_observation = InitialObservation()
-        self._motion = settings.node_motion()
+        self._motion, self._estimate_motion = settings.node_motion(), settings.node_motion()
 
     @property
     def thread(self) -> Thread:
@@ -149,12 +169,18 @@ class ThreadSession:
         """
         if settings == self.settings and scene == self.scene:
             return lambda: None
-        predictor, motion = settings.predictor(scene), settings.node_motion()
+        predictor, estimator = settings.predictor(scene), settings.estimator_session(scene)
+        motion, estimate_motion = settings.node_motion(), settings.node_motion()
 
         def put_in_force() -> None:
             predictor.follow_on(self._predictor)
             motion.follow_on(self._motion)
+            estimate_motion.follow_on(self._estimate_motion)
+            if estimator is not None and self._estimator is not None:
+                estimator.follow_on(self._estimator)
             self.settings, self.scene, self._predictor, self._motion = settings, scene, predictor, motion
+            self._estimator, self._estimate_motion = estimator, estimate_motion
+            self._measured = self._measured and estimator is not None
 
         return put_in_force
 
@@ -166,34 +192,46 @@ class ThreadSession:
         """
         self.prepare(settings, scene)()
 
+    @property
+    def estimates(self) -> bool:
+        """Whether the thread is estimated too, and every observation of it needed."""
+        return self._estimator is not None
+
     def needs_measured_thread(self, stamp: int) -> bool:
-        """Return whether a measured thread of this stamp [ns] is needed; most are not."""
+        """Return whether the prediction needs a measured thread of this stamp [ns] to start from; most are not."""
         if self.settings.initial_shape != "measured":
             return False
         return not self._predictor.started or self._last is None or stamp < self._last - MAX_LATENESS
 
     def on_measured_thread(self, stamp: int, centreline: Points) -> Iterator[PredictionResult]:
-        """Start from a thread that the camera measured.
+        """Take a thread that the camera measured: whole, or a part from the needle on.
 
         Args:
             stamp: of the frame [ns].
-            centreline: from the needle's tail on, shape (m, d) [m].
+            centreline: from the needle's tail on, shape (m, 2) [m].
 
         Returns:
-            What comes of the poses that waited for it, each worked out when it is asked for.
+            What comes of the poses that waited for it, each worked out when it is asked for. What comes of the
+            estimate is returned by `late_estimates`, if the pose of the frame came before, else by `on_pose`.
         """
+        deviation, length = self.settings.estimator_path_deviation, self.settings.thread_length
+        self._correct(stamp, observation_of(centreline, length, deviation))
+        return self._start_from(stamp, centreline)
+
+    def _start_from(self, stamp: int, centreline: Points) -> Iterator[PredictionResult]:
         if not self.needs_measured_thread(stamp):
             return iter(())
         self._seen = (stamp, centreline)
         # The pose of the same frame may have come first, and others after it.
         early = [(at, pose) for at, pose in self._early if at >= stamp]
         self._early.clear()
-        return (self.on_pose(at, pose) for at, pose in early)
+        return (self._predicted(at, pose) for at, pose in early)
 
     def on_observation(self, stamp: int, observation: ThreadObservation) -> Iterator[PredictionResult]:
-        """Start from what the camera sees of the thread: from all of it, or after a while from a part.
+        """Take what the camera sees of the thread.
 
-        See `InitialObservation`; what is missing of a part goes on straight, see `ThreadPredictor.start`.
+        The prediction starts from all of it, or after a while from a part, see `InitialObservation`; what is missing
+        of a part goes on straight, see `ThreadPredictor.start`.
 
         Args:
             stamp: of the frame [ns].
@@ -202,12 +240,40 @@ class ThreadSession:
         Returns:
             See `on_measured_thread`.
         """
-        if not self.needs_measured_thread(stamp):
-            return iter(())
-        points = self._initial_observation.shape(stamp, observation)
-        if points is None:
-            return iter(())
-        return self.on_measured_thread(stamp, points)
+        self._correct(stamp, observation)
+        points = self._initial_observation.shape(stamp, observation) if self.needs_measured_thread(stamp) else None
+        return iter(()) if points is None else self._start_from(stamp, points)
+
+    def late_estimates(self) -> list[PredictionResult]:
+        """Return, once, what came of observations that came after the poses of their frames, or were refused.
+
+        Of each observation the estimate at its stamp, and the one at the last pose.
+        """
+        late, self._late_estimates = self._late_estimates, []
+        return late
+
+    def _correct(self, stamp: int, observation: ThreadObservation) -> None:
+        """Correct the estimate by an observation; one that comes before the pose of its frame waits for that."""
+        if self._estimator is None:
+            return
+        found = self._estimator.on_observation(stamp * 1e-9, self.settings.attached_observation(observation))
+        if found.measured is not None and found.estimate is not None and self._last_pose is not None:
+            self._measured = self._measured or math.isfinite(found.estimate.unmeasured_for)
+            changed = {stamp: found.measured, self._last_pose: found.estimate}
+            self._late_estimates += [self._late(at, estimate) for at, estimate in changed.items()]
+        if found.problem is not None:
+            self._late_estimates.append(replace(self._late(stamp, None), estimate_problem=found.problem))
+
+    def _late(self, stamp: int, estimate: ThreadEstimate | None) -> PredictionResult:
+        measured = estimate is not None and math.isfinite(estimate.unmeasured_for)
+        return PredictionResult(
+            stamp,
+            estimate=estimate if measured else None,
+            late=True,
+            scene_version=self.scene_version,
+            law=self.settings.friction_law(),
+            speeds=self._estimate_motion.speeds,
+        )
 
     def on_pose(self, stamp: int, pose: NeedlePose) -> PredictionResult:
         """Follow the needle to a pose.
@@ -216,6 +282,25 @@ class ThreadSession:
             stamp: of the frame [ns]; `pose.stamp` is the same in seconds.
             pose: as tracked; where the thread is fixed to it, `attachment_offset` says.
         """
+        result = self._predicted(stamp, pose)
+        if self._estimator is None:
+            return result
+        attached = self.settings.attachment_pose(pose)
+        found = self._estimator.on_pose(attached)
+        if isinstance(found.problem, SolverError) and not self._measured:
+            # The thread has been laid straight behind the needle, where a shape or the wall may be; begin anew here.
+            self._estimator.reset()
+            found = self._estimator.on_pose(attached)
+        if found.estimate is None:
+            return replace(result, estimate_problem=found.problem)
+        self._last_pose = stamp
+        speeds = self._estimate_motion.update(found.estimate.positions, found.estimate.prediction.interval)
+        self._measured = math.isfinite(found.estimate.unmeasured_for)
+        if not self._measured:
+            return result
+        return replace(result, estimate=found.estimate, law=self.settings.friction_law(), speeds=speeds)
+
+    def _predicted(self, stamp: int, pose: NeedlePose) -> PredictionResult:
         if self._last is not None and stamp < self._last - MAX_LATENESS:
             self._predictor.reset()
             self._last = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
 from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
@@ -18,6 +19,7 @@ from magnetosuture_thread.model.solvers import SOLVERS, make_solver
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.thread_observation import ThreadObservation
 
 MEDIA = ("liquid", "air")
 OF_MEDIUM = {
@@ -35,6 +37,7 @@ FIXED = {  # why a node cannot change it
     "barriers": "what is imported when it starts",
     "scene": "what it starts with; the topic scene changes it",
 }
+_OPTIONS = EstimatorOptions()  # their defaults
 MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
@@ -171,6 +174,60 @@ class ThreadModelSettings(Configuration):
         maximum=10.0,
     )
 
+    estimator: bool = quantity(
+        True, "whether the thread is estimated too: the model corrected by the camera; for rod in liquid"
+    )
+    estimator_error_correlation: float = quantity(
+        _OPTIONS.error_correlation,
+        "distance along the thread over which the model's errors are alike, as a part of its length",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    estimator_point_correlation: float = quantity(
+        _OPTIONS.point_correlation,
+        "distance along the thread over which the errors of measured points are alike",
+        unit="m",
+        minimum=1e-6,
+        maximum=0.1,
+    )
+    estimator_min_deviation: float = quantity(
+        _OPTIONS.min_deviation,
+        "standard deviation of a measured point, at the least",
+        unit="m",
+        minimum=1e-7,
+        maximum=0.01,
+    )
+    estimator_path_deviation: float = quantity(
+        2e-5,
+        "standard deviation of the points of thread/measured, used where nobody publishes thread/observation",
+        unit="m",
+        minimum=1e-7,
+        maximum=0.01,
+    )
+    estimator_noise_time: float = quantity(
+        _OPTIONS.noise_time,
+        "time over which it is learned by how much the model errs",
+        unit="s",
+        minimum=0.05,
+        maximum=100.0,
+    )
+    estimator_initial_error: float = quantity(
+        _OPTIONS.initial_error,
+        "standard deviation of the free end before it is measured, as a part of the thread's length",
+        minimum=1e-3,
+        maximum=2.0,
+    )
+    estimator_disturbance_time: float = quantity(
+        _OPTIONS.disturbance_time,
+        "averaging time of the test for forces that the model does not know",
+        unit="s",
+        minimum=0.05,
+        maximum=10.0,
+    )
+    estimator_history: float = quantity(
+        _OPTIONS.history, "how late an observation of the thread may come", unit="s", minimum=0.05, maximum=5.0
+    )
+
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
         if self.friction_threshold > self.margin_range:
@@ -238,6 +295,10 @@ class ThreadModelSettings(Configuration):
         x, y = pose.heading
         return replace(pose, tail=pose.tail + np.array([along * x - left * y, along * y + left * x]))
 
+    def attached_observation(self, observation: ThreadObservation) -> ThreadObservation:
+        """Return an observation whose arc lengths are measured from where the thread is fixed."""
+        return observation.measured_from(-self.attachment_offset[0]) if self.attachment_offset else observation
+
     def predictor(self, scene: Scene | None) -> ThreadPredictor:
         """Return a predictor of this thread in a scene, its kernels compiled.
 
@@ -264,6 +325,22 @@ class ThreadModelSettings(Configuration):
         )
         predictor.warm_up()
         return predictor
+
+    def estimator_session(self, scene: Scene | None) -> EstimatorSession | None:
+        """Return an estimator of this thread in a scene, its kernels compiled; None where it is not estimated.
+
+        Args:
+            scene: dish and obstacles; None for neither.
+
+        Raises:
+            ConfigurationError: see `predictor`.
+        """
+        if not self.estimator or self.formulation != "rod" or self.medium != "liquid":
+            return None
+        options = {about.name: getattr(self, f"estimator_{about.name}") for about in fields(EstimatorOptions)}
+        estimator = ThreadEstimator(self.predictor(scene), EstimatorOptions(**options))
+        estimator.warm_up()
+        return EstimatorSession(estimator)
 
     def friction_law(self) -> FrictionLaw:
         """Return the friction law."""

@@ -134,6 +134,15 @@ class DisturbanceTest:
         other._rate = self._rate.copy()
         return other
 
+    def resampled(self, thread: Thread, time: float) -> DisturbanceTest:
+        """Return the same test of another thread, or with another averaging time [s]."""
+        other = copy.copy(self)
+        other._thread, other._time = thread, time
+        nodes = self._thread.segment_length * np.arange(self._thread.segments + 1)
+        at = thread.segment_length * np.arange(thread.segments + 1)
+        other._rate = np.column_stack([np.interp(at, nodes, along) for along in self._rate.T])
+        return other
+
     def decay(self, interval: float) -> None:
         """Let time pass [s]."""
         self._rate *= math.exp(-interval / self._time)

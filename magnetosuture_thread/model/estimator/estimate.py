@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,9 +14,11 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.model.estimator.innovations import Innovations
 from magnetosuture_thread.model.estimator.noise import NoiseModel
+from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.formulations import ThreadState
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.model.thread import Thread
 
 Vector = NDArray[np.float64]
 
@@ -115,3 +117,23 @@ class FilterState:
     measured_at: float
     gross: int
     unknown: bool
+
+    def resampled(self, before: Thread, thread: Thread, options: EstimatorOptions) -> FilterState:
+        """Return the state of the filter of another thread that takes this one's place.
+
+        Args:
+            before: the thread that this is the state of.
+            thread: the thread that takes its place.
+            options: of its estimator.
+        """
+        old, new = before.segment_length, thread.segment_length
+        nodes, at = old * np.arange(before.segments + 1), new * np.arange(thread.segments + 1)
+        scale = (old / new) ** 2
+        return replace(
+            self,
+            thread=self.thread.resampled(before, thread),
+            density=scale * np.interp(at, nodes, self.density),
+            variance=scale * np.interp(at, nodes, self.variance),
+            noise=self.noise.copied(options.noise_time),
+            test=self.test.resampled(thread, options.disturbance_time),
+        )

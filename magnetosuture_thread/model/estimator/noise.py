@@ -149,10 +149,11 @@ class NoiseModel:
         self._time_constant, self._learned_for = time_constant, 0.0
         self._last_mean, self._last_variance = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)
 
-    def copied(self) -> NoiseModel:
-        """Return a copy."""
+    def copied(self, time_constant: float | None = None) -> NoiseModel:
+        """Return a copy, that learns over another time if one is given [s]."""
         other = copy.copy(self)
         other.bank, other.intensity = self.bank.copied(), self.intensity.copy()
+        other._time_constant = self._time_constant if time_constant is None else time_constant
         return other
 
     def learn(self, sums: WindowSums, unit: float, elapsed: float) -> Innovations:

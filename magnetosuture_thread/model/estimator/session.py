@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
 from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 MAX_LATENESS = 1.0  # s; a pose older by more than this is not late: time itself was set back
@@ -63,6 +63,24 @@ class EstimatorSession:
         self._estimator.reset()
         self._moments.clear()
         self._early.clear()
+
+    def follow_on(self, other: EstimatorSession) -> None:
+        """Continue from the estimate of another session, of another thread, scene or other options.
+
+        Observations of frames before its last pose are too late from then on.
+        """
+        self.reset()
+        self._early = dict(other._early)
+        before, now = other._estimator, self._estimator
+        kept = before.snapshot()
+        if kept is None:
+            return
+        moment = other._moments[-1]
+        state = kept.resampled(before.thread, now.thread, now.options)
+        prediction = replace(state.prediction, scene_version=now.predictor.scene_version)
+        # The multipliers of other rows are no warm start.
+        now.restore(replace(state, prediction=prediction, warm_start=now.predictor.formulation.warm_start()))
+        self._moments.append(_Moment(moment.pose, moment.observation, now.snapshot()))
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
         """Start from a shape that is given; without it, straight behind the needle."""
@@ -162,7 +180,8 @@ def observation_of(centreline: Points, length: float, deviation: float) -> Threa
         deviation: of each point across it [m].
     """
     points = np.asarray(centreline, dtype=np.float64).reshape(-1, 2)
-    along = float(np.hypot(*np.diff(points, axis=0).T).sum()) if len(points) > 1 else 0.0
+    fit = len(points) > 1 and bool(np.all(np.abs(points) <= MAX_COORDINATE))  # another is refused by the estimator
+    along = float(arc_lengths(points)[-1]) if fit else 0.0
     complete = along > 0.97 * length
     last = PieceEnd.FREE if complete else PieceEnd.UNKNOWN
     piece = ThreadPiece(points, np.full(len(points), deviation), PieceEnd.TAIL, last, (0.0, 0.0))

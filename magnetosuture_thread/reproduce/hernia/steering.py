@@ -72,7 +72,7 @@ class SteeredThread:
     """
 
     def __init__(self, settings: ThreadModelSettings, centreline: Points, needle: NeedleSafetyFilter) -> None:
-        self._session = ThreadSession(replace(settings, initial_shape="measured"), needle.scene)
+        self._session = ThreadSession(replace(settings, initial_shape="measured", estimator=False), needle.scene)
         self._needle = needle
         self._stamp = 0
         self._tail = np.asarray(centreline[0], dtype=np.float64)
