@@ -20,6 +20,7 @@ from magnetosuture_thread.evaluation.estimation import (
 )
 from magnetosuture_thread.evaluation.frames import (
     MARGIN,
+    MIN_DISTANCE,
     WORST_ESTIMATES,
     WORST_FRAMES,
     Array,
@@ -319,8 +320,12 @@ class RunMetrics:
         return self._maps.get(("estimate", self.target))
 
     def worst_frames(self) -> list[WorstFrame]:
-        """Return the frames with the greatest errors of prediction, then of estimate, each the worst first."""
-        return [frame for kind in KINDS if self.target for frame in self._worst[kind, self.target].found()]
+        """Return the frames with the greatest errors of prediction, then of estimate, all apart; each the worst first."""
+        found: list[WorstFrame] = []
+        for kind in KINDS if self.target else ():
+            worst = self._worst[kind, self.target].found()
+            found += [each for each in worst if all(abs(each.time - other.time) >= MIN_DISTANCE for other in found)]
+        return found
 
     @property
     def worst_measured(self) -> FrameResult | None:

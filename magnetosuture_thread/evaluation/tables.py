@@ -200,7 +200,8 @@ def bags_table(rows: Sequence[Row]) -> Table:
             _shown(row["least_obstacle_m"], micrometres),
             _shown(row["step_median_s"], milliseconds),
         )
-        table.add_row(Text("  prediction", style="dim"), "", *_errors_shown(row["prediction"]))
+        errors = [row[f"error_{target}_{which}_percent"] for target in AGAINST for which in ("mean", "max")]
+        table.add_row(Text("  prediction", style="dim"), "", *(_shown(error, format_number) for error in errors))
     table.add_section()
     found = compared(rows)
     table.add_row("all bags", "", *_errors_shown(found["estimate"]))
