@@ -139,8 +139,8 @@ class Consistency:
         with np.errstate(invalid="ignore"):
             means = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
         low, high = mean_band(np.where(count > 0, count, np.nan))
-        begins = first + width * np.arange(windows)
-        return cls(begins, width, means, low, high, float((squared * counts).sum() / counts.sum()))
+        begins = first + width * np.arange(windows, dtype=np.float64)
+        return cls(np.asarray(begins), width, means, low, high, float((squared * counts).sum() / counts.sum()))
 
     @property
     def ends(self) -> Array:

@@ -296,7 +296,7 @@ class LoopCollector:
             raise GraphError(f"the needle was tracked in no frame; {said}")
         self.instants = self._threads.frames(first, last)
         metrics = self._threads.metrics(frames=self.instants)
-        errors = metrics.errors()
+        errors, compared = metrics.errors(), compare_errors(metrics.series)
         apart = np.array([self._tracked[stamp] - self._truth[stamp] for stamp in both])
         tail = np.hypot(apart[:, 0], apart[:, 1])
         heading = np.abs(np.angle(np.exp(1j * apart[:, 2])))
@@ -323,7 +323,8 @@ class LoopCollector:
             error_seen=errors["seen"],
             seen_share=metrics.mean("seen_share"),
             stretch=metrics.maximum("strain"),
-            **compare_errors(metrics.series),
+            prediction=compared["prediction"],
+            estimate=compared["estimate"],
         )
 
     def _tip(self, stamp: int) -> Points:

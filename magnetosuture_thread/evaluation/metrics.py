@@ -22,7 +22,6 @@ from magnetosuture_thread.evaluation.frames import (
     MARGIN,
     MIN_DISTANCE,
     WORST_ESTIMATES,
-    WORST_FRAMES,
     Array,
     ErrorMap,
     FrameResult,
@@ -37,7 +36,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
-KINDS = {"prediction": WORST_FRAMES, "estimate": WORST_ESTIMATES}  # of threads, and how many worst frames are shown
+KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
 END_TOLERANCE = 1e-3  # of the length; the chords of a curve are always a little short, and its free end counts
 BATCH = 128  # frames that are compared together
@@ -161,12 +160,6 @@ def mean_over_nodes(errors: Array, known: NDArray[np.bool_]) -> Array:
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def max_over_nodes(errors: Array, means: Array) -> Array:
-    """Return the greatest of the errors of each frame, shape (b, n); nan where their mean is."""
-    greatest = np.where(np.isfinite(errors), errors, -np.inf).max(axis=-1)
-    return np.asarray(np.where(np.isfinite(means), greatest, np.nan))
-
-
 def prediction_errors(vertices: Points, curves: Sequence[Points], length: float) -> tuple[Array, Array, Array]:
     """Return how far predictions are from threads, in % of the thread's length.
 
@@ -255,9 +248,7 @@ class RunMetrics:
         self._length, self._start = length, start
         self._minimum: dict[str, MinimumMargin] = {}
         self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
-        self._worst = {
-            (kind, target): WorstFrames(count, of=kind) for kind, count in KINDS.items() for target in self.targets
-        }
+        self._worst = {(kind, target): WorstFrames(of=kind) for kind in KINDS for target in self.targets}
         self.disturbances = DisturbanceLog()
         self._fresh: list[FrameResult] = []
         self._first: FrameResult | None = None
@@ -320,12 +311,12 @@ class RunMetrics:
         return self._maps.get(("estimate", self.target))
 
     def worst_frames(self) -> list[WorstFrame]:
-        """Return the frames with the greatest errors of prediction, then of estimate, all apart; each the worst first."""
-        found: list[WorstFrame] = []
-        for kind in KINDS if self.target else ():
-            worst = self._worst[kind, self.target].found()
-            found += [each for each in worst if all(abs(each.time - other.time) >= MIN_DISTANCE for other in found)]
-        return found
+        """Return the frames with the greatest errors of prediction, then of estimate, each time the worst first."""
+        if not self.target:
+            return []
+        found, others = (self._worst[kind, self.target].found() for kind in KINDS)
+        apart = [each for each in others if all(abs(each.time - one.time) >= MIN_DISTANCE for one in found)]
+        return found + apart[:WORST_ESTIMATES]
 
     @property
     def worst_measured(self) -> FrameResult | None:
@@ -366,36 +357,27 @@ class RunMetrics:
         if not frames:
             return
         self._first = self._first or frames[0]
-        vertices, estimated = np.stack([frame.vertices for frame in frames]), estimated_nodes(frames)
+        threads = {"prediction": np.stack([frame.vertices for frame in frames]), "estimate": estimated_nodes(frames)}
         rows = [frame.columns() | {"hidden": hidden_part(frame, self._length)} for frame in frames]
         for target in TARGETS:
             curves = [frame.target_curve(target) for frame in frames]
-            means, errors, shares = prediction_errors(vertices, curves, self._length)
-            of_estimate, estimate_errors, _ = prediction_errors(estimated, curves, self._length)
-            columns = {
-                f"error_{target}": means,
-                f"estimate_error_{target}": of_estimate,
-                f"max_node_error_{target}": max_over_nodes(errors, means),
-                f"max_node_estimate_error_{target}": max_over_nodes(estimate_errors, of_estimate),
-            }
+            compared = {kind: prediction_errors(nodes, curves, self._length) for kind, nodes in threads.items()}
             for index, (frame, row) in enumerate(zip(frames, rows, strict=True)):
                 if target == "seen":
-                    row["seen_share"] = float(shares[index])
+                    row["seen_share"] = float(compared["prediction"][2][index])
                 if target not in self.targets:
                     continue
-                row |= {name: float(values[index]) for name, values in columns.items()}
+                for kind, (means, errors, _) in compared.items():
+                    mean, time, column = float(means[index]), self._time(frame.stamp), f"{KINDS[kind]}error_{target}"
+                    row[column] = mean
+                    if math.isfinite(mean):
+                        row[f"max_node_{column}"] = float(np.nanmax(errors[index]))
+                        self._maps[kind, target].add(time, errors[index].copy())
+                        self._worst[kind, target].add(time, mean, frame)
                 frame.errors[target] = row[f"error_{target}"]
                 if frame.recorded is not None:
                     error = prediction_error_percent(frame.recorded, curves[index], self._length)
                     row[f"recorded_error_{target}"] = error
-                time = self._time(frame.stamp)
-                for kind, mean, nodes in (
-                    ("prediction", means, errors),
-                    ("estimate", of_estimate, estimate_errors),
-                ):
-                    if math.isfinite(mean[index]):
-                        self._maps[kind, target].add(time, nodes[index].copy())
-                        self._worst[kind, target].add(time, float(mean[index]), frame)
         for frame, row in zip(frames, rows, strict=True):
             self._series.add(self._time(frame.stamp), row)
 

@@ -158,7 +158,9 @@ def draw_threads(
     clearance = np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, FULL_CLEARANCE_MM)
     norm = Normalize(0.0, FULL_CLEARANCE_MM)
     size = 9.0 * magnified**2
-    return axes.scatter(*nodes.T, s=size, c=clearance, cmap=MARGIN_COLOURS, norm=norm, linewidths=0.0, zorder=2.5)
+    return axes.scatter(
+        nodes[:, 0], nodes[:, 1], s=size, c=clearance, cmap=MARGIN_COLOURS, norm=norm, linewidths=0.0, zorder=2.5
+    )
 
 
 def _draw_close_up(

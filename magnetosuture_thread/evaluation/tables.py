@@ -215,7 +215,8 @@ def _errors_shown(errors: Any) -> list[str]:
 
 
 def _silence(row: Row) -> tuple[float, float]:
-    return float(row["silent_s"] or 0.0), float(row["max_silence_s"] or 0.0)
+    total, longest = (own if isinstance(own := row[name], float) else 0.0 for name in ("silent_s", "max_silence_s"))
+    return total, longest
 
 
 def _shown(value: Any, how: Callable[[float], str]) -> str:

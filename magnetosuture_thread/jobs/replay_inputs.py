@@ -209,7 +209,7 @@ def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> Repla
         metrics: of its predictions, of which there are some.
         others: the fields of `ReplaySummary` that these do not give.
     """
-    errors = metrics.errors()
+    errors, compared = metrics.errors(), compare_errors(metrics.series)
     return ReplaySummary(
         bag=str(given.recording.path),
         setup=given.setup.name,
@@ -227,7 +227,8 @@ def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> Repla
         damage=str(given.recording.damage or ""),
         unverified=given.recording.unverified,
         estimation=metrics.estimation,
-        **compare_errors(metrics.series),
+        prediction=compared["prediction"],
+        estimate=compared["estimate"],
         **others,
     )
 
