@@ -15,9 +15,14 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
                   "view": {"centre": [u, v], "scale": m_per_px, "rotation": rad} | None, "age": s} | None,
       "measured": [[x, y], ...],       # the measured centreline, may be empty
       "predicted": {"vertices": [[x, y], ...], "residual": float, "step_time": float, "status": str, "age": s} | None,
-      "margins": {"valid": bool, "reason": str,
+      "estimated": {"vertices": [[x, y], ...], "deviation": [m, ...],   # of each vertex across the thread
+                    "prediction_only": bool, "unmeasured_for": s, "hidden": share,
+                    "disturbances": [{"position": [x, y], "direction": [x, y], "force": N, "text": str}, ...],
+                    "age": s} | None,
+      "margins": {"valid": bool, "of": "estimate|prediction|nothing", "reason": str,
                   "clearance": [float | None, ...],   # of each node, minimum over wall and shapes; None: none near
                   "least": {"connectivity": m, "compression": m, "obstacle": m, ...},   # of the kinds present
+                  "bound": m | None,   # least of the 99 % bounds of all clearances
                   "contact": [node, ...],
                   "friction": {"state": "unknown|free|pulled|resting", "nodes": [int], "slowdown": float}} | None,
       "filter": {"source": "operator|needle|", "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy],

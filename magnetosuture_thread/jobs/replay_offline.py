@@ -16,6 +16,7 @@ from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.interface import (
+    ESTIMATED_THREAD,
     MARGINS,
     MEASURED_THREAD,
     NEEDLE_POSE,
@@ -36,6 +37,7 @@ from magnetosuture_thread.jobs.replay_inputs import (
 )
 from magnetosuture_thread.messages.cdr import time_of
 from magnetosuture_thread.messages.packing import (
+    packed_estimate,
     packed_margins,
     packed_observation,
     packed_path,
@@ -62,9 +64,9 @@ def replay_offline(
     """Put a bag through tracker and model without a graph, and evaluate the predictions.
 
     `output` is made at the end, whole or not at all: `bag/`, `summary.json` and `summary.png`. The bag holds pose,
-    what is seen of the thread, prediction and margins, each logged at its own stamp, with the numbers of the live
-    graph. Two runs write it alike to the last bit: times that steps took are in the summary alone. The coil bridge
-    has no part in it: what it does depends on real time.
+    what is seen of the thread, prediction, estimate and margins, each logged at its own stamp, with the numbers of
+    the live graph. Two runs write it alike to the last bit: times that steps took are in the summary alone. The coil
+    bridge has no part in it: what it does depends on real time.
 
     Args:
         bag_path: a bag.
@@ -109,6 +111,8 @@ def replay_offline(
                     metrics.add(frame)
                 elif step.result.problem is not None:
                     refused[_kind(step.result.problem)] += 1
+                elif step.result.late and step.result.estimate_problem is not None:
+                    refused[_kind(step.result.estimate_problem)] += 1
             speed = given.duration / (time.perf_counter() - began)
         log(f"{speed:.3g} times as fast as it was recorded; evaluating the outputs")
         summary = _summary(given, seen, metrics, refused, speed)
@@ -170,21 +174,24 @@ class _Output:
         by_tracker = [TRACKER_STATE, THREAD_OBSERVATION] if seen.source == "camera" else []
         if seen.source == "poses" and given.recording.counts.get(THREAD_OBSERVATION.recorded):
             by_tracker = [THREAD_OBSERVATION]
-        for channel in (NEEDLE_POSE, *by_tracker, MEASURED_THREAD, PREDICTED_THREAD, MARGINS):
+        for channel in (NEEDLE_POSE, *by_tracker, MEASURED_THREAD, PREDICTED_THREAD, ESTIMATED_THREAD, MARGINS):
             bag.add_topic(channel.recorded, channel.type_name)
         self._version = given.setup.scene.version
         seen.on_frame, seen.on_record = self._frame, self._record
 
     def write(self, step: Step) -> None:
-        """Write the prediction of an observation."""
-        stamp, result, prediction = step.result.stamp, step.result, step.result.prediction
-        if prediction is not None:
-            packed = packed_prediction(time_of(stamp), prediction, step.settings.material)
+        """Write prediction, estimate and margins of an observation."""
+        stamp, result = step.result.stamp, step.result
+        when = time_of(stamp)
+        if result.prediction is not None:
+            packed = packed_prediction(when, result.prediction, step.settings.material)
             self._bag.write(PREDICTED_THREAD.recorded, max(stamp, 0), packed)
-        if isinstance(result.problem, InvalidInputError):
-            return  # as live: a pose that is refused gets no answer
-        reason = WAITING if result.waiting else str(result.problem) if prediction is None else prediction.status
-        packed = packed_margins(time_of(stamp), step.margins, reason, result.scene_version)
+        if result.refused is not None or result.late:
+            return  # as live: a pose that is refused gets no answer, nor does an observation
+        if result.estimate is not None:
+            self._bag.write(ESTIMATED_THREAD.recorded, max(stamp, 0), packed_estimate(when, result.estimate))
+        of_estimate, reason = result.estimate is not None, "" if step.margins else result.reason
+        packed = packed_margins(when, step.margins, reason, result.scene_version, of_estimate=of_estimate)
         self._bag.write(MARGINS.recorded, max(stamp, 0), packed)
 
     def _frame(self, stamp: int, seen: FrameMeasurement) -> None:

@@ -1,18 +1,16 @@
-"""Packs the messages of every pose as CDR bytes, each with one format: pose, path, prediction, margins, markers."""
+"""Packs the messages of every pose as CDR bytes: pose, path, prediction, estimate, margins, markers."""
 
 from __future__ import annotations
 
 import struct
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
 from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.messages.building import ADD, IN_PLANE, LINE_STRIP
+from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import (
     BEGIN,
     DISH,
@@ -20,7 +18,6 @@ from magnetosuture_thread.messages.cdr import (
     HEADER,
     KEPT,
     REAL,
-    Text,
     Time,
     array_codes,
     form,
@@ -28,12 +25,15 @@ from magnetosuture_thread.messages.cdr import (
     points_of,
     text,
     text_codes,
+    time_of,
 )
-from magnetosuture_thread.model.margins import UNKNOWN, FrictionState, Margins, friction_colour
+from magnetosuture_thread.model.estimator import ThreadEstimate
+from magnetosuture_thread.model.margins import FrictionState, Margins
 from magnetosuture_thread.model.predictor import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 _UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
+_OF_NOTHING, _OF_PREDICTION, _OF_ESTIMATE = 0, 1, 2
 _BARRIER, _NODE, _OBSTACLE = (np.dtype(code) for code in ("u1", "<u4", "<i4"))
 _PLACES = [6 * row + column for row in IN_PLANE for column in IN_PLANE]
 _POSE = form(*HEADER, *"d" * 7, *"d" * 36)
@@ -47,12 +47,7 @@ _STAMPED = np.dtype(
         "itemsize": 80,
     }
 )
-SPHERE_LIST, TEXT_VIEW_FACING = 7, 9  # as in Marker.msg
-TEXT_HEIGHT, LINE_HEIGHT = 8e-4, 1e-3  # m
-LIFETIME = 500_000_000  # ns of a barrier's text; poses come far more often
-SEGMENT_BARRIERS = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
-_THREAD, _MARGINS = text("thread"), text("margins")
-_INK, _RED = (0.1, 0.13, 0.16, 1.0), (0.78, 0.06, 0.18, 1.0)
+MAX_PROBLEMS = 8  # of a frame that are published
 
 
 def packed_pose(
@@ -143,20 +138,73 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
     )
 
 
-def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_version: str = "") -> bytes:
+def packed_estimate(time: Time, estimate: ThreadEstimate) -> bytes:
+    """Return an EstimatedThread.
+
+    Args:
+        time: of the frame, seconds and nanoseconds.
+        estimate: of the thread at the same time.
+    """
+    positions, disturbances = estimate.positions, estimate.disturbances
+    scene, problems = text(estimate.prediction.scene_version), [text(why) for why in estimate.problems[:MAX_PROBLEMS]]
+    square, degrees = (0.0, 0) if estimate.innovations is None else estimate.innovations.total
+    sizes = tuple(size for size, _ in problems)
+    return BEGIN + _estimate_form(scene[0], len(positions), len(disturbances), sizes).pack(
+        *time,
+        *DISH,
+        *scene,
+        len(positions),
+        points_of(positions),
+        len(positions),
+        numbers(estimate.deviation, REAL),
+        4 * len(positions),
+        numbers(estimate.covariance, REAL),
+        not estimate.corrected,
+        estimate.unmeasured_for,
+        estimate.hidden,
+        estimate.points,
+        square,
+        degrees,
+        len(disturbances),
+        *[
+            part
+            for found in disturbances
+            for part in (
+                found.arc_length,
+                found.extent,
+                *found.position,
+                0.0,
+                *found.direction,
+                0.0,
+                found.force,
+                found.significance,
+                *time_of(round(found.since * 1e9)),
+            )
+        ],
+        len(problems),
+        *[part for problem in problems for part in problem],
+        estimate.converged,
+        estimate.residual,
+    )
+
+
+def packed_margins(
+    time: Time, margins: Margins | None, reason: str = "", scene_version: str = "", *, of_estimate: bool = False
+) -> bytes:
     """Return a SafetyMargins: every barrier, the minimum of each, and what is in contact; or why there are none.
 
     Args:
         time: of the pose, seconds and nanoseconds.
-        margins: of its prediction; None where there are none.
+        margins: of the thread; None where there are none.
         reason: why there are none.
         scene_version: of the scene in force where there are none.
+        of_estimate: whether they are of the estimated thread; else of the predicted one.
     """
     scene = text(scene_version if margins is None else margins.scene_version)
     if margins is None:
         words = text(reason)
         return BEGIN + _no_margins_form(scene[0], words[0]).pack(
-            *time, *DISH, *scene, False, *words, *[0] * 7, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
+            *time, *DISH, *scene, False, *words, _OF_NOTHING, *[0] * 8, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
         )
     names = [text(name) for name in margins]
     minima = [(text(row.barrier), row) for row in margins.minima]
@@ -167,7 +215,8 @@ def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_
         scene[0], tuple(size for size, _ in names), count, tuple(name[0] for name, _ in minima), touching, squeezed
     )
     columns = [np.repeat(np.arange(len(names)), counts).astype(_BARRIER).tobytes()]
-    for attribute, kind in (("node", _NODE), ("obstacle", _OBSTACLE), ("value", REAL), ("clearance", REAL)):
+    real = [(name, REAL) for name in ("value", "clearance", "bound")]
+    for attribute, kind in (("node", _NODE), ("obstacle", _OBSTACLE), *real):
         columns.append(b"".join(numbers(getattr(barrier, attribute), kind) for barrier in margins.barriers))
     return BEGIN + layout.pack(
         *time,
@@ -175,6 +224,7 @@ def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_
         *scene,
         True,
         *EMPTY,
+        _OF_ESTIMATE if of_estimate else _OF_PREDICTION,
         len(names),
         *[part for name in names for part in name],
         *[part for column in columns for part in (count, column)],
@@ -182,7 +232,7 @@ def packed_margins(time: Time, margins: Margins | None, reason: str = "", scene_
         *[
             part
             for name, row in minima
-            for part in (*name, row.node[0], row.obstacle[0], row.value[0], row.clearance[0])
+            for part in (*name, row.node[0], row.obstacle[0], row.value[0], row.clearance[0], row.bound[0])
         ],
         _IN_CONTACT if touching else _FREE,
         touching,
@@ -205,6 +255,24 @@ def _prediction_form(
 
 
 @lru_cache(KEPT)
+def _estimate_form(scene: int, nodes: int, disturbances: int, problems: tuple[int, ...]) -> struct.Struct:
+    """Return the format of an EstimatedThread of so many nodes and disturbances, and problems of these lengths."""
+    return form(
+        *HEADER,
+        *text_codes(scene),
+        *array_codes(nodes, "d", 3),
+        *array_codes(nodes, "d"),
+        *array_codes(4 * nodes, "d"),
+        *("?", "d", "d", "I", "d", "I"),
+        "I",
+        *[*"d" * 10, "i", "I"] * disturbances,
+        "I",
+        *[code for size in problems for code in text_codes(size)],
+        *("?", "d"),
+    )
+
+
+@lru_cache(KEPT)
 def _margins_form(
     scene: int, names: tuple[int, ...], rows: int, minima: tuple[int, ...], touching: int, squeezed: int
 ) -> struct.Struct:
@@ -223,11 +291,12 @@ def _margins_form(
         *text_codes(scene),
         "?",
         *text_codes(EMPTY[0]),
+        "B",
         "I",
         *[code for size in names for code in text_codes(size)],
-        *[code for kind in "BIidd" for code in array_codes(rows, kind)],
+        *[code for kind in "BIiddd" for code in array_codes(rows, kind)],
         "I",
-        *[code for size in minima for code in (*text_codes(size), "I", "i", "d", "d")],
+        *[code for size in minima for code in (*text_codes(size), "I", "i", "d", "d", "d")],
         *_nodes(touching),
         *_nodes(squeezed),
         "d",
@@ -237,79 +306,9 @@ def _margins_form(
 @lru_cache(KEPT)
 def _no_margins_form(scene: int, reason: int) -> struct.Struct:
     """Return the format of a SafetyMargins without any, but a reason of this length."""
-    return form(*HEADER, *text_codes(scene), "?", *text_codes(reason), *"IIIIIII", *_nodes(0), *_nodes(0), "d")
+    return form(*HEADER, *text_codes(scene), "?", *text_codes(reason), "B", *"IIIIIIII", *_nodes(0), *_nodes(0), "d")
 
 
 def _nodes(count: int) -> tuple[str, ...]:
     """Return the codes of a state and the nodes that it is about."""
     return "B", "I", *"I" * count
-
-
-def packed_markers(time: Time, prediction: Prediction, margins: Margins | None, diameter: float) -> bytes:
-    """Return a MarkerArray: the predicted thread, its nodes under friction, and the minimum of each barrier.
-
-    The line has the colour of the friction, and the nodes under friction are spheres. A barrier's least clearance is
-    written beside the node that has it, in the namespace `margins`, also for barriers that users added; those of
-    single segments are not shown. The text disappears by its lifetime when its barrier has no row any more.
-
-    Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback": green where free, orange, darker
-    with every node, where sliding under friction, blue where stuck. Deviation: grey where unknown.
-
-    Args:
-        time: of the pose, seconds and nanoseconds.
-        prediction: the thread.
-        margins: of it; None where there are none.
-        diameter: of the thread [m].
-    """
-    width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
-    friction = UNKNOWN if margins is None else margins.friction
-    colour = (*friction_colour(friction), 1.0)
-    nodes = prediction.positions
-    markers = [
-        _Marker(_THREAD, 0, LINE_STRIP, (width, 0.0, 0.0), colour, points=nodes),
-        _Marker(_THREAD, 1, SPHERE_LIST, (2.0 * width,) * 3, colour, points=nodes[list(friction.nodes)]),
-    ]
-    shown = [each for each in (() if margins is None else margins.minima) if each.barrier not in SEGMENT_BARRIERS]
-    for number, minimum in enumerate(shown):
-        clearance = minimum.minimum_clearance
-        x, y = nodes[minimum.node[0]]
-        place = (float(x), float(y) + (number + 1) * LINE_HEIGHT, 0.0)  # several may be closest at the same node
-        caption = text(f"{minimum.barrier} {1e3 * clearance:.2f} mm")
-        colour = _RED if clearance <= 0.0 else _INK
-        marker = _Marker(_MARGINS, number, TEXT_VIEW_FACING, (0.0, 0.0, TEXT_HEIGHT), colour, place, caption=caption)
-        markers.append(marker)
-    values = [value for marker in markers for value in marker.values(time)]
-    codes = tuple((len(marker.points), len(marker.namespace[1]), len(marker.caption[1])) for marker in markers)
-    return BEGIN + _markers_form(codes).pack(len(markers), *values)
-
-
-class _Marker(NamedTuple):
-    """A marker of visualization_msgs, as far as ours differ."""
-
-    namespace: Text
-    number: int
-    kind: int
-    scale: tuple[float, ...]
-    colour: tuple[float, ...]
-    place: tuple[float, ...] = (0.0, 0.0, 0.0)
-    points: Points = np.empty((0, 2))
-    caption: Text = EMPTY
-
-    def values(self, time: Time) -> tuple[object, ...]:
-        """Return the fields in the message's order."""
-        upright, lifetime = (0.0, 0.0, 0.0, 1.0), (0, LIFETIME if self.kind == TEXT_VIEW_FACING else 0)
-        head = (*time, *DISH, *self.namespace, self.number, self.kind, ADD, *self.place, *upright)
-        shape = (*self.scale, *self.colour, *lifetime, False, len(self.points), points_of(self.points))
-        # Colours of single points, a texture with its header and picture, its coordinates, then a mesh and its file.
-        return (*head, *shape, 0, *EMPTY, 0, 0, *EMPTY, *EMPTY, 0, 0, *self.caption, *EMPTY, *EMPTY, 0, False)
-
-
-@lru_cache(KEPT)
-def _markers_form(sizes: tuple[tuple[int, int, int], ...]) -> struct.Struct:
-    codes = ["I"]
-    empty = text_codes(EMPTY[0])
-    for points, namespace, caption in sizes:
-        codes += [*HEADER, *text_codes(namespace), "i", "i", "i", *"d" * 7, *"d" * 3, *"f" * 4, "i", "I", "?"]
-        codes += [*array_codes(points, "d", 3), "I", *empty, "i", "I", *empty, *empty, "I", "I"]
-        codes += [*text_codes(caption), *empty, *empty, "I", "?"]
-    return form(*codes)

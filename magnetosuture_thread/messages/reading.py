@@ -123,6 +123,8 @@ def margins_of(message: Any) -> Margins:
             (message.obstacle, np.int32),
             (message.value, np.float64),
             (message.clearance, np.float64),
+            # Bags that are older than the estimate hold none.
+            (getattr(message, "clearance_bound", np.full(len(row), -np.inf)), np.float64),
         )
     ]
     if any(len(column) != len(row) for column in columns) or (len(row) and row.max() >= len(names)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -75,6 +75,8 @@ class BarrierMargins:
         value: h, safe at >= 0, shape (m,); [m] for an obstacle and the wall, [m^4] for stiffness, [m^2] for
             connectivity and compression, else the barrier's own unit.
         clearance: the same margin as a distance, shape (m,) [m].
+        bound: the clearance is greater than this with a probability of 99 %, shape (m,) [m]; -inf where nothing is known
+            of the thread's covariance.
     """
 
     barrier: str
@@ -82,6 +84,12 @@ class BarrierMargins:
     obstacle: NDArray[np.int32]
     value: NDArray[np.float64]
     clearance: NDArray[np.float64]
+    bound: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]  # -inf
+
+    def __post_init__(self) -> None:
+        """Without a bound there is none."""
+        if self.bound is None:
+            object.__setattr__(self, "bound", np.full(len(self.clearance), -np.inf))
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -96,6 +104,11 @@ class BarrierMargins:
     def minimum_clearance(self) -> float:
         """Least margin as a distance [m]; inf where the barrier has no rows."""
         return float(self.clearance.min(initial=math.inf))
+
+    @property
+    def minimum_bound(self) -> float:
+        """Least bound of all rows [m]; inf where the barrier has no rows."""
+        return float(self.bound.min(initial=math.inf))
 
     @property
     def closest(self) -> int:
@@ -140,8 +153,15 @@ class Margins(Mapping[str, BarrierMargins]):
 
     @property
     def minima(self) -> tuple[BarrierMargins, ...]:
-        """The row of least clearance of each barrier that has rows, each as margins of one row."""
+        """The row of least clearance of each barrier that has rows, as margins of one row; its bound is the least."""
         return tuple(_row(margins, margins.closest) for margins in self.barriers if len(margins))
+
+    def with_bounds(self, bounds: Mapping[str, NDArray[np.float64]]) -> Margins:
+        """Return the same margins with bounds of the clearances of some barriers [m], by name."""
+        barriers = tuple(
+            replace(each, bound=bounds[each.barrier]) if each.barrier in bounds else each for each in self.barriers
+        )
+        return replace(self, barriers=barriers)
 
     def with_friction(self, friction: Friction) -> Margins:
         """Return the same margins with the thread's friction."""
@@ -174,7 +194,12 @@ class Margins(Mapping[str, BarrierMargins]):
 def _row(margins: BarrierMargins, row: int) -> BarrierMargins:
     part = slice(row, row + 1)
     return BarrierMargins(
-        margins.barrier, margins.node[part], margins.obstacle[part], margins.value[part], margins.clearance[part]
+        margins.barrier,
+        margins.node[part],
+        margins.obstacle[part],
+        margins.value[part],
+        margins.clearance[part],
+        np.array([margins.minimum_bound]),
     )
 
 
@@ -207,11 +232,13 @@ class FrictionLaw:
         threshold: of h_obs,i,O, a distance [m].
         beta: 0 < beta <= 1.
         stuck_speed: a node that is not faster rests [m/s].
+        by_bound: whether the bound of a clearance counts where there is one, in place of the clearance.
     """
 
     threshold: float
     beta: float
     stuck_speed: float
+    by_bound: bool = False
 
     def classify(self, margins: Mapping[str, BarrierMargins], speeds: NDArray[np.float64]) -> Friction:
         """Return the friction of a thread.
@@ -221,7 +248,10 @@ class FrictionLaw:
             speeds: of each node, shape (n + 1,) [m/s].
         """
         obstacle = margins[OBSTACLE]
-        close = np.bincount(obstacle.node[obstacle.clearance < self.threshold], minlength=len(speeds))
+        clearance = obstacle.clearance
+        if self.by_bound:
+            clearance = np.where(np.isfinite(obstacle.bound), obstacle.bound, clearance)
+        close = np.bincount(obstacle.node[clearance < self.threshold], minlength=len(speeds))
         close[0] = 0  # the needle: what holds it back is no friction of the thread
         index = np.flatnonzero(close >= 2)
         if not len(index):

@@ -71,6 +71,20 @@ class PredictionResult:
         return margins.with_friction(self.law.classify(margins, self.speeds))
 
     @property
+    def reason(self) -> str:
+        """Why there are no margins; the solver's word where there are."""
+        if self.estimate is not None:
+            return "" if self.estimate.converged else "the estimate is not where the barriers hold"
+        if self.prediction is not None:
+            return self.prediction.status
+        return WAITING if self.problem is None else str(self.problem)
+
+    @property
+    def refused(self) -> InvalidInputError | None:
+        """Why the pose is refused, so that there is neither prediction nor estimate of it; None where it is not."""
+        return self.problem if isinstance(self.problem, InvalidInputError) and self.estimate is None else None
+
+    @property
     def waiting(self) -> bool:
         """Whether the pose waits for the first measured thread."""
         return self.prediction is None and self.problem is None and not self.late
@@ -225,7 +239,7 @@ class ThreadSession:
         # The pose of the same frame may have come first, and others after it.
         early = [(at, pose) for at, pose in self._early if at >= stamp]
         self._early.clear()
-        return (self._predicted(at, pose) for at, pose in early)
+        return (self.predict(at, pose) for at, pose in early)
 
     def on_observation(self, stamp: int, observation: ThreadObservation) -> Iterator[PredictionResult]:
         """Take what the camera sees of the thread.
@@ -282,7 +296,15 @@ class ThreadSession:
             stamp: of the frame [ns]; `pose.stamp` is the same in seconds.
             pose: as tracked; where the thread is fixed to it, `attachment_offset` says.
         """
-        result = self._predicted(stamp, pose)
+        return self.estimate(self.predict(stamp, pose), pose)
+
+    def estimate(self, result: PredictionResult, pose: NeedlePose) -> PredictionResult:
+        """Add the estimate to the prediction of a pose; the second half of `on_pose`.
+
+        Args:
+            result: of `predict` of this pose.
+            pose: as tracked.
+        """
         if self._estimator is None:
             return result
         attached = self.settings.attachment_pose(pose)
@@ -293,14 +315,15 @@ class ThreadSession:
             found = self._estimator.on_pose(attached)
         if found.estimate is None:
             return replace(result, estimate_problem=found.problem)
-        self._last_pose = stamp
+        self._last_pose = result.stamp
         speeds = self._estimate_motion.update(found.estimate.positions, found.estimate.prediction.interval)
         self._measured = math.isfinite(found.estimate.unmeasured_for)
         if not self._measured:
             return result
         return replace(result, estimate=found.estimate, law=self.settings.friction_law(), speeds=speeds)
 
-    def _predicted(self, stamp: int, pose: NeedlePose) -> PredictionResult:
+    def predict(self, stamp: int, pose: NeedlePose) -> PredictionResult:
+        """Return what the model alone says of a pose; the first half of `on_pose`."""
         if self._last is not None and stamp < self._last - MAX_LATENESS:
             self._predictor.reset()
             self._last = None

@@ -173,6 +173,9 @@ class ThreadModelSettings(Configuration):
         minimum=0.0,
         maximum=10.0,
     )
+    friction_by_bound: bool = quantity(
+        False, "whether the 99 % bound of an estimated clearance counts for friction, in place of the clearance"
+    )
 
     estimator: bool = quantity(
         True, "whether the thread is estimated too: the model corrected by the camera; for rod in liquid"
@@ -349,7 +352,7 @@ class ThreadModelSettings(Configuration):
 
     def friction_law(self) -> FrictionLaw:
         """Return the friction law."""
-        return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.stuck_speed)
+        return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.stuck_speed, self.friction_by_bound)
 
     def node_motion(self) -> NodeMotion:
         """Return what follows the nodes' velocities."""

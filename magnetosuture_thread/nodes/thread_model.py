@@ -1,7 +1,8 @@
-"""The node `thread_model`: predicts the thread from the needle poses of the tracker."""
+"""The node `thread_model`: predicts the thread from needle poses, and estimates it by what the camera sees of it."""
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -11,11 +12,13 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Prediction, Scene
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene
 from magnetosuture_thread.configuration import configuration_fields
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp, time_of
-from magnetosuture_thread.messages.packing import packed_margins, packed_markers, packed_prediction
+from magnetosuture_thread.messages.markers import packed_markers
+from magnetosuture_thread.messages.packing import packed_estimate, packed_margins, packed_prediction
+from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.predictor import STARTED
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
@@ -28,6 +31,8 @@ from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.thread_observation import ThreadObservation
+
+UNMEASURED_TOO_LONG = 1.0  # s; an estimate that is only a prediction for longer is a warning
 
 
 class ThreadSettings:
@@ -68,7 +73,7 @@ class ThreadSettings:
 
 
 class ThreadModelNode(PackageNode):
-    """Predicts the thread at every needle pose.
+    """Predicts and estimates the thread at every needle pose.
 
     Args:
         listens: whether poses and observations of the thread come by topics; else a tracker in the same process
@@ -85,9 +90,14 @@ class ThreadModelNode(PackageNode):
         self._scene = SceneFollower(self, self.health, scene, self.on_scene)
         self._settings = ThreadSettings(self, self._session, self.health)
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
+        self._estimated = topics.ESTIMATED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         self._observed = False
+        self._waiting = True  # for a thread from which the prediction can start
+        self._last_margins = 0  # stamp of those that were published [ns]
+        self._disturbance: tuple[float, str] | None = None  # when it was put into words [s], and these
+        self._refused_pieces = 0
         if listens:
             self.listen()
         self.health.warn("no needle pose yet")
@@ -108,10 +118,7 @@ class ThreadModelNode(PackageNode):
         self._session.change(self._session.settings, scene)
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Step the thread to a needle pose, or report why that is impossible.
-
-        No margin is published that is not proven.
-        """
+        """Step the thread to a needle pose, or report why that is impossible."""
         self._step(message.header.stamp, lambda: reading.needle_pose(message))
 
     def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
@@ -121,17 +128,20 @@ class ThreadModelNode(PackageNode):
     def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
         began = time.perf_counter()
         try:
-            outcome = self._session.on_pose(reading.nanoseconds(stamp), pose())
+            read = pose()
         except InvalidInputError as error:
             self.health.refuse(error)
             return
-        self._report(outcome, time.perf_counter() - began)
+        result = self._session.predict(reading.nanoseconds(stamp), read)
+        step_time = time.perf_counter() - began
+        self._publish_prediction(result, step_time)  # at once, as it is waited for
+        self._report(self._session.estimate(result, read), step_time)
 
     def on_measured_thread_message(self, data: bytes) -> None:
-        """Start from a centreline, where no tracker tells whether it is all of the thread, as in older bags.
+        """Take a centreline, where no tracker tells whether it is all of the thread, as in older bags.
 
-        Most are not needed, and to read a path of a hundred poses takes as long as some predictions: so
-        only the stamp is read of those.
+        Where the thread is not estimated most are not needed, and to read a path of a hundred poses takes as long as
+        some predictions: so only the stamp is read of those.
         """
         name = self.resolve_topic_name(topics.THREAD_OBSERVATION.name)
         self._observed = self._observed or self.count_publishers(name) > 0
@@ -139,54 +149,115 @@ class ThreadModelNode(PackageNode):
             self._take(data, topics.MEASURED_THREAD, reading.path_points, self._session.on_measured_thread)
 
     def on_observation_message(self, data: bytes) -> None:
-        """Start from what the camera sees of the thread; as above, most are not read."""
+        """Take what the camera sees of the thread; as above, it may not be needed."""
         self._observed = True
         self._take(data, topics.THREAD_OBSERVATION, reading.thread_observation, self._session.on_observation)
 
-    def _take(self, data: bytes, topic: topics.Topic, read: Callable[[Any], Any], start: Callable[..., Any]) -> None:
+    def _take(self, data: bytes, topic: topics.Topic, read: Callable[[Any], Any], take: Callable[..., Any]) -> None:
         stamp = header_stamp(data) or 0
-        if self._session.needs_measured_thread(stamp):
+        if self._session.estimates or self._session.needs_measured_thread(stamp):
             try:
-                self._start(start(stamp, read(topic.decode(data))))
+                self._report_all(take(stamp, read(topic.decode(data))))
             except InvalidInputError as error:
                 self.health.refuse(error)
 
     def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
         """Handle an observation of the thread handed over by a tracker in the same process."""
-        self._start(self._session.on_observation(reading.nanoseconds(stamp), observation))
+        self._report_all(self._session.on_observation(reading.nanoseconds(stamp), observation))
 
-    def _start(self, outcomes: Iterator[PredictionResult]) -> None:
+    def _report_all(self, results: Iterator[PredictionResult]) -> None:
         began = time.perf_counter()
-        for outcome in outcomes:
-            self._report(outcome, time.perf_counter() - began)
+        for result in results:
+            step_time = time.perf_counter() - began
+            self._publish_prediction(result, step_time)
+            self._report(result, step_time)
             began = time.perf_counter()
+        for late in self._session.late_estimates():
+            self._report(late, 0.0)
 
-    def _report(self, outcome: PredictionResult, step_time: float) -> None:
-        """Publish the result of a pose, or why there is none."""
-        if outcome.prediction is not None:
-            self._publish(outcome, outcome.prediction, step_time)
-        elif isinstance(outcome.problem, InvalidInputError):
-            self.health.refuse(outcome.problem)
+    def _publish_prediction(self, result: PredictionResult, step_time: float) -> None:
+        if result.prediction is not None:
+            when, material = time_of(result.stamp), self._session.settings.material
+            self._predicted.publish(packed_prediction(when, result.prediction, material, step_time=step_time))
+
+    def _report(self, result: PredictionResult, step_time: float) -> None:
+        """Publish estimate and margins of a pose or of a late observation, or why there are none.
+
+        No margin is published that is not proven.
+        """
+        if result.refused is not None:
+            self.health.refuse(result.refused)
+            return
+        if result.estimate is not None:
+            self._estimated.publish(packed_estimate(time_of(result.stamp), result.estimate))
+        if result.stamp >= self._last_margins or not result.late:  # those of an earlier frame are of no use any more
+            self._publish_margins(result)
+        self._show_health(result, step_time)
+
+    def _publish_margins(self, result: PredictionResult) -> None:
+        if result.late and result.estimate is None:
+            return
+        when, margins, of_estimate = time_of(result.stamp), result.margins, result.estimate is not None
+        reason = "" if margins else result.reason
+        self._margins.publish(packed_margins(when, margins, reason, result.scene_version, of_estimate=of_estimate))
+        self._last_margins = result.stamp
+        if self._markers.get_subscription_count() and (result.prediction or result.estimate):
+            diameter = self._session.thread.diameter
+            self._markers.publish(packed_markers(when, result.prediction, margins, diameter, result.estimate))
+
+    def _show_health(self, result: PredictionResult, step_time: float) -> None:
+        if isinstance(result.estimate_problem, InvalidInputError):
+            self.health.refuse(result.estimate_problem)
+            return
+        prediction, estimate = result.prediction, result.estimate
+        self._waiting = self._waiting if result.late else result.waiting
+        figures: dict[str, object] = {}
+        if prediction is not None:
+            figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
+        if estimate is not None:
+            figures |= self._estimate_figures(estimate)
+        if result.problem is not None:
+            self.health.error(str(result.problem), **figures)
+        elif self._waiting:
+            self.health.warn(WAITING if estimate is None else f"estimating; the prediction is {WAITING}", **figures)
+        elif trouble := self._troubles(result):
+            self.health.warn(f"predicting, but {'; '.join(trouble)}", **figures)
         else:
-            problem = WAITING if outcome.problem is None else str(outcome.problem)
-            (self.health.warn if outcome.problem is None else self.health.error)(problem)
-            packed = packed_margins(time_of(outcome.stamp), None, problem, outcome.scene_version)
-            self._margins.publish(packed)
-
-    def _publish(self, outcome: PredictionResult, prediction: Prediction, step_time: float) -> None:
-        when, settings, version = time_of(outcome.stamp), self._session.settings, outcome.scene_version
-        # The prediction first: it is waited for, and the margins are only worked out here.
-        self._predicted.publish(packed_prediction(when, prediction, settings.material, step_time=step_time))
-        margins = outcome.margins
-        reason = "" if margins else prediction.status
-        self._margins.publish(packed_margins(when, margins, reason, version))
-        if self._markers.get_subscription_count():
-            self._markers.publish(packed_markers(when, prediction, margins, self._session.thread.diameter))
-        figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
-        if prediction.status in (SOLVED, STARTED):
             self.health.ok("predicting", **figures)
+
+    def _troubles(self, result: PredictionResult) -> list[str]:
+        """Return what is wrong with prediction and estimate; figures in it change once a second at the most."""
+        found, prediction, estimate = [], result.prediction, result.estimate
+        if prediction is not None and prediction.status not in (SOLVED, STARTED):
+            found.append(prediction.status)
+        if result.estimate_problem is not None:
+            found.append(f"not estimating: {result.estimate_problem}")
+        if estimate is None:
+            return found
+        if not estimate.converged:
+            found.append(result.reason)
+        if estimate.disturbances:
+            if not self._disturbance or abs(estimate.stamp - self._disturbance[0]) >= 1.0:
+                self._disturbance = (estimate.stamp, "; ".join(map(str, estimate.disturbances)))
+            found.append(self._disturbance[1])
         else:
-            self.health.warn(f"predicting, but {prediction.status}", **figures)
+            self._disturbance = None
+        if estimate.unmeasured_for >= UNMEASURED_TOO_LONG:
+            why = f" ({estimate.problems[0]})" if estimate.problems else ""
+            found.append(f"the estimate is only a prediction since {math.floor(estimate.unmeasured_for)} s{why}")
+        return found
+
+    def _estimate_figures(self, estimate: ThreadEstimate) -> dict[str, object]:
+        self._refused_pieces += len(estimate.problems)
+        deviation = 1e3 * float(estimate.deviation.max())
+        figures: dict[str, object] = {
+            "measured": f"{100.0 * (1.0 - estimate.hidden):.0f} %",
+            "deviation": f"{deviation:.3f} mm",
+            "refused_pieces": self._refused_pieces,
+        }
+        if estimate.problems:
+            figures["last_refused_piece"] = estimate.problems[0]
+        return figures
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -145,15 +145,16 @@ class VisionTrackerNode(PackageNode):
             taken = time.perf_counter() - began
         track = seen.track
         when = stamp.sec, stamp.nanosec
+        if seen.tracked:
+            # Before the pose, so that the thread is estimated once, at the pose of its frame.
+            for follower in self._followers:
+                follower.on_observation(stamp, track.observation)
+            self._observations.publish(packed_observation(when, track.observation))
         if len(track.tail):  # also with a heading that is unknown, which those who need it refuse
-            # The pose first: the prediction waits for it, and all else can wait.
             self._poses.publish(packed_pose(when, track.tail, track.heading, track.covariance))
         if seen.tracked:
             for follower in self._followers:
                 follower.on_tracked(stamp, track.tail, track.heading)
-            self._observations.publish(packed_observation(when, track.observation))
-            for follower in self._followers:
-                follower.on_observation(stamp, track.observation)
             if len(seen.centreline):
                 self._threads.publish(packed_path(when, seen.centreline))
         self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))

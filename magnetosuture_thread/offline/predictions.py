@@ -74,12 +74,13 @@ def chosen_source(recording: Recording, source: str) -> str:
 
 @dataclass(frozen=True)
 class Step:
-    """The prediction for one observation with a needle.
+    """Prediction and estimate for one observation with a needle.
 
     Attributes:
-        sight: the sight.
-        outcome: the prediction, or why there is none.
-        margins: of the prediction; None where there is none, or where it did not converge, so that they prove nothing.
+        observation: the observation.
+        result: prediction and estimate, or why there is none. A `late` one says why an observation was refused.
+        margins: of the estimate, else of the prediction; None where there is none, or where it did not converge, so
+            that they prove nothing.
         step_time: wall-clock time that the prediction took [s].
         settings: in force.
         scene: in force.
@@ -94,7 +95,7 @@ class Step:
 
 
 def predictions(given: Iterable[Observation], settings: ThreadModelSettings, scene: Scene | None) -> Iterator[Step]:
-    """Predict the thread over one run, as `thread_model` does.
+    """Predict and estimate the thread over one run, as `thread_model` does.
 
     What the bag of `sights` says of scene and thread is taken as it comes. A pose before the thread is first seen
     gives a step that waits, as live, and is not predicted later unless its own thread is seen; sights without a
@@ -114,8 +115,7 @@ def predictions(given: Iterable[Observation], settings: ThreadModelSettings, sce
 def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Step]:
     waiting: dict[int, Observation] = {}
 
-    def step(observation: Observation, result: PredictionResult, began: float) -> Step:
-        taken = time.perf_counter() - began
+    def step(observation: Observation, result: PredictionResult, taken: float) -> Step:
         if result.waiting:
             waiting[result.stamp] = observation
         else:
@@ -134,11 +134,15 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
             results = session.on_measured_thread(observation.stamp, observation.measured)
         began = time.perf_counter()
         for result in results:
-            yield step(waiting.get(result.stamp, observation), result, began)
+            yield step(waiting.get(result.stamp, observation), result, time.perf_counter() - began)
             began = time.perf_counter()
         began = time.perf_counter()
         pose = NeedlePose(observation.stamp * 1e-9, observation.tail, observation.heading)
-        yield step(observation, session.on_pose(observation.stamp, pose), began)
+        predicted = session.predict(observation.stamp, pose)
+        taken = time.perf_counter() - began
+        yield step(observation, session.estimate(predicted, pose), taken)
+        for late in session.late_estimates():  # of observations that are refused: all others come with their poses
+            yield step(observation, late, 0.0)
         while len(waiting) > 2 * MAX_WAITING_POSES:
             del waiting[next(iter(waiting))]
 

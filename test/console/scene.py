@@ -99,8 +99,11 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "status": "solved",
             "age": 0.02,
         },
+        "estimated": None,
         "margins": {
             "valid": True,
+            "of": "prediction",
+            "bound": None,
             "reason": "",
             "clearance": clearances(line),
             "least": {"connectivity": 4.1e-6, "compression": 1.2e-4, "obstacle": min(clearances(line))},
@@ -150,6 +153,43 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "coil_bridge": {"level": "ok", "message": "armed", "values": {}, "age": 0.5},
         },
     }
+
+
+def estimated_state(hidden: bool = False, found: bool = False, **values: Any) -> dict[str, Any]:
+    """Return the state of a graph that estimates its thread too, while the model alone has gone another way.
+
+    Args:
+        hidden: whether nothing was measured for 3.2 s; else half of the thread is hidden.
+        found: whether something holds the thread that the model does not know.
+        values: see `state`.
+    """
+    shown = state(**values)
+    line = thread(shown_nodes := len(shown["predicted"]["vertices"]))
+    half = np.arange(shown_nodes) > shown_nodes // 2
+    deviation = np.where(half | hidden, 3e-4 * np.linspace(0.1, 1.0, shown_nodes), 2e-5)
+    off = np.column_stack([np.zeros(shown_nodes), 1.2e-3 * np.linspace(0.0, 1.0, shown_nodes) ** 2])
+    shown["predicted"]["vertices"] = (line + off).tolist()
+    at = shown_nodes - 9
+    shown["estimated"] = {
+        "vertices": line.tolist(),
+        "deviation": deviation.tolist(),
+        "prediction_only": hidden,
+        "unmeasured_for": 3.2 if hidden else 0.0,
+        "hidden": 1.0 if hidden else 0.5,
+        "disturbances": [
+            {
+                "position": line[at].tolist(),
+                "direction": [-0.8, 0.6],
+                "force": 2e-4,
+                "text": "held at 22 mm of the thread: 0.2 mN up and to the left",
+            }
+        ]
+        if found
+        else [],
+        "age": 0.02,
+    }
+    shown["margins"] |= {"of": "estimate", "bound": min(clearances(line)) - 5e-5}
+    return shown
 
 
 class RecordingGraph:

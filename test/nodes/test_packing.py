@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
+from magnetosuture_msgs.msg import EstimatedThread, SafetyMargins, ThreadDisturbance
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_markers, packed_observation, packed_path, packed_pose
+from magnetosuture_thread.messages.markers import packed_markers
+from magnetosuture_thread.messages.packing import (
+    packed_estimate,
+    packed_margins,
+    packed_observation,
+    packed_path,
+    packed_pose,
+)
+from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.model.margins import (
     UNKNOWN,
     BarrierMargins,
@@ -27,6 +38,7 @@ from magnetosuture_thread.model.margins import (
 from magnetosuture_thread.model.predictor import Prediction
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from test.model.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
 
 WHEN, STAMP = (12, 345), Time(sec=12, nanosec=345)
 
@@ -167,6 +179,94 @@ def test_markers_are_packed_as_rclpy_makes_them(segments: int, friction: Frictio
     )
     margins = None if friction is UNKNOWN else Margins((), friction=friction)
     same(packed_markers(WHEN, prediction, margins, diameter), expected)
+
+
+def an_estimate(disturbances: int = 0) -> ThreadEstimate:
+    """Return an estimate of a thread, measured in this frame, with so many forces that the model does not know."""
+    way = poses(3)
+    truth = true_shapes(thread_of(segments=6), way)
+    estimator = estimator_of(thread_of(segments=6), discs=(Disc((-0.005, 0.0015), 1e-3),))
+    estimator.start(way[0])
+    estimate = estimator.correct(whole(truth[0], 1))
+    found = [
+        Disturbance(1e-3 * k, 2e-3, np.array([k, -0.5]), np.array([0.6, 0.8]), 2e-4, 5.0, 11.5 + k)
+        for k in range(disturbances)
+    ]
+    return replace(estimate, disturbances=tuple(found), problems=("a", "of two words")[:disturbances])
+
+
+@pytest.mark.parametrize("disturbances", [0, 1, 2])
+def test_an_estimate_is_packed_as_rclpy_makes_it(disturbances: int):
+    estimate = an_estimate(disturbances)
+    assert estimate.innovations is not None
+    squares = estimate.innovations.normalised_squared
+    expected = EstimatedThread(
+        header=MESSAGES.header(STAMP),
+        positions=MESSAGES.points(estimate.positions),
+        deviation=estimate.deviation.tolist(),
+        covariance=estimate.covariance.ravel().tolist(),
+        unmeasured_for=0.0,
+        hidden=estimate.hidden,
+        points=estimate.points,
+        innovation_squared=float(np.nansum(squares)),
+        innovation_degrees=int(np.isfinite(squares).sum()),
+        problems=list(estimate.problems),
+        converged=True,
+        residual=estimate.residual,
+        disturbances=[
+            ThreadDisturbance(
+                arc_length=1e-3 * k,
+                extent=2e-3,
+                position=Point(x=float(k), y=-0.5),
+                direction=Vector3(x=0.6, y=0.8),
+                force=2e-4,
+                significance=5.0,
+                since=Time(sec=11 + k, nanosec=500_000_000),
+            )
+            for k in range(disturbances)
+        ],
+    )
+    same(packed_estimate(WHEN, estimate), expected)
+
+
+def test_margins_of_an_estimate_have_bounds_and_go_there_and_back():
+    margins = an_estimate().margins
+    for of_estimate in (True, False):
+        message: Any = deserialize_message(packed_margins(WHEN, margins, of_estimate=of_estimate), SafetyMargins)
+        assert message.source == (SafetyMargins.OF_ESTIMATE if of_estimate else SafetyMargins.OF_PREDICTION)
+        read = reading.margins_of(message)
+        for name in margins:
+            np.testing.assert_array_equal(read[name].bound, margins[name].bound)
+            np.testing.assert_array_equal(read[name].clearance, margins[name].clearance)
+        assert (read["obstacle"].bound <= read["obstacle"].clearance).all()
+        least = {each.barrier: each.clearance_bound for each in message.minimum}
+        assert least["obstacle"] == margins["obstacle"].bound.min()
+        assert least["connectivity"] == -math.inf
+    none: Any = deserialize_message(packed_margins(WHEN, None, "no pose"), SafetyMargins)
+    assert (none.valid, none.source) == (False, SafetyMargins.OF_NOTHING)
+
+
+def test_markers_show_the_estimate_beside_the_prediction():
+    estimate = an_estimate(2)
+    prediction = replace(estimate.prediction, positions=estimate.positions + 1e-3)
+    data = packed_markers(WHEN, prediction, estimate.margins, 1e-4, estimate)
+    shown: Any = deserialize_message(data, MarkerArray)
+    assert len(data) == len(serialize_message(shown))
+    lines = {each.ns: each for each in shown.markers if each.id == 0}
+    for name, nodes in (("thread", estimate.positions), ("predicted", prediction.positions)):
+        np.testing.assert_array_equal([[point.x, point.y] for point in lines[name].points], nodes)
+    assert lines["thread"].color != lines["predicted"].color
+    assert lines["deviation"].type == Marker.TRIANGLE_LIST
+    assert len(lines["deviation"].points) == 6 * 6
+    forces = [each for each in shown.markers if each.ns == "disturbances"]
+    assert [each.type for each in forces] == [Marker.ARROW, Marker.TEXT_VIEW_FACING] * 2
+    assert [each.text for each in forces[1::2]] == [
+        f"held at {k} mm of the thread: 0.2 mN up and to the right" for k in range(2)
+    ]
+    assert (forces[0].points[1].x, forces[0].points[1].y) == (0.0, -0.5)
+    assert all(each.lifetime.nanosec > 0 for each in forces)
+    alone: Any = deserialize_message(packed_markers(WHEN, None, None, 1e-4, estimate), MarkerArray)
+    assert {each.ns for each in alone.markers} == {"thread", "deviation", "disturbances"}
 
 
 def test_the_minimum_of_every_barrier_is_written_beside_its_node():

@@ -22,6 +22,7 @@ from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
+    ESTIMATED_THREAD,
     GROUND_TRUTH_THREAD,
     MARGINS,
     MATERIAL,
@@ -136,7 +137,10 @@ def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
     counts = Bag(one / "bag").counts
     assert {topic: counts[topic] for topic in counts if counts[topic]} == {
         SCENE.recorded: 1,
-        **{channel.recorded: 30 for channel in (NEEDLE_POSE, MEASURED_THREAD, PREDICTED_THREAD, MARGINS)},
+        **{
+            channel.recorded: 30
+            for channel in (NEEDLE_POSE, MEASURED_THREAD, PREDICTED_THREAD, ESTIMATED_THREAD, MARGINS)
+        },
     }
 
 

@@ -4,6 +4,8 @@ export const FREE = "#12a150";
 export const STUCK = "#2f6bff";
 export const GREY = "#7d8790";
 export const MEASURED = "rgba(47, 123, 255, 0.40)";
+export const ESTIMATED = "#00a3a8";
+export const MODEL = "#b5179e"; // the prediction by the model alone, beside an estimate
 export const VELOCITY = "#7a3fc0";
 export const NEAR = "#d1122f";
 export const MIDDLING = "#f08c00";
@@ -27,12 +29,22 @@ export function sliding(count) {
   return `#${mixed.map((entry) => entry.toString(16).padStart(2, "0")).join("")}`;
 }
 
-export const OLD = 0.5; // [s] a prediction that is older is drawn as not valid
+export const OLD = 0.5; // [s] a thread that is older is drawn as not valid
+export const UNMEASURED = 0.3; // [s] an estimate that was not measured for longer is shown as a prediction only
 
-// State and colour of the predicted thread: free, sliding, stuck, unknown, invalid or old.
-export function threadLook(predicted, margins, since) {
-  if (!predicted) return { state: "none", colour: GREY };
-  if (predicted.age + since > OLD) return { state: "old", colour: GREY };
+// The thread that the margins are of: the estimated one where there is one, else the predicted one.
+export const threadOf = (graph) => (graph?.margins?.of === "estimate" && graph.estimated ? graph.estimated : graph?.predicted);
+
+// none, measured, or prediction: what the estimate is now.
+export function estimateState({ estimated } = {}, since) {
+  if (!estimated || estimated.age + since > OLD) return "none";
+  return estimated.prediction_only && estimated.unmeasured_for + since > UNMEASURED ? "prediction" : "measured";
+}
+
+// State and colour of the thread: free, sliding, stuck, unknown, invalid or old.
+export function threadLook(thread, margins, since) {
+  if (!thread) return { state: "none", colour: GREY };
+  if (thread.age + since > OLD) return { state: "old", colour: GREY };
   if (!margins || !margins.valid) return { state: "invalid", colour: GREY };
   const { state, nodes } = margins.friction;
   const colour = { free: FREE, sliding: sliding(nodes.length), stuck: STUCK }[state];

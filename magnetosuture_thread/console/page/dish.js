@@ -1,14 +1,18 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
-// data-friction (free, sliding, stuck, unknown, invalid, old, none), data-colour of the predicted thread,
-// data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
+// data-friction (free, sliding, stuck, unknown, invalid, old, none) and data-colour of the thread that the margins are of,
+// data-estimate (none, measured, prediction), data-disturbances (how many), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
-import { GREY, MIDDLING, MEASURED, VELOCITY, nodeLook, onGround, threadLook } from "./colours.js";
+import {
+  ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, nodeLook, onGround, threadLook, threadOf,
+} from "./colours.js";
 import { Placement, needleArc } from "./geometry.js";
 import { drawShapes } from "./shapes.js";
 
 const DIAMETER = 0.035; // [m] of the dish that is drawn dashed while no scene is known
 const STALE = 0.5; // [s] a needle that is older is drawn grey
 const ARROW = 0.3; // of the dish's diameter, at the greatest speed
+const SIGMAS = 2.33; // standard deviations on either side of the shaded band, which holds the thread with 98 %
+const PUSH = 34; // [px] length of the arrow of a force that was found
 const STEPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05];
 
 export class Dish {
@@ -48,18 +52,24 @@ export class Dish {
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.drawImage(this.ground, 0, 0);
     plain(context, ratio);
-    const look = threadLook(graph?.predicted, graph?.margins, since);
+    const thread = threadOf(graph);
+    const look = threadLook(thread, graph?.margins, since);
+    const estimate = graph ? estimateState(graph, since) : "none";
     const tip = graph?.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop().join(",") : "";
     if (graph) {
       this.#line(graph.measured ?? [], 12, MEASURED);
-      this.#drawPredicted(graph, look);
+      if (estimate !== "none") this.#drawBand(graph.estimated);
+      if (thread !== graph.predicted) this.#drawModel(graph, since);
+      this.#drawThread(thread, graph.margins, look, thread === graph.estimated ? estimate : "none");
+      if (estimate !== "none") graph.estimated.disturbances.forEach((found) => this.#drawDisturbance(found, width));
       this.#drawNeedle(graph, since);
       this.#drawVelocities(graph, since, maxSpeed);
     }
     if (drag) this.#drawDrag(drag);
     this.#drawScaleBar(width, height);
     Object.assign(canvas.dataset, {
-      friction: look.state, colour: look.colour, image: shown ? "yes" : "no", tip,
+      friction: look.state, colour: look.colour, estimate,
+      disturbances: String(estimate === "none" ? 0 : graph.estimated.disturbances.length), image: shown ? "yes" : "no", tip,
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
   }
@@ -116,11 +126,76 @@ export class Dish {
     this.context.stroke();
   }
 
-  #drawPredicted({ predicted, margins }, look) {
-    const vertices = predicted?.vertices ?? [];
+  // Where the estimated thread lies with a probability of 98 %, across it.
+  #drawBand({ vertices, deviation }) {
+    if (vertices.length < 2) return;
+    const points = vertices.map((vertex) => this.placement.at(vertex));
+    const sides = [[], []];
+    points.forEach(([x, y], at) => {
+      const [from, to] = [points[Math.max(at - 1, 0)], points[Math.min(at + 1, points.length - 1)]];
+      const size = Math.hypot(to[0] - from[0], to[1] - from[1]) || 1;
+      const off = (SIGMAS * deviation[at] * this.placement.scale) / size;
+      const across = [(from[1] - to[1]) * off, (to[0] - from[0]) * off];
+      sides[0].push([x + across[0], y + across[1]]);
+      sides[1].push([x - across[0], y - across[1]]);
+    });
+    const { context } = this;
+    context.beginPath();
+    for (const [x, y] of [...sides[0], ...sides[1].reverse()]) context.lineTo(x, y);
+    context.closePath();
+    context.globalAlpha = 0.3;
+    context.fillStyle = ESTIMATED;
+    context.fill();
+    context.globalAlpha = 1;
+  }
+
+  // What the model alone says, beside the estimate.
+  #drawModel({ predicted }, since) {
+    if (!predicted || predicted.age + since > STALE) return;
+    const { context } = this;
+    context.setLineDash([3, 5]);
+    this.#line(predicted.vertices, 2.2, MODEL);
+    context.setLineDash([]);
+  }
+
+  // A force that the model does not know: an arrow to where it acts, and what it is.
+  #drawDisturbance({ position, direction, text }, width) {
+    const { context } = this;
+    const [x, y] = this.placement.at(position);
+    const [right, down] = [direction[0], -direction[1]];
+    const from = [x - PUSH * right, y - PUSH * down];
+    for (const [wide, colour] of [[6, this.halo], [3, NEAR]]) {
+      context.beginPath();
+      context.moveTo(...from);
+      context.lineTo(x - 8 * right, y - 8 * down);
+      context.lineWidth = wide;
+      context.strokeStyle = colour;
+      context.stroke();
+    }
+    this.#head([x - 5 * right, y - 5 * down], Math.atan2(down, right), 12, NEAR);
+    context.font = '600 13px system-ui, "DejaVu Sans", sans-serif';
+    const size = context.measureText(text).width;
+    const left = Math.min(Math.max(from[0] - 9 * right - (right > 0 ? size : 0), 8), width - size - 8);
+    const base = from[1] - 14 * down + 4;
+    context.fillStyle = this.halo;
+    context.fillRect(left - 5, base - 14, size + 10, 20);
+    context.fillStyle = NEAR;
+    context.textAlign = "left";
+    context.fillText(text, left, base);
+  }
+
+  // The thread that the margins are of, in the colour of its friction; an estimated one with an edge of its own colour,
+  // which is broken where nothing is measured any more.
+  #drawThread(thread, margins, look, estimate) {
+    const vertices = thread?.vertices ?? [];
     const { context } = this;
     const valid = look.colour !== GREY;
     this.#line(vertices, 4.6, this.halo);
+    if (estimate !== "none") {
+      if (estimate === "prediction") context.setLineDash([9, 11]);
+      this.#line(vertices, 7.4, ESTIMATED);
+      context.setLineDash([]);
+    }
     if (!valid) context.setLineDash([7, 6]);
     this.#line(vertices, 2.6, look.colour);
     context.setLineDash([]);

@@ -1,6 +1,7 @@
 // Text beside the dish: states, figures, control. Text is written only where it changed.
 
 import { capital, isNumber, leastClearance, millimetres, plural, seconds } from "./format.js";
+import { estimateState, threadOf } from "./colours.js";
 import { SILENCE_TIMEOUT, motionStatus } from "./status.js";
 
 const NODE_TIMEOUT = 3.0; // [s]
@@ -127,16 +128,19 @@ function showVision({ graph, since, hasImage }) {
     if (!graph.needle) lines.push("no needle yet");
     else if (graph.needle.age + since > 0.5) lines.push(`needle pose is ${seconds(graph.needle.age + since)} old`);
     if (tracker && tracker.state !== "tracked") lines.push(`needle ${tracker.state}`);
+    if (estimateState(graph, since) === "prediction") lines.push(`thread not measured for ${seconds(graph.estimated.unmeasured_for)}: prediction only`);
   }
   write("vision", capital(lines.join(", ")));
 }
 
 function showThread({ graph, since }) {
-  const { margins, predicted } = graph;
-  const old = predicted && predicted.age + since > 0.5;
+  const { margins, predicted, estimated } = graph;
+  const thread = threadOf(graph);
+  const estimate = estimateState(graph, since);
+  const old = thread && thread.age + since > 0.5;
   const rows = [];
-  if (!margins || !predicted) write("friction", "no prediction yet", "silent");
-  else if (old) write("friction", `${seconds(predicted.age + since)} old`, "silent");
+  if (!margins || !thread) write("friction", "no prediction yet", "silent");
+  else if (old) write("friction", `${seconds(thread.age + since)} old`, "silent");
   else if (!margins.valid) write("friction", "margins not valid", "error");
   else {
     const { state, nodes, slowdown } = margins.friction;
@@ -148,7 +152,14 @@ function showThread({ graph, since }) {
     write("friction", ...words);
   }
   if (margins && !margins.valid && margins.reason) rows.push([margins.reason, null]);
+  if (estimate !== "none") for (const { text } of estimated.disturbances) rows.push([capital(text), null]);
+  if (estimate === "prediction") rows.push([`Prediction only for ${seconds(estimated.unmeasured_for)}`, null]);
   rows.push(["Clearance", margins?.valid ? clearanceText(margins) : "–"]);
+  if (margins?.valid && isNumber(margins.bound)) rows.push(["99 % bound", millimetres(margins.bound)]);
+  if (estimate === "measured") {
+    rows.push(["Measured", `${Math.round(100 * (1 - estimated.hidden))} %`]);
+    rows.push(["Deviation", `± ${millimetres(Math.max(...estimated.deviation, 0), 3)}`]);
+  }
   for (const [kind, value] of Object.entries(margins?.valid ? margins.least : {})) {
     rows.push([KINDS[kind] ?? capital(kind.replaceAll("_", " ")), millimetres(value, 3)]);
   }

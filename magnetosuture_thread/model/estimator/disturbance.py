@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,31 @@ class Disturbance:
     force: float
     significance: float
     since: float
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        return disturbance_text(self.arc_length, self.force, self.direction)
+
+
+def disturbance_text(arc_length: float, force: float, direction: Sequence[float] | Points) -> str:
+    """Return a disturbance in words, with directions as in the dish frame: right is x, up is y.
+
+    >>> disturbance_text(0.031, 2e-4, (-1.0, 0.0))
+    'held at 31 mm of the thread: 0.2 mN to the left'
+    """
+    return f"held at {1e3 * arc_length:.0f} mm of the thread: {_amount(force)} {_way(*direction)}"
+
+
+def _amount(force: float) -> str:
+    value, unit = (1e3 * force, "mN") if force >= 1e-4 else (1e6 * force, "uN")
+    return f"{value:.0f} {unit}" if value >= 10.0 else f"{value:.2g} {unit}"
+
+
+def _way(x: float, y: float) -> str:
+    """Return a direction in words, to an eighth of a turn."""
+    words = ["to the right" if x > 0.0 else "to the left"] if abs(x) > math.sin(math.pi / 8.0) else []
+    words += ["up" if y > 0.0 else "down"] if abs(y) > math.sin(math.pi / 8.0) else []
+    return " and ".join(reversed(words))
 
 
 def force_density(

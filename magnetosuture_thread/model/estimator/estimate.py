@@ -73,9 +73,14 @@ class ThreadEstimate:
         return self.prediction.stamp
 
     @cached_property
+    def _rows(self) -> list[BarrierRows]:
+        return self.compute_rows()
+
+    @cached_property
     def margins(self) -> Margins:
-        """The margins of every barrier by its name, of the estimate's positions; computed at first access."""
-        return Margins.of(self.compute_rows(), self.contact_tolerance, self.prediction.scene_version)
+        """The margins of every barrier by its name with their bounds, of its positions; computed at first access."""
+        margins = Margins.of(self._rows, self.contact_tolerance, self.prediction.scene_version)
+        return margins.with_bounds(self.clearance_bounds)
 
     @cached_property
     def clearance_bounds(self) -> dict[str, Vector]:
@@ -86,7 +91,7 @@ class ThreadEstimate:
         with the covariances C_k of the nodes that the row depends on, taken as fully correlated.
         """
         bounds = {}
-        for rows in self.compute_rows():
+        for rows in self._rows:
             if rows.name in (OBSTACLE, WALL) or rows.name not in _OWN:
                 bounds[rows.name] = _bound(rows, self.covariance)
         return bounds

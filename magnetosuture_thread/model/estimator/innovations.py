@@ -32,6 +32,12 @@ class Innovations:
         """Normalised innovation squared of each window, 1 in the mean; nan where nothing is measured."""
         return np.asarray(self.mean**2 / self.variance)
 
+    @property
+    def total(self) -> tuple[float, int]:
+        """Sum of the windows' normalised innovations squared, and its degrees of freedom: those that are measured."""
+        squares = self.normalised_squared
+        return float(np.nansum(squares)), int(np.isfinite(squares).sum())
+
 
 class WindowSums(NamedTuple):
     """Of each window of equal arc length, shape (w,).

@@ -12,7 +12,8 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
 from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
 from magnetosuture_thread.model.estimator.pieces import LENGTH_ERROR
-from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 MAX_LATENESS = 1.0  # s; a pose older by more than this is not late: time itself was set back
@@ -78,7 +79,7 @@ class EstimatorSession:
             return
         moment = other._moments[-1]
         state = kept.resampled(before.thread, now.thread, now.options)
-        prediction = replace(state.prediction, scene_version=now.predictor.scene_version)
+        prediction = _carried_over(state, now.predictor)
         # The multipliers of other rows are no warm start.
         now.restore(replace(state, prediction=prediction, warm_start=now.predictor.formulation.warm_start()))
         self._moments.append(_Moment(moment.pose, moment.observation, now.snapshot()))
@@ -170,6 +171,22 @@ class EstimatorSession:
 
     def _refused(self, stamp: float, expected: str) -> EstimationResult:
         return EstimationResult(None, problem=InvalidInputError("thread observation stamp", stamp, expected))
+
+
+def _carried_over(state: FilterState, predictor: ThreadPredictor) -> Prediction:
+    """Return the step that led to a state, as one of the predictor that goes on from there; it keeps no other alive."""
+    formulation, positions, heading = predictor.formulation, state.thread.positions, state.pose.heading
+    version = predictor.scene_version
+    along = np.diff(positions, axis=0)
+    return replace(
+        state.prediction,
+        scene_version=version,
+        positions=positions,
+        strain=np.hypot(*along.T) / formulation.rest_lengths(positions, heading) - 1.0,
+        compute_margins=lambda: Margins.of(
+            formulation.margins(positions, heading), predictor.contact_tolerance, version
+        ),
+    )
 
 
 def observation_of(centreline: Points, length: float, deviation: float) -> ThreadObservation:

@@ -121,6 +121,7 @@ READERS = {
     "needle": (topics.NEEDLE_POSE, messages.needle, 0.0),
     "measured": (topics.MEASURED_THREAD, messages.measured_thread, MEASURED_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
+    "estimated": (topics.ESTIMATED_THREAD, messages.estimated, 0.0),
     "margins": (topics.MARGINS, messages.margins, 0.0),
     "scene": (topics.SCENE, messages.scene, SCENE_PERIOD),
     "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
@@ -136,7 +137,7 @@ ZERO_FILTER_STATE = {
     "overridden": "",
     "age": 0.0,
 }
-AGED_PARTS = ("tracker", "needle", "predicted", "filter", "bridge")
+AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "filter", "bridge")
 
 
 class ConsoleGraph:

@@ -10,9 +10,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3
 from magnetosuture_msgs.msg import (
     CoilBridgeState,
+    EstimatedThread,
     FilterState,
     PredictedThread,
     SafetyMargins,
+    ThreadDisturbance,
     TrackerState,
 )
 from magnetosuture_msgs.msg import Scene as SceneMessage
@@ -22,6 +24,7 @@ from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.model.estimator.disturbance import disturbance_text
 from magnetosuture_thread.model.margins import node_clearance
 from magnetosuture_thread.texts import shortened
 
@@ -46,6 +49,7 @@ FRICTION = {
     SafetyMargins.FRICTION_SLIDING: "sliding",
     SafetyMargins.FRICTION_STUCK: "stuck",
 }
+SOURCES = {SafetyMargins.OF_PREDICTION: "prediction", SafetyMargins.OF_ESTIMATE: "estimate"}
 LEVELS = {
     DiagnosticStatus.OK: "ok",
     DiagnosticStatus.WARN: "warn",
@@ -93,13 +97,40 @@ def predicted(message: PredictedThread) -> dict[str, Any]:
     }
 
 
+def estimated(message: EstimatedThread) -> dict[str, Any]:
+    """Return the estimated vertices with their deviations [m], how they were found, and the forces that were found.
+
+    Raises:
+        InvalidInputError: the deviations are not those of the vertices.
+    """
+    if len(message.deviation) != len(message.positions):
+        found = f"{len(message.positions)} positions and {len(message.deviation)} deviations"
+        raise InvalidInputError("thread/estimated", found, "a deviation for each position")
+    return {
+        "vertices": [[vertex.x, vertex.y] for vertex in message.positions],
+        "deviation": list(message.deviation),
+        "prediction_only": message.prediction_only,
+        "unmeasured_for": message.unmeasured_for,
+        "hidden": message.hidden,
+        "disturbances": [_disturbance(found) for found in message.disturbances[:MAX_LISTED]],
+    }
+
+
+def _disturbance(message: ThreadDisturbance) -> dict[str, Any]:
+    place, way = message.position, message.direction
+    text = disturbance_text(message.arc_length, message.force, (way.x, way.y))
+    return {"position": [place.x, place.y], "direction": [way.x, way.y], "force": message.force, "text": text}
+
+
 def margins(message: SafetyMargins) -> dict[str, Any]:
     """Return the margins by node and by kind, as distances [m]; no number of a message that is not valid."""
     return {
         "valid": message.valid,
+        "of": SOURCES.get(message.source, "nothing"),
         "reason": shortened(message.reason),
         "clearance": clearances(message) if message.valid else [],
         "least": {shortened(least.barrier): least.clearance for least in message.minimum[:MAX_LISTED]},
+        "bound": min((b for b in (least.clearance_bound for least in message.minimum) if np.isfinite(b)), default=None),
         "contact": list(message.contact_nodes),
         "friction": {
             "state": FRICTION.get(message.friction_state, "unknown"),

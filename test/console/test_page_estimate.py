@@ -1,0 +1,86 @@
+"""What the operator's page shows of the estimated thread, in a real browser."""
+
+from __future__ import annotations
+
+from playwright.sync_api import expect
+
+from test.console.scene import estimated_state, picture, state, thread
+from test.console.test_page import Operator, between, operator
+
+__all__ = ["operator"]  # the fixture
+
+TEAL, MAGENTA, GREEN, RED = "#00a3a8", "#b5179e", "#12a150", "#d1122f"
+
+
+def test_estimate_prediction_and_measurement_have_their_own_colours(operator: Operator) -> None:
+    graph = operator.served.graph
+    operator.page.emulate_media(color_scheme="light")
+    graph.shown = estimated_state()
+    dish = operator.page.locator("#dish")
+    expect(dish).to_have_attribute("data-estimate", "measured")
+    assert operator.drawn("free") == GREEN
+    at = between(36, 37)
+    operator.until(lambda: {GREEN, TEAL} <= operator.colours_at(at, 5))
+    x, y = graph.shown["predicted"]["vertices"][38]
+    operator.until(lambda: MAGENTA in operator.colours_at((x, y), 6))
+    expect(operator.page.locator("#margins")).to_contain_text("Measured50 %")
+    expect(operator.page.locator("#margins")).to_contain_text("99 % bound")
+    legend = operator.page.locator("#legend")
+    for text in ("measured thread", "estimated", "predicted by the model alone"):
+        expect(legend).to_contain_text(text)
+    graph.shown = state()
+    expect(dish).to_have_attribute("data-estimate", "none")
+    operator.until(lambda: TEAL not in operator.colours_at(at, 5))
+    expect(operator.page.locator("#margins")).not_to_contain_text("99 % bound")
+
+
+def test_the_band_of_the_deviation_is_shaded(operator: Operator) -> None:
+    graph = operator.served.graph
+    operator.page.emulate_media(color_scheme="light")
+    graph.shown = estimated_state()
+    line = thread()
+    along = line[39] - line[37]
+    across = (-along[1] / float((along @ along) ** 0.5), along[0] / float((along @ along) ** 0.5))
+    inside = (line[38][0] - 5.5e-4 * across[0], line[38][1] - 5.5e-4 * across[1])
+    outside = (line[38][0] - 1.2e-3 * across[0], line[38][1] - 1.2e-3 * across[1])
+    operator.until(lambda: operator.colours_at(inside, 0) != operator.colours_at(outside, 0))
+    graph.shown["estimated"]["deviation"] = [1e-6] * 40
+    operator.until(lambda: operator.colours_at(inside, 0) == operator.colours_at(outside, 0))
+
+
+def test_an_estimate_that_is_not_measured_any_more_says_so(operator: Operator) -> None:
+    operator.served.graph.shown = estimated_state(hidden=True)
+    expect(operator.page.locator("#dish")).to_have_attribute("data-estimate", "prediction")
+    expect(operator.page.locator("#margins")).to_contain_text("Prediction only for 3.2 s")
+    expect(operator.page.locator("#margins")).not_to_contain_text("Measured")
+
+
+def test_a_force_that_was_found_is_marked_where_it_is_and_put_into_words(operator: Operator) -> None:
+    graph = operator.served.graph
+    operator.page.emulate_media(color_scheme="light")
+    graph.shown = estimated_state(found=True)
+    expect(operator.page.locator("#dish")).to_have_attribute("data-disturbances", "1")
+    expect(operator.page.locator("#margins")).to_contain_text("Held at 22 mm of the thread: 0.2 mN up and to the left")
+    found = graph.shown["estimated"]["disturbances"][0]
+    x, y = found["position"]
+    behind = (x - 1e-3 * found["direction"][0], y - 1e-3 * found["direction"][1])
+    operator.until(lambda: RED in operator.colours_at(behind))
+    graph.shown = estimated_state()
+    expect(operator.page.locator("#dish")).to_have_attribute("data-disturbances", "0")
+    operator.until(lambda: RED not in operator.colours_at(behind))
+
+
+def test_an_old_estimate_is_not_drawn_as_one(operator: Operator) -> None:
+    graph = operator.served.graph
+    graph.shown = estimated_state()
+    expect(operator.page.locator("#dish")).to_have_attribute("data-estimate", "measured")
+    graph.shown["estimated"]["age"] = 2.0
+    expect(operator.page.locator("#dish")).to_have_attribute("data-estimate", "none")
+    assert operator.drawn("old") == "#7d8790"
+
+
+def test_everything_has_room_on_a_laptop_with_a_force_and_an_image(operator: Operator) -> None:
+    operator.served.graph.picture = (1, picture())
+    operator.served.graph.shown = estimated_state(found=True, friction="sliding", count=8)
+    expect(operator.page.locator("#margins")).to_contain_text("Held at")
+    assert operator.cut_off() == []

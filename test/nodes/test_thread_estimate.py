@@ -1,0 +1,263 @@
+"""The estimated thread in a graph: at every frame, late, of paths, with bounds, disturbances, and bad observations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from magnetosuture_msgs.msg import SafetyMargins
+
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.messages.cdr import time_of
+from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
+from test.model.estimator.threads import error_percent, piece_of, poses, thread_of, true_shapes, whole
+
+COUNT = 12
+WAY = poses(60)
+NODES = true_shapes(thread_of(viscosity=3.0), WAY)  # the node is told of a liquid a third as viscous
+SILK = {"material": "silk_6_0"}
+
+
+def stamp(k: float) -> Time:
+    seconds, nanoseconds = time_of(round((1.0 + k / 30.0) * 1e9))
+    return Time(sec=seconds, nanosec=nanoseconds)
+
+
+class Bench:
+    """A thread model, and what it says.
+
+    Args:
+        graph: of the test.
+        parameters: of the node.
+    """
+
+    def __init__(self, graph: Any, **parameters: Any) -> None:
+        self.graph = graph
+        self.node = graph.add(ThreadModelNode, **{**SILK, **parameters})
+        self.predicted, self.margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
+        self.estimated, self.reports = graph.listen(topics.ESTIMATED_THREAD), graph.listen(topics.DIAGNOSTICS)
+
+    def pose(self, k: int, needle: NeedlePose | None = None) -> None:
+        shown = needle or WAY[k]
+        self.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(stamp(k), shown.tail, shown.heading))
+
+    def observe(self, k: float, observation: ThreadObservation) -> None:
+        """Publish what a frame shows, and wait until the node has taken it."""
+        before = self.taken()
+        self.graph.publish(topics.THREAD_OBSERVATION, MESSAGES.observation_message(stamp(k), observation))
+        self.graph.wait(lambda: self.taken() > before, "the observation to be taken")
+
+    def taken(self) -> int:
+        """Return how many observations the node has been through; see `counting`."""
+        raise NotImplementedError
+
+    def show(self, k: int, observation: ThreadObservation | None = None, needle: NeedlePose | None = None) -> Any:
+        """Show a frame, its observation first, and return what is estimated."""
+        before = len(self.estimated)
+        self.observe(k, observation or whole(NODES[k], k))
+        self.pose(k, needle)
+        self.graph.wait(lambda: len(self.estimated) == before + 1, "an estimate")
+        return self.estimated[-1]
+
+    def hears(self, words: str) -> Callable[[], bool]:
+        """Return whether a report has such words in its message or its values."""
+        return lambda: any(
+            words in text
+            for report in self.reports
+            for text in (report.status[0].message, *(value.value for value in report.status[0].values))
+        )
+
+
+@pytest.fixture
+def bench(graph: Any, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Return a thread model of a thread whose observations are counted as the node takes them."""
+    return counting(monkeypatch, graph)
+
+
+def counting(monkeypatch: pytest.MonkeyPatch, graph: Any, **parameters: Any) -> Bench:
+    counts = {"observations": 0}
+    take = ThreadModelNode.on_observation_message
+
+    def counted(self: ThreadModelNode, data: bytes) -> None:
+        take(self, data)
+        counts["observations"] += 1
+
+    monkeypatch.setattr(ThreadModelNode, "on_observation_message", counted)
+    made = Bench(graph, **parameters)
+    made.taken = lambda: counts["observations"]  # type: ignore[method-assign]
+    return made
+
+
+def error(message: Any, k: int) -> float:
+    return error_percent(np.array([[point.x, point.y] for point in message.positions]), NODES[k])
+
+
+def test_every_frame_has_an_estimate_beside_the_prediction(bench: Bench):
+    for k in range(COUNT):
+        message = bench.show(k)
+        assert message.header.stamp == stamp(k)
+        assert message.header.frame_id == "dish"
+        assert (message.prediction_only, message.unmeasured_for, message.converged) == (False, 0.0, True)
+        assert message.hidden < 0.2
+        assert len(message.positions) == len(message.deviation) == 26
+        assert len(message.covariance) == 4 * 26
+        assert 0.0 < message.innovation_squared < 100.0 * message.innovation_degrees
+    bench.graph.wait(lambda: len(bench.predicted) == len(bench.margins) == COUNT, "all that comes of the frames")
+    assert error(bench.estimated[-1], COUNT - 1) < 0.5 * error(bench.predicted[-1], COUNT - 1)
+    assert [each.source for each in bench.margins] == [SafetyMargins.OF_ESTIMATE] * COUNT
+    bench.graph.wait(bench.hears("predicting"), "the state")
+
+
+def test_a_frame_without_an_observation_is_only_predicted_and_says_since_when(bench: Bench):
+    bench.show(0)
+    for k in (1, 2, 45):
+        bench.pose(k)
+        bench.graph.wait(lambda: bench.estimated[-1].header.stamp == stamp(k), "an estimate")  # noqa: B023
+        message = bench.estimated[-1]
+        assert (message.prediction_only, message.hidden, message.points) == (True, 1.0, 0)
+        assert message.unmeasured_for == pytest.approx(k / 30.0, abs=1e-6)
+        assert message.innovation_degrees == 0
+    bench.graph.wait(bench.hears("only a prediction since 1 s"), "a warning")
+
+
+def test_before_the_thread_is_measured_the_margins_are_of_the_prediction(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, initial_shape="straight", scene="dish_35mm")
+    bench.pose(0)
+    graph.wait(lambda: len(bench.margins) == 1, "margins")
+    assert bench.margins[0].source == SafetyMargins.OF_PREDICTION
+    assert set(bench.margins[0].clearance_bound) == {-math.inf}
+    bench.show(1)
+    graph.wait(lambda: len(bench.margins) == 2, "margins")
+    assert bench.margins[1].source == SafetyMargins.OF_ESTIMATE
+    wall = next(each for each in bench.margins[1].minimum if each.barrier == "wall")
+    assert wall.clearance - 1e-3 < wall.clearance_bound < wall.clearance
+    assert not bench.estimated[:-1]
+
+
+def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(bench: Bench):
+    for k in range(3):
+        bench.show(k)
+    for k in (3, 4):
+        bench.pose(k)
+    bench.graph.wait(lambda: len(bench.estimated) == 5, "estimates")
+    assert [each.prediction_only for each in bench.estimated[3:]] == [True, True]
+    bench.observe(3, whole(NODES[3], 3))
+    bench.graph.wait(lambda: len(bench.estimated) == 7, "both estimates again")
+    assert [each.header.stamp for each in bench.estimated[5:]] == [stamp(3), stamp(4)]
+    assert [each.prediction_only for each in bench.estimated[5:]] == [False, True]
+    assert bench.estimated[6].unmeasured_for == pytest.approx(1 / 30.0, abs=1e-6)
+    bench.graph.wait(lambda: len(bench.margins) == 6, "the margins of the last")
+    assert bench.margins[-1].header.stamp == stamp(4)
+    bench.observe(4, whole(NODES[4], 4))
+    bench.graph.wait(lambda: len(bench.estimated) == 8, "the last again")
+    assert not bench.estimated[-1].prediction_only
+
+
+def test_paths_that_end_early_are_estimated_where_no_observations_come(graph: Any):
+    bench = Bench(graph, initial_shape="straight")
+    for k in range(COUNT):
+        graph.publish(topics.MEASURED_THREAD, MESSAGES.path_message(stamp(k), NODES[k, :14]))
+        bench.pose(k)
+        graph.wait(lambda: bool(bench.estimated) and bench.estimated[-1].header.stamp == stamp(k), "an estimate")  # noqa: B023
+    graph.wait(lambda: not bench.estimated[-1].prediction_only, "a measured estimate")
+    assert bench.estimated[-1].hidden == pytest.approx(0.5, abs=0.1)
+
+
+def test_what_holds_the_thread_unknown_to_the_model_is_reported(bench: Bench):
+    disc, way = Disc((0.0, -2.2e-3), 1.7e-3), poses(150, turn=-0.9)
+    held = true_shapes(thread_of(), way, (disc,))
+    gap = np.linalg.norm(held - np.array(disc.centre), axis=2).min(axis=1) - disc.radius
+    contact = int(np.flatnonzero(gap < 5e-5)[0])
+    for k in range(contact + 16):
+        message = bench.show(k, whole(held[k], k), way[k])
+        if message.disturbances:
+            break
+    assert contact <= k <= contact + 15  # within half a second
+    found = message.disturbances[0]
+    assert math.hypot(found.position.x - disc.centre[0], found.position.y - disc.centre[1]) < 4e-3
+    assert found.force > 0.0
+    bench.graph.wait(bench.hears("held at"), "a warning")
+    warned = next(each.status[0] for each in bench.reports if "held at" in each.status[0].message)
+    assert warned.level == DiagnosticStatus.WARN
+    assert "N " in warned.message.split("held at")[1]  # so many mN or uN to a side
+
+
+def spoiled(name: str) -> tuple[float, ThreadObservation]:
+    """Return when an observation that cannot be used is stamped, in frames after the third, and it."""
+    good = piece_of(NODES[3], 3)
+    if name in ("doubled", "future", "long ago"):
+        return {"doubled": -1.0, "future": 1800.0, "long ago": -20.0}[name], whole(NODES[3], 3)
+    if name == "not finite":
+        points = good.points.copy()
+        points[3, 0] = math.nan
+        return 0.0, ThreadObservation((replace(good, points=points),))
+    if name == "another thread":
+        off = good.points + np.array([0.0, 8e-3])
+        unknown = {"first_end": PieceEnd.UNKNOWN, "last_end": PieceEnd.UNKNOWN, "arc_length": (math.nan, math.nan)}
+        return 0.0, ThreadObservation((replace(good, points=off, **unknown),))  # type: ignore[arg-type]
+    if name == "pieces doubled":
+        return 0.0, ThreadObservation((good, replace(good)))
+    assert name == "ten thousand points"
+    count = 10_000
+    many = np.column_stack([np.interp(np.linspace(0, 25, count), np.arange(26), NODES[3, :, axis]) for axis in (0, 1)])
+    return 0.0, ThreadObservation((replace(good, points=many, deviation=np.full(count, 2e-5)),))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("doubled", "a second observation of the same frame"),
+        ("future", "after the last pose"),
+        ("long ago", "the stamp of a pose that is kept"),
+        ("not finite", "thread/observation"),
+        ("another thread", "it is of another one"),
+        ("pieces doubled", "another one shows the thread already"),
+        ("ten thousand points", "2 to 4096"),
+    ],
+)
+def test_an_observation_that_cannot_be_used_is_survived_and_reported(bench: Bench, name: str, words: str):
+    for k in range(3):
+        bench.show(k)
+    offset, observation = spoiled(name)
+    bench.observe(3.0 + offset, observation)
+    bench.pose(3)
+    bench.graph.wait(lambda: len(bench.estimated) == 4, "an estimate")
+    bench.graph.wait(bench.hears(words), "the reason")
+    for k in range(4, COUNT):
+        message = bench.show(k)
+        assert not message.prediction_only
+    assert error(message, COUNT - 1) < 0.1
+
+
+def test_the_estimate_goes_on_after_a_minute_without_an_observation(bench: Bench):
+    bench.show(0)
+    late = WAY[1]
+    at = stamp(1800)
+    bench.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(at, late.tail, late.heading))
+    bench.graph.wait(lambda: len(bench.estimated) == 2, "an estimate")
+    assert bench.estimated[-1].unmeasured_for == pytest.approx(60.0, abs=1e-6)
+    bench.observe(1801, whole(NODES[2], 2))
+    bench.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(stamp(1801), WAY[2].tail, WAY[2].heading))
+    bench.graph.wait(lambda: len(bench.estimated) == 3, "an estimate")
+    assert not bench.estimated[-1].prediction_only
+    assert error(bench.estimated[-1], 2) < 0.2
+
+
+def test_without_the_estimator_there_is_the_prediction_alone(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, estimator=False)
+    for k in range(3):
+        bench.observe(k, whole(NODES[k], k))
+        bench.pose(k)
+        graph.wait(lambda k=k: len(bench.margins) == k + 1, "margins")  # type: ignore[misc]
+    assert [(each.reason, each.source) for each in bench.margins] == [("", SafetyMargins.OF_PREDICTION)] * 3
+    assert not bench.estimated
