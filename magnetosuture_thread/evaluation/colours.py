@@ -1,6 +1,7 @@
-"""The colours of threads in plots, pictures and reports: told apart by red-green blind readers too.
+"""The colours of threads in plots, pictures and reports, which red-green blind readers tell apart too.
 
-Each thread also has a line of its own: the measured one is wide and light, the ground truth dashed.
+They are those of the operator's page. Each thread also has a line of its own: the measured one is wide and light, the
+ground truth dashed.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ class Colour(NamedTuple):
 
 
 INK = Colour("#1d2833", "#e3e9ee")
-MEASURED = Colour("#0f6fc6", "#63b3f7")
+MEASURED = Colour("#2f7bff", "#5b8cff")
 GROUND_TRUTH = INK  # dashed
-PREDICTED = Colour("#d55e00", "#ff9d66")
-ESTIMATED = Colour("#00855f", "#35d0a0")
+PREDICTED = Colour("#99107f", "#e83aae")
+ESTIMATED = Colour("#00a3a8", "#35e6cb")
 
 BY_NAME = {"measured": MEASURED, "ground-truth": GROUND_TRUTH, "predicted": PREDICTED, "estimated": ESTIMATED}
 

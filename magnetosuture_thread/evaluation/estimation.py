@@ -27,7 +27,8 @@ def hidden_part(frame: FrameResult, length: float) -> float:
     """Return the part of the thread that a frame's measurement does not show, 0 to 1.
 
     All of it is hidden where nothing was measured, or where no measurement went into the frame's estimate. Nothing is
-    where the observation is complete. A centreline alone, or pieces, show as much as they are long.
+    where the observation is complete. A centreline alone, or pieces, show as much as they are long; where neither was
+    kept, it is what the estimate says.
 
     Args:
         frame: with what was measured in it.
@@ -36,6 +37,8 @@ def hidden_part(frame: FrameResult, length: float) -> float:
     if frame.estimate is not None and not frame.estimate.corrected:
         return 1.0
     if frame.observation is None:
+        if frame.estimate is not None and not len(frame.measured):
+            return frame.estimate.hidden
         pieces = [frame.measured]
     elif frame.observation.complete:
         return 0.0

@@ -71,18 +71,20 @@ class EstimatedThread:
         corrected: whether a measurement went into it; otherwise it is only a prediction.
         squared: normalised innovation squared of each window of arc length, shape (w,); nan where nothing is measured.
         disturbances: what the model does not know.
+        hidden: part of the thread that no point shows, 0 to 1.
     """
 
     vertices: Points
     corrected: bool = False
     squared: Array = field(default_factory=lambda: np.empty(0))
     disturbances: tuple[Disturbance, ...] = ()
+    hidden: float = 1.0
 
     @classmethod
     def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
         """Return what is kept of an estimate."""
         squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
-        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances)
+        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
 
 
 @dataclass

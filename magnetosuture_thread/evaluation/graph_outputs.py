@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from magnetosuture_thread import interface
-from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.errors import GraphError, InvalidInputError
 from magnetosuture_thread.evaluation.currents import CurrentDifference
 from magnetosuture_thread.evaluation.currents import CurrentSeries as CurrentSeries
 from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
-from magnetosuture_thread.evaluation.frames import Array, FrameResult
+from magnetosuture_thread.evaluation.frames import Array, EstimatedThread, FrameResult
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, finite_or_none
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose
+from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose, thread_observation
+from magnetosuture_thread.model.estimator import Disturbance
+from magnetosuture_thread.thread_observation import ThreadObservation
 
 TRACKED = 1  # as in the message TrackerState
 WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the ground truth, or ...
@@ -26,7 +29,9 @@ OF_FRAMES = {
     for c in (
         interface.NEEDLE_POSE,
         interface.MEASURED_THREAD,
+        interface.THREAD_OBSERVATION,
         interface.PREDICTED_THREAD,
+        interface.ESTIMATED_THREAD,
         interface.MARGINS,
         interface.GROUND_TRUTH_THREAD,
     )
@@ -72,8 +77,12 @@ class GraphCollector:
             frame.measured = _path(message)
         elif topic == interface.GROUND_TRUTH_THREAD.recorded:
             frame.ground_truth = _path(message)
+        elif topic == interface.THREAD_OBSERVATION.recorded:
+            frame.observation = _observation(message)
+        elif topic == interface.ESTIMATED_THREAD.recorded:
+            frame.estimate = _estimate(message)  # a later one of the same frame takes its place
         elif topic == interface.PREDICTED_THREAD.recorded:
-            frame.vertices = np.array([[p.x, p.y] for p in message.positions]).reshape(-1, 2)
+            frame.vertices = _points(message.positions)
             frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
             frame.residual, frame.step_time = message.residual, message.step_time
         elif message.valid:
@@ -100,7 +109,41 @@ class GraphCollector:
 
 
 def _path(message: Any) -> Points:
-    return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
+    return _points(each.pose.position for each in message.poses)
+
+
+def _points(points: Iterable[Any]) -> Points:
+    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
+
+
+def _observation(message: Any) -> ThreadObservation:
+    try:
+        return thread_observation(message, interface.THREAD_OBSERVATION.name)
+    except InvalidInputError:
+        return ThreadObservation()
+
+
+def _estimate(message: Any) -> EstimatedThread:
+    degrees = int(message.innovation_degrees)
+    disturbances = tuple(
+        Disturbance(
+            found.arc_length,
+            found.extent,
+            np.array([found.position.x, found.position.y]),
+            np.array([found.direction.x, found.direction.y]),
+            found.force,
+            found.significance,
+            nanoseconds(found.since) * 1e-9,
+        )
+        for found in message.disturbances
+    )
+    return EstimatedThread(
+        _points(message.positions),
+        not message.prediction_only,
+        np.full(degrees, message.innovation_squared / max(degrees, 1)),
+        disturbances,
+        message.hidden,
+    )
 
 
 @dataclass(frozen=True)

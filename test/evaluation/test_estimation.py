@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -186,14 +188,22 @@ def test_each_thread_has_a_colour_of_its_own_for_the_colour_blind_too():
     """Distances in CIE Lab as red-green blind readers see them (Machado 2009) of what is drawn as a plain line."""
     deuteranopia = [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
     protanopia = [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
-    names = list(colours.BY_NAME)
-    for ground in ("light", "dark"):
+    for ground, names in (("light", list(colours.BY_NAME)), ("dark", ["measured", "predicted", "estimated"])):
         linear = [linear_rgb(getattr(colours.BY_NAME[name], ground)) for name in names]
         for seen_by in (np.eye(3), np.array(deuteranopia), np.array(protanopia)):
             lab = [cie_lab(seen_by @ each) for each in linear]
             for a in range(len(names)):
                 for b in range(a):
                     assert np.linalg.norm(lab[a] - lab[b]) > 20.0, (names[a], names[b], ground)
+
+
+def test_the_colours_are_those_of_the_operator_s_page():
+    page = files("magnetosuture_thread.console").joinpath("page", "colours.js").read_text(encoding="utf-8")
+    given = dict(re.findall(r'export const (\w+) = "(#\w{6}|rgba\([^)]*\))"', page))
+    assert given["ESTIMATED"] == colours.ESTIMATED.light
+    assert given["MODEL"] == colours.PREDICTED.light
+    parts = [int(part) for part in re.findall(r"\d+", given["MEASURED"])[:3]]
+    assert "#" + "".join(f"{part:02x}" for part in parts) == colours.MEASURED.light
 
 
 def linear_rgb(colour: str) -> np.ndarray:
