@@ -134,6 +134,8 @@ def _predict(given: BagInput, model: ThreadModelSettings, metrics: RunMetrics, s
                 step.result.prediction,
                 step.margins,
                 step.step_time,
+                estimate=step.result.estimate,
+                estimated=step.settings.is_estimated,
                 recorded=recorded.of(step.observation.stamp),
                 obstacles=step.scene.obstacles if step.scene is not None else (),
             )

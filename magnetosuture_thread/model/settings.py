@@ -329,6 +329,11 @@ class ThreadModelSettings(Configuration):
         predictor.warm_up()
         return predictor
 
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the thread is estimated too."""
+        return self.estimator and self.formulation == "rod" and self.medium == "liquid"
+
     def estimator_session(self, scene: Scene | None) -> EstimatorSession | None:
         """Return an estimator of this thread in a scene, its kernels compiled; None where it is not estimated.
 
@@ -338,7 +343,7 @@ class ThreadModelSettings(Configuration):
         Raises:
             ConfigurationError: see `predictor`.
         """
-        if not self.estimator or self.formulation != "rod" or self.medium != "liquid":
+        if not self.is_estimated:
             return None
         options = {about.name: getattr(self, f"estimator_{about.name}") for about in fields(EstimatorOptions)}
         estimator = ThreadEstimator(self.predictor(scene), EstimatorOptions(**options))
