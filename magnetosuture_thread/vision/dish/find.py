@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.vision.dish.robust_fits import fit_circle
 from magnetosuture_thread.vision.sampling import rim_along_rays
 
 RAYS = 180
@@ -149,18 +150,7 @@ def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:
 
 
 def _fit_circle(points: np.ndarray, agreement: float) -> tuple[float, float, float, int] | None:
-    """Fit a circle by least squares, leaving out what is far from it; None with too few points."""
-    kept = points
-    for tolerance in (8.0 * agreement, 3.0 * agreement, agreement):
-        if len(kept) < 20:
-            return None
-        # Around the mean, where the normal equations are well conditioned.
-        mean = kept.mean(axis=0)
-        offset = kept - mean
-        system = np.column_stack([2.0 * offset, np.ones(len(kept))])
-        u, v, rest = np.linalg.solve(system.T @ system, system.T @ (offset**2).sum(axis=1))
-        radius = float(np.sqrt(max(rest + u * u + v * v, 0.0)))
-        u, v = mean + np.array([u, v])
-        distance = np.abs(np.hypot(points[:, 0] - u, points[:, 1] - v) - radius)
-        kept = points[distance < tolerance]
-    return float(u), float(v), radius, len(kept)
+    """Return centre and radius of a circle, and how many points agree on it; None if too few do. See `fit_circle`."""
+    circle = np.empty(3)
+    agreeing = fit_circle(points, agreement, circle)
+    return (float(circle[0]), float(circle[1]), float(circle[2]), agreeing) if agreeing else None

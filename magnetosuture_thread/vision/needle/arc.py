@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magnetosuture_thread.compiled import compiled
+
 
 @dataclass(frozen=True)
 class Arc:
@@ -32,15 +34,10 @@ class Arc:
         p = start + s sinc(k s / 2) (cos b, sin b) + d (-sin c, cos c),  b = angle + k s / 2,  c = angle + k s
         """
         s = np.asarray(along, dtype=float)
-        chord = s * np.sinc(self.curvature * s / (2.0 * math.pi))
-        middle, turned = self.angle + 0.5 * self.curvature * s, self.angle + self.curvature * s
-        return np.stack(
-            [
-                self.start[0] + chord * np.cos(middle) - aside * np.sin(turned),
-                self.start[1] + chord * np.sin(middle) + aside * np.cos(turned),
-            ],
-            axis=-1,
-        )
+        result = np.empty((s.size, 2))
+        apart = np.full(s.size, aside) if np.ndim(aside) == 0 else np.broadcast_to(aside, s.shape).ravel()
+        _points(self.start[0], self.start[1], self.angle, self.curvature, s.ravel(), apart, result)
+        return result.reshape(*s.shape, 2)
 
     def direction(self, along: float = 0.0) -> np.ndarray:
         """Return the unit tangent after a length, shape (2,)."""
@@ -101,3 +98,14 @@ def fit_arc(points: np.ndarray) -> Arc:
     foot = mean + normal * (-2.0 * d / (gradient + root))
     # Across the tangent (n_v, -n_u) lies the normal itself, and the circle's centre lies against it where a > 0.
     return Arc(foot, math.atan2(-normal[0], normal[1]), -2.0 * a)
+
+
+@compiled
+def _points(u, v, angle, curvature, along, aside, points):
+    """Fill in the points of an arc; see `Arc.at`."""
+    for index in range(len(along)):
+        half = 0.5 * curvature * along[index]
+        chord = along[index] if abs(half) < 1e-9 else along[index] * math.sin(half) / half
+        middle, turned = angle + half, angle + 2.0 * half
+        points[index, 0] = u + chord * math.cos(middle) - aside[index] * math.sin(turned)
+        points[index, 1] = v + chord * math.sin(middle) + aside[index] * math.cos(turned)
