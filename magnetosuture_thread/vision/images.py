@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,11 +31,13 @@ class Layer:
         pixels: shape (rows, columns), uint8.
         small: the same, shrunk by area.
         floor: how bright what is behind all slender things is, in the pixels of `small`.
+        cleared: the last needle that was taken out of it, and the pixels without; see `without_needle`.
     """
 
     pixels: np.ndarray
     small: np.ndarray
     floor: np.ndarray
+    cleared: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def replaced(self, pixels: np.ndarray) -> Layer:
         """Return the layer with other pixels."""
