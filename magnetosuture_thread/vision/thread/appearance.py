@@ -123,7 +123,7 @@ def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, vis
     width = STEP_PX * (right - left + 1)
     floor = aside[:: round(1.0 / STEP_PX)]
     floor = floor[np.abs(floor) > 0.5 * width + 3.0]
-    raw = _profiles(picture.darkest.pixels, points, floor, shown)
+    raw = np.rint(_profiles(picture.darkest.pixels, points, floor, shown))  # Between pixels there is less noise.
     noise = 1.4826 * middle(np.abs(np.diff(raw, axis=1))) / math.sqrt(2.0)
     half = 0.5 * width + BESIDE_PX
     darkness = np.array([np.median(each) for each in _integrals(picture, points[shown], half, pale)])
