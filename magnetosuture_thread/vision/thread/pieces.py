@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.sampling import middle
@@ -151,16 +152,29 @@ def _clear(fresh: NDArray[np.uint8], line: Points, reach: float) -> None:
 def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
     """Return the parts of a line that run along no known one, nor along itself; they may cross them."""
     line = respaced(line, 1.0)
-    apart = ((line[:, None] - line[None]) ** 2).sum(axis=2)
-    index = np.arange(len(line))
-    twice = ((apart < TWICE_PX**2) & (index[None] < index[:, None] - MAX_TWICE_PX)).any(axis=1)
-    if known:
-        others = np.vstack([respaced(other, 1.0) for other in known])
-        twice |= ((line[:, None] - others[None]) ** 2).sum(axis=2).min(axis=1) < TWICE_PX**2
+    others = np.vstack([respaced(other, 1.0) for other in known]) if known else np.empty((0, 2))
+    twice = np.empty(len(line), np.bool_)
+    _mark_twice(line, others, twice)
     for first, last in runs(twice):
         if last - first < MAX_TWICE_PX and first > 0 and last < len(twice):
             twice[first:last] = False
     return [line[first:last] for first, last in runs(~twice) if last - first > 1]
+
+
+@compiled
+def _mark_twice(line, others, twice):
+    """Mark where a line with vertices 1 px apart comes near to other points, or to its own from long before."""
+    for index in range(len(line)):
+        u, v = line[index, 0], line[index, 1]
+        twice[index] = False
+        for own in range(index - int(MAX_TWICE_PX)):
+            if (line[own, 0] - u) ** 2 + (line[own, 1] - v) ** 2 < TWICE_PX**2:
+                twice[index] = True
+                break
+        for other in range(len(others)):
+            if twice[index]:
+                break
+            twice[index] = (others[other, 0] - u) ** 2 + (others[other, 1] - v) ** 2 < TWICE_PX**2
 
 
 def _is_thread(picture: Picture, gray: NDArray[np.uint8], thread: Appearance, hiding: Hiding, line: Points) -> bool:

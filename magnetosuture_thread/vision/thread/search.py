@@ -354,12 +354,18 @@ class ThreadSearch:
         """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
         scale = ridge.scale
         axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24)) - self._origin
-        at = np.round((axis - 0.5 * (scale - 1)) / scale * 16.0).astype(np.int32)
-        zone = np.zeros_like(ridge.strength)
+        axis = (axis - 0.5 * (scale - 1)) / scale
         thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / scale)
+        left, top = np.maximum(axis.min(axis=0) - thickness, 0.0).astype(int)
+        right, bottom = np.maximum(axis.max(axis=0) + thickness, 0.0).astype(int)
+        near = ridge.strength[top:bottom, left:right]
+        if not near.size:
+            return
+        zone = np.zeros_like(near)
+        at = np.round((axis - (left, top)) * 16.0).astype(np.int32)
         cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
         floor = ridge.noise if ridge.signed else 0.0
-        ridge.strength[(zone > 0) & (ridge.strength < floor + shade)] = floor
+        near[(zone > 0) & (near < floor + shade)] = floor
 
 
 def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
