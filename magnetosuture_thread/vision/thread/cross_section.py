@@ -27,6 +27,7 @@ NEAR, FAR = 3, 20  # vertices to both sides, over which an edge and the thread's
 BEND_PRICE = 1.0  # of a change of the shift by one step from vertex to vertex, in units of the log-likelihood
 MAX_CHANGE = 3  # steps, by which the shift may change from vertex to vertex
 WINDOW = 4  # vertices to both sides of a stretch, in which floor has to be the better explanation for a thread to end
+MIN_FLOOR = 1.0  # mean evidence against a thread in a stretch, where it ends
 EVEN = 2  # vertices to both sides, over which shifts are averaged
 ROUNDS = 2  # of measuring the colour and then the shift
 OUTLIER = 4.0  # deviations, beyond which a difference on the floor is none of noise
@@ -69,7 +70,7 @@ class CrossSection:
         the end is the greatest (maximum likelihood).
         """
         stretches = _mean(self.evidence[:, None], WINDOW)[:, 0]
-        floor = np.flatnonzero(stretches < 0.0)
+        floor = np.flatnonzero(stretches < -MIN_FLOOR)
         searched = self.evidence[: floor[0] + 1] if len(floor) else self.evidence
         count = int(np.argmax(np.cumsum(searched))) + 1
         return CrossSection(self.points[:count], self.half_width, self.evidence[:count], self.visible[:count])
