@@ -105,19 +105,16 @@ def _followed(
     search = ThreadSearch(picture, needle, max_length, centre, reach)
     dark = search.dark()
     enough = ENOUGH * max_length
-    if is_strong(dark, enough):
-        best, evidence = dark, 0.0
-    else:
-        best, evidence = _best_centred(search, dark, enough)
-    if len(best.points) >= MIN_CENTRED and search.is_edge(best):
+    best = dark if is_strong(dark, enough) else _best_centred(search, dark, enough)
+    whole = best is not dark and best.shown > enough
+    if not whole and len(best.points) >= MIN_CENTRED and search.is_edge(best):
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
-            centred, section = search.centred(wide)
-            return centred
+            return search.centred(wide)[0]
     return best
 
 
-def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> tuple[Walk, float]:
+def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
     """Return the walk with the greatest evidence for a thread that leaves the needle; at first at full size."""
     best, greatest = dark, 0.0
     for scale in SCALES:
@@ -131,4 +128,4 @@ def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> tuple[Walk
                 best, greatest = centred, section.mean * centred.shown
         if best.shown > enough:
             break
-    return best, greatest
+    return best
