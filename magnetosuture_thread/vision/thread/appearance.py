@@ -24,6 +24,8 @@ BESIDE_PX = 2.5  # from a thread's edge to the floor beside it
 BLUR_PX = 0.7  # of the picture, before it is sampled
 MIN_SHARE = 0.3  # of the usual darkness: below, the thread isn't visible
 FAINTEST = 3.0  # grey levels; less is noise
+SURE_STRENGTH = 2.0 * FAINTEST  # grey levels; of a fainter thread noise hides single points
+FAINT_SHARE = 0.4  # of its usual strength, that it shows in the mean where it is visible
 SMOOTHED_PX = 9.0  # along the thread, over which its darkness is averaged
 LOCAL_PX = 4.0  # along the thread, over which its middle is averaged
 MIN_DEVIATION_PX = 0.12  # of a middle: by pixels, compression, and the evening out of bends
@@ -167,6 +169,15 @@ def strengths(
     values = np.empty(len(points))
     middle_strengths(gray, points, thread.beside_px, thread.pale, two_sided, values)
     return values
+
+
+def faintly_visible(gray: NDArray[np.uint8], points: Points, thread: Appearance, spacing: float) -> NDArray[np.bool_]:
+    """Return where a thread is visible of which noise hides single points: by means across and along it, shape (m,)."""
+    reach = thread.beside_px
+    profiles = sampled(gray, across(points, np.array([-reach, -0.5, 0.0, 0.5, reach]))).astype(float)
+    differs = profiles[:, 1:-1].mean(axis=1) - 0.5 * (profiles[:, 0] + profiles[:, -1])
+    mean = smoothed(differs if thread.pale else -differs, spacing)
+    return np.asarray(mean > FAINT_SHARE * max(0.0, float(np.median(mean))))
 
 
 def smoothed(values: Values, spacing: float) -> Values:

@@ -70,11 +70,13 @@ def find_pieces(
         thread: how the piece looks that leaves the needle.
         hiding: areas where nothing can be seen.
         known: pieces that are known, each of shape (m, 2) [px].
-        max_length: of a piece [px].
+        max_length: of all these pieces: what is left of the thread, so that anything longer is none of it [px].
 
     Returns:
         Pieces in the picture's pixels, the longest first, each of shape (m, 2), m >= 2 [px].
     """
+    if max_length < MIN_LENGTH_PX:
+        return []
     ridge = two_sided_ridge(gray, thread, hiding)
     (u, v), reach = hiding.wall.centre, hiding.wall.radius - WALL_PX
     ridge[~hiding.inside] = 0
@@ -91,11 +93,12 @@ def find_pieces(
         seed = _seed(fresh, ridge)
         if seed is None:
             break
-        line = _traced(ridge, noise, faintest, seed, thread.strength, dish, max_length)
+        line = _traced(ridge, noise, faintest, seed, thread.strength, dish, max_length + MIN_LENGTH_PX)
         _clear(fresh, line, thread.beside_px)
         cv2.circle(fresh, (round(seed[0]), round(seed[1])), MIN_SEED_PX, 0, -1)
         for part in fresh_parts(line, known + found):
-            if arc_lengths(part)[-1] >= MIN_LENGTH_PX and _is_thread(picture, gray, thread, hiding, part):
+            long = MIN_LENGTH_PX <= arc_lengths(part)[-1] <= max_length
+            if long and _is_thread(picture, gray, thread, hiding, part):
                 found.append(part)
     return sorted(found, key=lambda line: -arc_lengths(line)[-1])
 
