@@ -15,6 +15,7 @@ from magnetosuture_thread.model.estimator.correction import (
     MeasuredPoints,
     correct,
 )
+from magnetosuture_thread.model.estimator.sensitivity import correct_sensitivities
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.predictor import ThreadPredictor
@@ -41,6 +42,25 @@ class CorrectionResult:
     off: float
     residual: float
     solved: bool
+
+
+@dataclass(frozen=True)
+class CorrectedSensitivities:
+    """What a correction makes of derivatives of the nodes by parameters, and what its residuals say of these.
+
+    Attributes:
+        corrected: V, shape (p, n + 1, 2) [D].
+        information: J, shape (p, p).
+        score: s, shape (p,).
+        square: squared innovations over their covariance, nu' S^-1 nu.
+        independent: number of independent points.
+    """
+
+    corrected: NDArray[np.float64]
+    information: NDArray[np.float64]
+    score: Vector
+    square: float
+    independent: float
 
 
 class Corrector:
@@ -116,3 +136,33 @@ class Corrector:
             if code != NO_ROOM:
                 return CorrectionResult(solves, off, max(residuals), code == CORRECTED and off <= 1.0)
             self._use(self._buffers.enlarged())
+
+    def sensitivities(
+        self,
+        start: Points,
+        density: Vector,
+        points: MeasuredPoints,
+        weights: Vector,
+        end: tuple[float, float],
+        sensitivities: NDArray[np.float64],
+    ) -> CorrectedSensitivities:
+        """Return what the last correction, of the same arguments, makes of derivatives of the nodes, shape (p, n + 1, 2)."""
+        count = len(sensitivities)
+        corrected, information, score = np.empty_like(sensitivities), np.empty((count, count)), np.empty(count)
+        scale = max(float((1.0 / density[1:]).max()), float((points.share / points.variance).max()))  # as in `correct`
+        square, independent = correct_sensitivities(
+            (0, 1),
+            points,
+            weights,
+            end,
+            start,
+            self.work.moved,
+            self.work.known,
+            scale,
+            self.solver_buffers.band,
+            sensitivities,
+            corrected,
+            information,
+            score,
+        )
+        return CorrectedSensitivities(corrected, information, score, square, independent)

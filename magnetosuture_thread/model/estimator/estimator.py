@@ -33,6 +33,7 @@ from magnetosuture_thread.model.estimator.pieces import (
     place_pieces,
     smoothed_line,
 )
+from magnetosuture_thread.model.estimator.slow_parameters import SlowParameters
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -75,6 +76,7 @@ class ThreadEstimator:
         self._unit = self.thread.segment_length
         self._length = max(self.options.error_correlation * self.thread.segments, 0.5)
         self._corrector = Corrector(predictor, formulation, self._length)
+        self._slow = SlowParameters(predictor, self.options)
         self._work, self._added = np.empty(nodes), np.empty(nodes)
         self._prediction: Prediction | None = None
         self._converged = False
@@ -88,6 +90,7 @@ class ThreadEstimator:
         self._test = DisturbanceTest(self.thread, self.options.disturbance_time)
         self._measured_at = -math.inf
         self._gross, self._unknown = 0, True
+        self._slow.reset()
 
     @property
     def started(self) -> bool:
@@ -155,7 +158,7 @@ class ThreadEstimator:
             SolverError: see `ThreadPredictor.step`.
         """
         before = self.predictor.state
-        self._prediction = self.predictor.step(pose)
+        self._prediction = self._slow.step(pose)
         self._converged = self._prediction.converged
         state = self.predictor.state
         assert before is not None
@@ -186,7 +189,26 @@ class ThreadEstimator:
         points = measured_points(placed, nodes, unit, workspace, 0.5 * self.thread.diameter, scale, problems)
         if points is None:
             return self._estimate(tuple(problems))
-        return self._corrected(points, free_end(placed, nodes, float(self._variance[-1])), pose, state, problems)
+        end = free_end(placed, nodes, float(self._variance[-1]))
+        if (moved := self._learn_parameters(points, end, pose, state)) is not state:
+            state, nodes = moved, moved.positions / unit
+            end = free_end(placed, nodes, float(self._variance[-1]))
+            again = measured_points(placed, nodes, unit, workspace, 0.5 * self.thread.diameter, scale, problems := [])
+            points = again if again is not None else points
+        return self._corrected(points, end, pose, state, problems)
+
+    def _learn_parameters(
+        self, points: MeasuredPoints, end: tuple[float, float], pose: NeedlePose, state: ThreadState
+    ) -> ThreadState:
+        """Learn the slow parameters; return where the thread is predicted with them."""
+        if not self._slow.kinds:
+            return state
+        weights, noise = np.ones(len(points.place)), np.empty(self.thread.segments + 1)
+        interpolate_to_nodes(self._noise.intensity, len(noise), noise)
+        weigh(points, self._variance, weights, self._sums)
+        density, start = np.maximum(self._density, MIN_VARIANCE), np.ascontiguousarray(state.positions / self._unit)
+        done = self._corrector.solve(start, pose.heading, density, noise / self._unit**2, points, weights, end)
+        return self._slow.learn(self._corrector, start, density, points, weights, end, pose, state) if done.solved else state
 
     def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
@@ -218,6 +240,7 @@ class ThreadEstimator:
         self._set_variance(known + (self.options.initial_error * np.maximum(arcs - end, 0.0)) ** 2)
         self._noise = NoiseModel(self.options.noise_time)
         self._test = DisturbanceTest(self.thread, self.options.disturbance_time)
+        self._slow.restart()
         return laid
 
     def _corrected(
@@ -244,6 +267,7 @@ class ThreadEstimator:
             return self._estimate(tuple(problems), innovations=innovations, points=len(weights))
         self._density, self._variance = density, np.empty(segments + 1)
         work = self._corrector.work
+        self._slow.correct(self._corrector, start, density, points, weights, end)
         hidden = take_over(points, weights, work, density, self._variance, self._applied)
         shift_errors(self._noise.bank, self._applied * unit)
         elapsed = elapsed if math.isfinite(elapsed) else 0.0
@@ -328,6 +352,7 @@ class ThreadEstimator:
             noise=self._noise.bank.intensity.copy(),
             disturbances=self._test.found(pose.stamp, positions),
             problems=problems,
+            slow_parameters=self._slow.report(),
             compute_rows=compute_rows,
             contact_tolerance=self.predictor.contact_tolerance,
         )
@@ -350,6 +375,7 @@ class ThreadEstimator:
             self._measured_at,
             self._gross,
             self._unknown,
+            self._slow.state,
         )
 
     def restore(self, kept: FilterState) -> None:
@@ -360,3 +386,4 @@ class ThreadEstimator:
         self._density, self._variance = kept.density.copy(), kept.variance.copy()
         self._noise, self._test = kept.noise.copied(), kept.test.copied()
         self._measured_at, self._gross, self._unknown = kept.measured_at, kept.gross, kept.unknown
+        self._slow.restore(kept.slow)

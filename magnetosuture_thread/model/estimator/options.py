@@ -22,9 +22,12 @@ class EstimatorOptions:
             length.
         disturbance_time: averaging time of the test for what the model does not know [s].
         history: how late an observation may come [s].
+        slow_parameters: what is learned on line, some of `stiffness_over_drag`, `drag_anisotropy`, `rest_curvature` and
+            `flow`; nothing by default.
+        slow_time: time over which those may change [s].
 
     Raises:
-        ConfigurationError: a value is not a positive number.
+        ConfigurationError: a value is not a positive number, or a parameter is unknown.
     """
 
     error_correlation: float = 0.1
@@ -34,10 +37,14 @@ class EstimatorOptions:
     initial_error: float = 0.2
     disturbance_time: float = 0.4
     history: float = 1.0
+    slow_parameters: tuple[str, ...] = ()
+    slow_time: float = 10.0
 
     def __post_init__(self) -> None:
         """Check the values."""
         for each in fields(self):
+            if each.name == "slow_parameters":
+                continue
             value = getattr(self, each.name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ConfigurationError(f"estimator.{each.name}", value, "a positive number")
