@@ -84,6 +84,7 @@ class Corrector:
         self._known[[0, *predictor.fixed_nodes]] = True
         self.work = CorrectionBuffers.of(nodes)
         self._solver = BandedSolver()
+        self._last: tuple[Points, MeasuredPoints, Vector, tuple[float, float], float]
         self._use(StepBuffers.of(nodes, 2, 3 * thread.segments + 1, 2 * nodes))
 
     def _use(self, buffers: StepBuffers) -> None:
@@ -113,6 +114,7 @@ class Corrector:
         """
         rod = self._formulation.rod
         stiffness = rod.bending_stiffness / (rod.drag_across * self._unit**4)
+        scale = max(float((1.0 / density[1:]).max()), float((points.share / points.variance).max()))  # as in `correct`
         while True:
             self.work.known[:] = self._known
             code, solves, off, residuals = correct(
@@ -134,22 +136,15 @@ class Corrector:
                 RESIDUAL_TOLERANCE,
             )
             if code != NO_ROOM:
+                self._last = (start, points, weights, end, scale)
                 return CorrectionResult(solves, off, max(residuals), code == CORRECTED and off <= 1.0)
             self._use(self._buffers.enlarged())
 
-    def sensitivities(
-        self,
-        start: Points,
-        density: Vector,
-        points: MeasuredPoints,
-        weights: Vector,
-        end: tuple[float, float],
-        sensitivities: NDArray[np.float64],
-    ) -> CorrectedSensitivities:
-        """Return what the last correction, of the same arguments, makes of derivatives of the nodes, shape (p, n + 1, 2)."""
+    def sensitivities(self, sensitivities: NDArray[np.float64]) -> CorrectedSensitivities:
+        """Return what the last correction makes of derivatives of the nodes, shape (p, n + 1, 2) [D]."""
         count = len(sensitivities)
         corrected, information, score = np.empty_like(sensitivities), np.empty((count, count)), np.empty(count)
-        scale = max(float((1.0 / density[1:]).max()), float((points.share / points.variance).max()))  # as in `correct`
+        start, points, weights, end, scale = self._last
         square, independent = correct_sensitivities(
             (0, 1),
             points,

@@ -208,7 +208,9 @@ class ThreadEstimator:
         weigh(points, self._variance, weights, self._sums)
         density, start = np.maximum(self._density, MIN_VARIANCE), np.ascontiguousarray(state.positions / self._unit)
         done = self._corrector.solve(start, pose.heading, density, noise / self._unit**2, points, weights, end)
-        return self._slow.learn(self._corrector, start, density, points, weights, end, pose, state) if done.solved else state
+        if not done.solved:
+            return state
+        return self._slow.learn(self._corrector, state, pose.stamp)
 
     def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
@@ -267,8 +269,8 @@ class ThreadEstimator:
             return self._estimate(tuple(problems), innovations=innovations, points=len(weights))
         self._density, self._variance = density, np.empty(segments + 1)
         work = self._corrector.work
-        self._slow.correct(self._corrector, start, density, points, weights, end)
         hidden = take_over(points, weights, work, density, self._variance, self._applied)
+        self._slow.correct(self._corrector, self._variance)
         shift_errors(self._noise.bank, self._applied * unit)
         elapsed = elapsed if math.isfinite(elapsed) else 0.0
         own = self._sums.own * unit**2

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 
 from magnetosuture_thread.errors import ConfigurationError
 
+SLOW_PARAMETERS = ("stiffness_over_drag", "drag_anisotropy", "rest_curvature", "flow")
+
 
 @dataclass(frozen=True)
 class EstimatorOptions:
@@ -22,8 +24,7 @@ class EstimatorOptions:
             length.
         disturbance_time: averaging time of the test for what the model does not know [s].
         history: how late an observation may come [s].
-        slow_parameters: what is learned on line, some of `stiffness_over_drag`, `drag_anisotropy`, `rest_curvature` and
-            `flow`; nothing by default.
+        slow_parameters: what is learned on line, some of `SLOW_PARAMETERS`; nothing by default.
         slow_time: time over which those may change [s].
 
     Raises:
@@ -42,6 +43,9 @@ class EstimatorOptions:
 
     def __post_init__(self) -> None:
         """Check the values."""
+        for name in self.slow_parameters:
+            if name not in SLOW_PARAMETERS:
+                raise ConfigurationError("estimator.slow_parameters", name, f"some of {', '.join(SLOW_PARAMETERS)}")
         for each in fields(self):
             if each.name == "slow_parameters":
                 continue

@@ -1,29 +1,59 @@
-"""Slow parameters on line: what the thread and the liquid are, learned from the same points as the thread's place.
+"""Slow parameters on line: what thread and liquid are like, learned from the points that correct the thread's place.
 
-DOC
+The parameters x (logarithms of what is positive) are constant but for a slow forgetting. Together with the thread's
+place they are one Kalman filter, kept in two parts: the place with its gain as it is, and the derivatives V_j of the
+estimated nodes by the parameters, which say where the thread would be estimated had they been others. Each frame
+
+    U_j = (step(x + e_j; place + V_j e) - step(x; place)) / e       by a step of the same program for each parameter
+    J, s = information and score of the innovations                 see `sensitivity`
+    I+ = I - forgotten + J,    x+ = x + I+^-1 s,    place = predicted + sum_j U_j (x+_j - x_j)
+
+and the thread is then corrected from where the model with the new parameters would have predicted it. So a new value
+is no jump: the place moves by what was wrong because of the parameter, through the hard constraints, and no more.
+
+Forgetting: in the directions in which a frame informs (the eigenvectors of J against I), I loses at most as much as
+J brings, and at most the share dt / T. Without excitation nothing is learned and nothing is forgotten: values and
+intervals stay to the last bit. A parameter is excited where what is not known of it beforehand would move the
+predicted thread by more than the last estimate was uncertain; noise of the camera bends the estimate by less than
+that, and says nothing about stiffness.
+
+Interval: half of it is
+
+    t sqrt(phi_j (I^-1)_jj) + CHAIN L sum_k |U_jk| / (r_j sum_k |U_jk|^2),    r_j^2 = 1 / ((I^-1)_jj I_jj)
+
+phi_j is the mean square of the scores of blocks of time over what the filter expects, at least 1: errors that last
+are no noise. The second term is an error of the whole chain of camera, tracker and model along the parameter's effect
+in the frames k, of which no other parameter makes up for the share r_j; no block of time can show it, see
+`calibration/identifiability.py`.
+
+Source: B. Friedland, Treatment of bias in recursive filtering, 1969; directional forgetting, R. Kulhavy 1987, for
+several outputs B. Lai, D. S. Bernstein 2024. Deviation: derivatives by differences of the program's steps, at the
+active set that these find; forgetting bounded by what is learned.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError, SolverError
-from magnetosuture_thread.model.estimator.corrector import CorrectedSensitivities
+from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.model.estimator.corrector import Corrector
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
+from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_95
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
-from magnetosuture_thread.model.settings import MAX_REST_ANGLE
-from magnetosuture_thread.model.thread import Thread
 
 Vector = NDArray[np.float64]
 
 DIFFERENCE = 1e-3  # of the prior deviation, in difference quotients
-NORMAL_95 = 1.959963984540054
+MAX_CHANGE = 0.5  # of the prior deviation, by a frame: beyond, the derivatives say little
+BLOCKS = 5  # of time, in the time over which parameters may change
+STUDENT_95 = 2.262  # of 2 * BLOCKS - 1 degrees of freedom: so many blocks count, the older ones for less
+CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time, as in `calibrate`
+MAX_ELAPSED = 1.0  # s; between two frames, in which something can be forgotten
 
 
 @dataclass(frozen=True)
@@ -36,7 +66,7 @@ class SlowParameter:
         value: that the estimate uses.
         low: lower end of its 95 % interval, within its bounds.
         high: upper end.
-        excited: whether the last measurements said something about it; if not, value and interval stay.
+        excited: whether the last measurement said something about it; if not, value and interval stay.
     """
 
     name: str
@@ -48,269 +78,214 @@ class SlowParameter:
 
 
 @dataclass(frozen=True)
-class ParameterKind:
-    """How a parameter enters a thread, and what is known of it beforehand.
-
-    Attributes:
-        name: of it.
-        unit: of its value.
-        logarithmic: whether it is positive and estimated as x = ln value, or else as x = value.
-        read: its value in a thread.
-        write: a thread with another value.
-        bounds: of its value.
-        deviation: of x, before anything is measured.
-    """
-
-    name: str
-    unit: str
-    logarithmic: bool
-    read: Callable[[Thread], float]
-    write: Callable[[Thread, float], Thread]
-    bounds: Callable[[Thread], tuple[float, float]]
-    deviation: Callable[[Thread], float]
-
-    def to_x(self, value: float) -> float:
-        """Return x of a value."""
-        return math.log(value) if self.logarithmic else value
-
-    def from_x(self, x: float) -> float:
-        """Return the value of x."""
-        return math.exp(x) if self.logarithmic else x
-
-
-def _stiffness(thread: Thread) -> float:
-    return thread.bending_stiffness / thread.medium.drag_across
-
-
-def _with_stiffness(thread: Thread, value: float) -> Thread:
-    return replace(thread, bending_stiffness=value * thread.medium.drag_across)
-
-
-def _anisotropy(thread: Thread) -> float:
-    return thread.medium.drag_along / thread.medium.drag_across
-
-
-def _with_anisotropy(thread: Thread, value: float) -> Thread:
-    return replace(thread, medium=replace(thread.medium, drag_along=value * thread.medium.drag_across))
-
-
-def _curvature(thread: Thread) -> float:
-    return float(np.mean(thread.rest_curvature))
-
-
-def _with_curvature(thread: Thread, value: float) -> Thread:
-    """Return a thread whose curvature at rest is that on the average, and differs along it as before."""
-    if isinstance(thread.rest_curvature, tuple):
-        more = value - _curvature(thread)
-        return replace(thread, rest_curvature=tuple(each + more for each in thread.rest_curvature))
-    return replace(thread, rest_curvature=value)
-
-
-def _max_curvature(thread: Thread) -> tuple[float, float]:
-    most = min(2000.0, 0.99 * MAX_REST_ANGLE / thread.segment_length)
-    return -most, most
-
-
-def _flow(axis: int) -> ParameterKind:
-    def read(thread: Thread) -> float:
-        return (thread.medium.flow or (0.0, 0.0))[axis]
-
-    def write(thread: Thread, value: float) -> Thread:
-        both = list(thread.medium.flow or (0.0, 0.0))
-        both[axis] = value
-        return replace(thread, medium=replace(thread.medium, flow=tuple(both)))
-
-    return ParameterKind(
-        f"flow_{'xy'[axis]}", "m/s", False, read, write, lambda thread: (-MAX_FLOW, MAX_FLOW), lambda thread: FLOW
-    )
-
-
-STIFFNESS_RANGE = 1e3  # within this factor of what is set, as `calibrate` looks for it
-MAX_FLOW, FLOW = 0.02, 2e-3  # m/s; the second its prior deviation
-KINDS = {
-    "stiffness_over_drag": (
-        ParameterKind(
-            "stiffness_over_drag",
-            "m^4/s",
-            True,
-            _stiffness,
-            _with_stiffness,
-            lambda thread: (_stiffness(thread) / STIFFNESS_RANGE, _stiffness(thread) * STIFFNESS_RANGE),
-            lambda thread: math.log(10.0) / NORMAL_95,
-        ),
-    ),
-    "drag_anisotropy": (
-        ParameterKind(
-            "drag_anisotropy",
-            "",
-            True,
-            _anisotropy,
-            _with_anisotropy,
-            lambda thread: (0.05, 1.0),
-            lambda thread: math.log(3.0) / NORMAL_95,
-        ),
-    ),
-    "rest_curvature": (
-        ParameterKind(
-            "rest_curvature",
-            "1/m",
-            False,
-            _curvature,
-            _with_curvature,
-            _max_curvature,
-            lambda thread: 2.0 / thread.length,
-        ),
-    ),
-    "flow": (_flow(0), _flow(1)),
-}
-
-
-@dataclass(frozen=True)
 class LearnedState:
-    """What is known of the parameters; arrays are never written to.
+    """What is known of p parameters; arrays are never written to.
 
     Attributes:
         x: of the parameters, shape (p,).
         information: inverse of their covariance, shape (p, p).
         sensitivities: derivatives of the nodes and of their velocities by x, shape (2, p, n + 1, 2) [m], [m/s].
-        activity: of each parameter, shape (p,).
+        stamp: of the last measurement [s].
+        deviation: root mean square of those of the nodes after the last correction [m].
+        excited: by it, shape (p,).
+        effect: sums over frames of how far each moves the thread, squared and as it is, by unit of x, shape (2, p).
+        block: sums of scores and of their expected squares in the block under way, shape (2, p).
+        block_time: since it began [s].
+        spread: sums over blocks of squared scores and of what was expected, shape (2, p).
     """
 
     x: Vector
     information: NDArray[np.float64]
     sensitivities: NDArray[np.float64]
-    activity: Vector
+    stamp: float
+    deviation: float
+    excited: NDArray[np.bool_]
+    effect: NDArray[np.float64]
+    block: NDArray[np.float64]
+    block_time: float
+    spread: NDArray[np.float64]
 
 
 class SlowParameters:
-    """Learns parameters while a predictor runs.
+    """Learns parameters of the thread while its predictor runs; with none it does nothing.
 
     Args:
         predictor: of the estimator.
-        names: of the parameters, keys of `KINDS`.
-        time: over which they may change [s].
+        options: which parameters, and over what time they may change.
 
-    Raises:
-        ConfigurationError: a name is unknown, or the medium is none that drags.
+    Attributes:
+        kinds: of the parameters.
+        state: what is known of them.
     """
 
     def __init__(self, predictor: ThreadPredictor, options: EstimatorOptions) -> None:
-        names, self._time = options.slow_parameters, options.slow_time
-        self._predictor, self._thread = predictor, predictor.thread
-        self.kinds = tuple(kind for name in dict.fromkeys(names) for kind in KINDS[name])
+        self._predictor, self._thread, self._time = predictor, predictor.thread, options.slow_time
         thread = self._thread
+        self.kinds = tuple(kind for name in dict.fromkeys(options.slow_parameters) for kind in KINDS[name])
         self._start = np.array([kind.to_x(kind.read(thread)) for kind in self.kinds])
         bounds = np.array([[kind.to_x(each) for each in kind.bounds(thread)] for kind in self.kinds]).reshape(-1, 2)
-        self._low, self._high = bounds[:, 0], bounds[:, 1]
+        # What is set counts, even where nobody would look for it.
+        self._low, self._high = np.minimum(bounds[:, 0], self._start), np.maximum(bounds[:, 1], self._start)
         self._deviation = np.array([kind.deviation(thread) for kind in self.kinds])
-        self._low, self._high = np.minimum(self._low, self._start), np.maximum(self._high, self._start)
-        self.state = self._fresh()
-
-    def _fresh(self) -> LearnedState:
-        count, nodes = len(self.kinds), self._thread.segments + 1
-        return LearnedState(
-            self._start.copy(), np.diag(self._deviation**-2.0), np.zeros((2, count, nodes, 2)), np.zeros(count)
-        )
-
-    def restart(self) -> None:
-        """Forget how the thread's place depends on the parameters, as where it is laid along a measured line."""
-        self.state = replace(self.state, sensitivities=np.zeros_like(self.state.sensitivities))
-
-    def _thread_of(self, x: Vector) -> Thread:
-        thread = self._thread
-        for kind, each in zip(self.kinds, x.tolist(), strict=True):
-            thread = kind.write(thread, kind.from_x(each))
-        return thread
-
-    def use(self, x: Vector) -> None:
-        formulation = self._predictor.formulation
-        assert isinstance(formulation, RodFormulation)
-        formulation.set_thread(self._thread_of(x))
+        self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
-        self.restore(self._fresh())
+        count, nodes = len(self.kinds), self._thread.segments + 1
+        self.restore(
+            LearnedState(
+                self._start,
+                np.diag(self._deviation**-2.0),
+                np.zeros((2, count, nodes, 2)),
+                math.nan,
+                math.inf,
+                np.zeros(count, dtype=np.bool_),
+                np.zeros((2, count)),
+                np.zeros((2, count)),
+                0.0,
+                np.zeros((2, count)),
+            )
+        )
 
     def restore(self, state: LearnedState) -> None:
         """Go back to a state."""
         self.state = state
         if self.kinds:
-            self.use(state.x)
+            self._use(state.x)
+
+    def restart(self) -> None:
+        """Take the thread's place as one that does not depend on the parameters, as where it was measured whole."""
+        self.state = replace(self.state, sensitivities=np.zeros_like(self.state.sensitivities))
+
+    def _use(self, x: Vector) -> None:
+        thread, formulation = self._thread, self._predictor.formulation
+        for kind, each in zip(self.kinds, x.tolist(), strict=True):
+            thread = kind.write(thread, kind.from_x(each))
+        assert isinstance(formulation, RodFormulation)
+        formulation.set_thread(thread)
 
     def step(self, pose: NeedlePose) -> Prediction:
-        """Let the predictor follow the needle, and propagate the sensitivities with it."""
+        """Let the predictor follow the needle to its next pose, and propagate the derivatives with it.
+
+        Raises:
+            InvalidInputError, SolverError: see `ThreadPredictor.step`.
+        """
         predictor, state = self._predictor, self.state
         formulation, last_pose, before = predictor.formulation, predictor.pose, predictor.state
-        if not self.kinds or before is None:
+        if not self.kinds or last_pose is None or before is None:
             return predictor.step(pose)
         warm_start = formulation.warm_start()
         prediction = predictor.step(pose)
-        after, after_pose = predictor.state, predictor.pose
+        after, after_pose, kept = predictor.state, predictor.pose, formulation.warm_start()
         assert after is not None
-        kept = formulation.warm_start()
-        result = np.zeros_like(state.sensitivities)
-        for j, deviation in enumerate(self._deviation):
-            e = DIFFERENCE * deviation
-            x = state.x.copy()
-            x[j] += e if x[j] + e <= self._high[j] else -e
-            e = x[j] - state.x[j]
-            moved = ThreadState(
-                before.positions + e * state.sensitivities[0, j],
-                before.velocities + e * state.sensitivities[1, j],
-                before.interval,
-            )
-            self.use(x)
-            predictor.pose, predictor.state = last_pose, moved
+        sensitivities = np.zeros_like(state.sensitivities)
+        for j, by in enumerate(
+            np.where(state.x < 0.5 * (self._low + self._high), 1.0, -1.0) * DIFFERENCE * self._deviation
+        ):
+            moved = by * state.sensitivities[:, j]
+            if not np.abs(moved[0]).max() < 0.5 * self._thread.segment_length:
+                continue  # no derivative any more; it begins anew
+            self._use(state.x + by * (np.arange(len(state.x)) == j))
+            predictor.pose = last_pose
+            predictor.state = ThreadState(before.positions + moved[0], before.velocities + moved[1], before.interval)
             formulation.restore(warm_start)
             try:
                 predictor.step(pose)
-                result[0, j] = (predictor.state.positions - after.positions) / e
-                result[1, j] = (predictor.state.velocities - after.velocities) / e
             except SolverError:
-                pass
-        self.use(state.x)
+                continue
+            sensitivities[0, j] = (predictor.state.positions - after.positions) / by
+            sensitivities[1, j] = (predictor.state.velocities - after.velocities) / by
+        self._use(state.x)
         predictor.pose, predictor.state = after_pose, after
         formulation.restore(kept)
-        self.state = replace(state, sensitivities=result)
+        self.state = replace(state, sensitivities=sensitivities)
         return prediction
 
-    def correct(self, corrector, start, density, points, weights, end) -> None:
-        """Take what a correction makes of the sensitivities."""
-        if self.kinds:
-            unit, both = self._thread.segment_length, self.state.sensitivities.copy()
-            both[0] = unit * corrector.sensitivities(start, density, points, weights, end, both[0] / unit).corrected
-            self.state = replace(self.state, sensitivities=both)
+    def learn(self, corrector: Corrector, predicted: ThreadState, stamp: float) -> ThreadState:
+        """Learn from a frame; return where the thread is predicted with what was learned.
 
-    def learn(self, corrector, start, density, points, weights, end, pose, thread: ThreadState) -> ThreadState:
-        """Return the thread as predicted with what a frame says of the parameters."""
+        Args:
+            corrector: that has solved the correction of the predicted thread.
+            predicted: that thread.
+            stamp: of the frame [s].
+        """
         state, unit = self.state, self._thread.segment_length
-        elapsed = 1 / 30.0
-        said = corrector.sensitivities(start, density, points, weights, end, state.sensitivities[0] / unit)
-        fit = max(1.0, said.square / max(said.independent, 1.0))
-        self.debug = (said.square, said.independent, said.information.copy(), said.score.copy())
-        J, s = said.information / fit, said.score / fit
-        L = np.linalg.cholesky(state.information)
-        Li = np.linalg.inv(L)
-        mu, Q = np.linalg.eigh(Li @ J @ Li.T)
-        mu = np.maximum(mu, 0.0)
-        keep = 1.0 - np.minimum(1.0 - math.exp(-elapsed / self._time), mu)
-        basis = L @ Q
-        information = (basis * (keep + mu)) @ basis.T
-        change = np.linalg.solve(information, s)
-        largest = float(np.abs(change / self._deviation).max())
-        part = min(1.0, 0.5 / largest) if largest > 0 else 1.0
-        x = np.clip(state.x + part * change, self._low, self._high)
-        change = x - state.x
-        self.state = replace(state, x=x, information=information)
-        self.use(x)
-        shift = np.einsum("j,cjna->cna", change, state.sensitivities)
-        return ThreadState(thread.positions + shift[0], thread.velocities + shift[1], thread.interval)
+        found = corrector.sensitivities(state.sensitivities[0] / unit)
+        if not (np.isfinite(found.information).all() and np.isfinite(found.score).all()):
+            return predicted
+        moved = np.sqrt((state.sensitivities[0] ** 2).sum(axis=2).mean(axis=1))
+        excited = moved * self._deviation > state.deviation
+        # Where not even the innovations that are left are as expected, a frame says less.
+        both = excited / max(1.0, found.square / max(found.independent, 1.0))
+        information, score = np.outer(both, excited) * found.information, both * found.score
+        elapsed = min(stamp - state.stamp, MAX_ELAPSED) if math.isfinite(state.stamp) else 0.0
+        forgetting = -math.expm1(-elapsed / self._time)
+        before = np.linalg.inv(state.information)
+        expected = np.diag(information) + np.einsum("ij,jk,ki->i", information, before, information)
+        root = np.linalg.cholesky(state.information)
+        inverse = np.linalg.inv(root)
+        gained, basis = np.linalg.eigh(inverse @ information @ inverse.T)
+        gained, basis = np.maximum(gained, 0.0), root @ basis
+        new = (
+            (basis * (1.0 - np.minimum(forgetting, gained) + gained)) @ basis.T if excited.any() else state.information
+        )
+        change = np.linalg.solve(new, score)
+        change /= max(1.0, float(np.abs(change / self._deviation).max()) / MAX_CHANGE)
+        x = np.clip(state.x + change, self._low, self._high)
+        share = np.diag(information) / np.diag(state.information)
+        effect = state.effect * (1.0 - np.minimum(forgetting, share)) + np.where(
+            excited, np.array([moved**2, moved]), 0.0
+        )
+        self.state = self._with_block(
+            replace(state, x=x, information=new, stamp=stamp, excited=excited, effect=effect),
+            np.array([score, expected]),
+            elapsed if excited.any() else 0.0,
+        )
+        if not excited.any():
+            return predicted
+        self._use(x)
+        by = np.einsum("j,cjna->cna", x - state.x, state.sensitivities)
+        return ThreadState(predicted.positions + by[0], predicted.velocities + by[1], predicted.interval)
+
+    def correct(self, corrector: Corrector, variance: Vector) -> None:
+        """Take over what a correction makes of the derivatives.
+
+        Args:
+            corrector: that has solved it.
+            variance: of the nodes after it, shape (n + 1,) [D^2].
+        """
+        if self.kinds:
+            unit, sensitivities = self._thread.segment_length, self.state.sensitivities.copy()
+            found = corrector.sensitivities(sensitivities[0] / unit)
+            sensitivities[0] = unit * np.where(np.isfinite(found.corrected), found.corrected, 0.0)
+            deviation = unit * math.sqrt(max(float(variance.mean()), 0.0))
+            self.state = replace(self.state, sensitivities=sensitivities, deviation=deviation)
+
+    def _with_block(self, state: LearnedState, sums: NDArray[np.float64], elapsed: float) -> LearnedState:
+        """Return a state in which a frame's score is counted, and its block of time where that ends."""
+        block, time, spread = state.block + sums, state.block_time + elapsed, state.spread
+        if time >= self._time / BLOCKS:
+            keep = np.where(block[1] > 0.0, math.exp(-time / self._time), 1.0)
+            spread = keep * spread + np.array([block[0] ** 2, block[1]])
+            block, time = np.zeros_like(block), 0.0
+        return replace(state, block=block, block_time=time, spread=spread)
 
     def report(self) -> tuple[SlowParameter, ...]:
-        covariance = np.linalg.inv(self.state.information)
-        half = NORMAL_95 * np.sqrt(np.diag(covariance))
-        found = []
-        for j, kind in enumerate(self.kinds):
-            low, high = max(self.state.x[j] - half[j], self._low[j]), min(self.state.x[j] + half[j], self._high[j])
-            found.append(SlowParameter(kind.name, kind.unit, *(kind.from_x(float(v)) for v in (self.state.x[j], low, high)), True))
-        return tuple(found)
+        """Return the parameters as they are known now."""
+        state = self.state
+        if not self.kinds:
+            return ()
+        variance = np.diag(np.linalg.inv(state.information))
+        own = 1.0 / np.sqrt(variance * np.diag(state.information))  # of the effect of each, no other makes up for
+        ratio = np.maximum(state.spread[0] / np.maximum(state.spread[1], 1e-300), 1.0)
+        square, effect = state.effect
+        chain = CHAIN * self._thread.length * effect / (own * np.where(square > 0.0, square, 1.0))
+        half = np.minimum(STUDENT_95 * np.sqrt(ratio * variance) + chain, NORMAL_95 * self._deviation)
+        low, high = np.maximum(state.x - half, self._low), np.minimum(state.x + half, self._high)
+        values = [
+            [kind.from_x(float(x)) for x in ends] for kind, *ends in zip(self.kinds, state.x, low, high, strict=True)
+        ]
+        return tuple(
+            SlowParameter(kind.name, kind.unit, value, first, last, bool(excited))
+            for kind, (value, first, last), excited in zip(self.kinds, values, state.excited, strict=True)
+        )
