@@ -80,8 +80,11 @@ class EstimatorSession:
         moment = other._moments[-1]
         state = kept.resampled(before.thread, now.thread, now.options)
         prediction = _carried_over(state, now.predictor)
-        # The multipliers of other rows are no warm start.
-        now.restore(replace(state, prediction=prediction, warm_start=now.predictor.formulation.warm_start()))
+        # What was learned of another thread, or of other parameters, says nothing of this one; and the multipliers of
+        # other rows are no warm start.
+        same = now.thread == before.thread and now.options.slow_parameters == before.options.slow_parameters
+        slow, warm_start = kept.slow if same else now.learned, now.predictor.formulation.warm_start()
+        now.restore(replace(state, prediction=prediction, warm_start=warm_start, slow=slow))
         self._moments.append(_Moment(moment.pose, moment.observation, now.snapshot()))
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
