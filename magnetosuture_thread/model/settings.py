@@ -16,7 +16,7 @@ from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.solvers import SOLVERS, make_solver
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
+from magnetosuture_thread.model.thread import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -38,7 +38,6 @@ FIXED = {  # why a node cannot change it
     "scene": "what it starts with; the topic scene changes it",
 }
 _OPTIONS = EstimatorOptions()  # their defaults
-MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
 @dataclass(frozen=True)

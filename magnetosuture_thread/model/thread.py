@@ -14,6 +14,8 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Scene
 
+MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
+
 
 @dataclass(frozen=True)
 class Medium:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magnetosuture_thread.model.settings import MAX_REST_ANGLE
-from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.model.thread import MAX_REST_ANGLE, Thread
 
 NORMAL_95 = 1.959963984540054
 # Bounds are those of `calibrate` where it fits the same.
