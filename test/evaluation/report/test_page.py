@@ -180,7 +180,6 @@ def test_estimate_and_prediction_stand_side_by_side():
         "thread hidden",
         "6.67 to 9.97 s",
         "3.00 µN",
-        "error of the estimate",
     ):
         assert text in " ".join(reader.text.split())
     data = json.loads(reader.scripts[0])
