@@ -148,10 +148,10 @@ def draw_threads(
             measured[:, 0], measured[:, 1], color=SEEN, linewidth=5.0 * magnified, alpha=0.45, solid_capstyle="round"
         )
     nodes = view.to_pixels(chosen.vertices)
-    axes.plot(nodes[:, 0], nodes[:, 1], color=PREDICTED, linewidth=2.2 * magnified, solid_capstyle="round")
+    axes.plot(nodes[:, 0], nodes[:, 1], color=PREDICTED, linewidth=3.0 * magnified, solid_capstyle="round")
     if chosen.estimate is not None:
         nodes = view.to_pixels(chosen.estimate.vertices)
-        axes.plot(nodes[:, 0], nodes[:, 1], color=ESTIMATED, linewidth=1.2 * magnified, solid_capstyle="round")
+        axes.plot(nodes[:, 0], nodes[:, 1], color=ESTIMATED, linewidth=1.7 * magnified, solid_capstyle="round")
     if len(chosen.ground_truth) > 1:
         points = view.to_pixels(chosen.ground_truth).T
         axes.plot(*points, color=TRUTH, linewidth=0.9 * magnified, linestyle=(0, (4, 4)))

@@ -178,9 +178,9 @@ def test_disturbances_of_one_beginning_are_one_event():
         log.add(time - 10.0, frame(time, estimate))
     assert log.count == 2
     first, second = log.events
-    assert (first.begin_s, first.end_s) == (pytest.approx(0.4), pytest.approx(0.7))
-    assert (first.significance, first.arc_length_m) == (7.0, pytest.approx(2.1))
-    assert (first.x_m, first.y_m, first.direction_rad) == (0.1, 0.2, pytest.approx(math.pi / 2))
+    assert [first.begin_s, first.end_s] == pytest.approx([0.4, 0.7])
+    assert [first.significance, first.arc_length_m] == pytest.approx([7.0, 2.1])
+    assert [first.x_m, first.y_m, first.direction_rad] == pytest.approx([0.1, 0.2, math.pi / 2])
     assert second.begin_s == pytest.approx(0.85)
 
 
@@ -198,7 +198,7 @@ def test_each_thread_has_a_colour_of_its_own_for_the_colour_blind_too():
 
 
 def test_the_colours_are_those_of_the_operator_s_page():
-    page = files("magnetosuture_thread.console").joinpath("page", "colours.js").read_text(encoding="utf-8")
+    page = files("magnetosuture_thread.console").joinpath("page/colours.js").read_text(encoding="utf-8")
     given = dict(re.findall(r'export const (\w+) = "(#\w{6}|rgba\([^)]*\))"', page))
     assert given["ESTIMATED"] == colours.ESTIMATED.light
     assert given["MODEL"] == colours.PREDICTED.light
