@@ -126,6 +126,14 @@ class ThreadModelSettings(Configuration):
         maximum=20.0,
         multiple=2,
     )
+    flow: tuple[float, ...] = quantity(
+        (),
+        "velocity of the liquid or air in the plane of the camera, the same everywhere: x, y; for rod",
+        unit="m/s",
+        minimum=-0.1,
+        maximum=0.1,
+        multiple=2,
+    )
     initial_shape: str = quantity(
         "measured",
         "where the thread starts: as the camera first measures it, or straight behind the needle",
@@ -241,6 +249,7 @@ class ThreadModelSettings(Configuration):
         for name, pair, words in (
             ("attachment_offset", self.attachment_offset, "along and to the left"),
             ("gravity", self.gravity, "x and y"),
+            ("flow", self.flow, "x and y"),
         ):
             if len(pair) not in (0, 2):
                 raise ConfigurationError(f"{self.GROUP}.{name}", list(pair), f"two numbers, {words}, or none")
@@ -251,6 +260,10 @@ class ThreadModelSettings(Configuration):
                 raise self.refused("solver", error.expectation) from None
         if self.formulation == "paper" and self.medium != "liquid":
             raise self.refused("medium", "liquid, as the formulation paper has no inertia")
+        if self.formulation == "paper" and self.flow:
+            raise ConfigurationError(
+                f"{self.GROUP}.flow", list(self.flow), "none, as the formulation paper has no drag"
+            )
         if abs(self.rest_curvature) * self.thread_length / segments > MAX_REST_ANGLE:
             limit = MAX_REST_ANGLE * segments / self.thread_length
             words = f"at most {limit:.0f} 1/m with {segments} segments, which turn by half a radian then"
@@ -286,8 +299,8 @@ class ThreadModelSettings(Configuration):
         )
         if self.medium == "air":
             air = Medium.air(self.mass_per_length, self.gravity, self.air_drag, self.bending_damping)
-            return replace(thread, medium=air)
-        return thread
+            thread = replace(thread, medium=air)
+        return replace(thread, medium=replace(thread.medium, flow=self.flow)) if self.flow else thread
 
     def attachment_pose(self, pose: NeedlePose) -> NeedlePose:
         """Return the pose of the point where the thread is fixed, from that of the needle's tail, in the plane."""

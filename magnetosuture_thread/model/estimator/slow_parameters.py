@@ -39,12 +39,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.model.estimator.corrector import Corrector
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_95
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+from magnetosuture_thread.model.thread import Thread
 
 Vector = NDArray[np.float64]
 
@@ -106,6 +107,10 @@ class LearnedState:
     spread: NDArray[np.float64]
 
 
+def _drags(thread: Thread) -> tuple[float, float]:
+    return thread.medium.drag_across, thread.medium.drag_along
+
+
 class SlowParameters:
     """Learns parameters of the thread while its predictor runs; with none it does nothing.
 
@@ -116,11 +121,20 @@ class SlowParameters:
     Attributes:
         kinds: of the parameters.
         state: what is known of them.
+
+    Raises:
+        ConfigurationError: the thread has no stiffness or no drag.
     """
 
     def __init__(self, predictor: ThreadPredictor, options: EstimatorOptions) -> None:
         self._predictor, self._thread, self._time = predictor, predictor.thread, options.slow_time
         thread = self._thread
+        if options.slow_parameters and not min(thread.bending_stiffness, *_drags(thread)) > 0.0:
+            raise ConfigurationError(
+                "estimator.slow_parameters",
+                list(options.slow_parameters),
+                "none for a thread without stiffness or drag",
+            )
         self.kinds = tuple(kind for name in dict.fromkeys(options.slow_parameters) for kind in KINDS[name])
         self._start = np.array([kind.to_x(kind.read(thread)) for kind in self.kinds])
         bounds = np.array([[kind.to_x(each) for each in kind.bounds(thread)] for kind in self.kinds]).reshape(-1, 2)
@@ -159,8 +173,9 @@ class SlowParameters:
 
     def _use(self, x: Vector) -> None:
         thread, formulation = self._thread, self._predictor.formulation
-        for kind, each in zip(self.kinds, x.tolist(), strict=True):
-            thread = kind.write(thread, kind.from_x(each))
+        for kind, each, start in zip(self.kinds, x.tolist(), self._start.tolist(), strict=True):
+            if each != start:  # a logarithm and back would change the last bit
+                thread = kind.write(thread, kind.from_x(each))
         assert isinstance(formulation, RodFormulation)
         formulation.set_thread(thread)
 
