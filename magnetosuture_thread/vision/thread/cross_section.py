@@ -91,7 +91,7 @@ def centred_between_edges(
 
         sum_i c_i . D_i(s_i) - k (s_i - s_(i-1))^2
 
-    (Viterbi), and the ratio c . D - |c|^2 / 2 is the evidence. A thread's shadow has no sharp edges, so the middle is the
+    (Viterbi), and the ratio c . D - |c|^2 / 2 is the evidence. A shadow has no sharp edges, so the middle is the
     thread's and not that of both.
 
     Args:
