@@ -32,7 +32,7 @@ class Layer:
         pixels: shape (rows, columns), uint8.
         small: the same, shrunk by area.
         floor: how bright what is behind all slender things is, in the pixels of `small`.
-        cleared: the last needle that was taken out of it, and the pixels without; see `without_needle`.
+        cleared: the last needle that was taken out of it, and the pixels without it; see `without_needle`.
     """
 
     pixels: np.ndarray

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.vision.images import Layer
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.template import BLOOM_PX, BLUR_PX, TAPER, THIN, edge
 
+SMOOTH_PX = 0.7  # before threads are looked for
 BESIDE_PX = 2.0 * BLUR_PX  # of the drawn outline, up to which light of the needle is mixed in
 
 
@@ -39,8 +42,17 @@ def without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> np.nd
     start = np.array([arc.start[0], arc.start[1], arc.angle, arc.curvature])
     shape = np.array([needle.length_px, half, needle.contrast])
     _erase(result, np.ascontiguousarray(channel.floor), factor, start, shape, (left, top, right, bottom))
+    channel.cleared.clear()
     channel.cleared.update(needle=needle, pixels=result)
     return result
+
+
+def smooth_without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> NDArray[np.uint8]:
+    """Return `without_needle` smoothed by `SMOOTH_PX`, as wide as the thinnest thread looks; kept like it."""
+    pixels = without_needle(channel, factor, needle)
+    if "smooth" not in channel.cleared:
+        channel.cleared["smooth"] = cv2.GaussianBlur(pixels, (5, 5), SMOOTH_PX)
+    return np.asarray(channel.cleared["smooth"])
 
 
 @compiled

@@ -21,7 +21,6 @@ from magnetosuture_thread.vision.thread.profiles import (
 
 REACH_PX, STEP_PX = 16.0, 0.5  # of profiles: to both sides, and between samples
 BESIDE_PX = 2.5  # from a thread's edge to the floor beside it
-BLUR_PX = 0.7  # of the picture, before it is sampled
 MIN_SHARE = 0.3  # of the usual darkness: below, the thread isn't visible
 FAINTEST = 3.0  # grey levels; less is noise
 SURE_STRENGTH = 2.0 * FAINTEST  # grey levels; of a fainter thread noise hides single points

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -120,9 +121,9 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Mask, NDArr
     fitted = inside & _every_second(cells)
     _fit_light(places[fitted], means[fitted].astype(float), weights)
     light = np.maximum(places @ weights, 1.0)
-    ratios = means[inside] / light[inside] - 1.0
+    ratios = np.ascontiguousarray((means[inside] / light[inside] - 1.0).T)  # numpy is slow along a short last axis
+    bounds = _bound(ratios.mean(axis=0), MIN_CONTRAST), _bound(np.ptp(ratios, axis=0), MIN_COLOUR)
     light = light.reshape(cells[1], cells[0], -1).astype(np.float32)
-    bounds = _bound(ratios.mean(axis=1), MIN_CONTRAST), _bound(np.ptp(ratios, axis=1), MIN_COLOUR)
     found = np.zeros(small.shape[:2], np.uint8)
     at_small = cv2.resize(light, size).reshape(*found.shape, -1)
     _mark_unlike(small.reshape(at_small.shape), at_small, bounds, (*near.centre, near.radius), found)
@@ -132,8 +133,8 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Mask, NDArr
     large[0] = False
     objects = cv2.resize(np.where(large, 255, 0).astype(np.uint8)[labels], (columns, rows))
     objects = cv2.dilate(objects, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
-    floor = cv2.resize(np.ascontiguousarray(light.min(axis=2)), (columns, rows))
-    return cv2.compare(objects, 127, cv2.CMP_GT), floor
+    darkest = reduce(np.minimum, np.moveaxis(light, 2, 0))
+    return cv2.compare(objects, 127, cv2.CMP_GT), cv2.resize(darkest, (columns, rows))
 
 
 def _places(size: tuple[int, int], shape: tuple[int, int], wall: Wall) -> NDArray[np.float64]:
@@ -169,17 +170,23 @@ def _fit_light(basis, values, weights):
         own[0] = np.median(values[:, colour])
         for _ in range(ROUNDS):
             for cell in range(count):
-                residuals[cell] = values[cell, colour] - (basis[cell] * own).sum()
+                residuals[cell] = values[cell, colour]
+                for i in range(size):
+                    residuals[cell] -= basis[cell, i] * own[i]
             bound = TUKEY * max(0.5, 1.4826 * np.median(np.abs(residuals)))
             normal[:], right[:] = 1e-6 * np.eye(size), 0.0
             for cell in range(count):
                 share = max(1.0 - (residuals[cell] / bound) ** 2, 0.0) ** 2
+                if share == 0.0:
+                    continue
                 for i in range(size):
                     weighted = share * basis[cell, i]
                     right[i] += weighted * values[cell, colour]
                     for j in range(i + 1):
                         normal[i, j] += weighted * basis[cell, j]
-                        normal[j, i] = normal[i, j]
+            for i in range(size):
+                for j in range(i):
+                    normal[j, i] = normal[i, j]
             before = own
             own = np.linalg.solve(normal, right)
             if np.abs(own - before).max() < SETTLED:

@@ -56,6 +56,8 @@ def ways_out(ridge, hidden, factor, noise, faintest, tail, max_hidden, simple, w
             continue
         for side in (-1.0, 1.0):
             for bend in BENDS:
+                if side * bend == 0.0 and side > 0.0:
+                    continue  # tried already
                 arc = (angle, side * bend, math.pi)
                 count = _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, ways, ends, count)
             for bend in SHARP_BENDS:
@@ -79,12 +81,18 @@ def _try(ridge, hidden, factor, noise, faintest, single, tail, arc, max_hidden, 
     angle, bend, most = arc
     u, v, s, visible, seen, total, below = tail[0], tail[1], 0.0, 0, 0, 0.0, 0.0
     step, turned, first = START_PX, 0.0, 0.0
+    x, y, half, cosine, sine = math.cos(angle), math.sin(angle), 0.0, 1.0, 0.0
     while visible < START_STEPS:
         turn = bend * step
         if abs(turned + turn) > most:
             turn = 0.0
-        u += step * math.cos(angle + turned + 0.5 * turn)
-        v += step * math.sin(angle + turned + 0.5 * turn)
+        if half != 0.5 * turn:
+            half = 0.5 * turn
+            cosine, sine = math.cos(half), math.sin(half)
+        # The chord is turned by half of the step's turn, what follows it by the other half.
+        x, y = x * cosine - y * sine, x * sine + y * cosine
+        u, v = u + step * x, v + step * y
+        x, y = x * cosine - y * sine, x * sine + y * cosine
         turned += turn
         s += step
         step = STEP_PX

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,10 +12,9 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.images import Picture, Wall
-from magnetosuture_thread.vision.needle.erase import without_needle
+from magnetosuture_thread.vision.needle.erase import smooth_without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.appearance import (
-    BLUR_PX,
     FAINTEST,
     MIN_SHARE,
     Appearance,
@@ -81,7 +79,7 @@ def observe(
     """
     if len(walk) < 2 or arc_lengths(walk)[-1] < SPACING_PX:
         return ThreadObservation()
-    gray = cv2.GaussianBlur(without_needle(picture.darkest, picture.factor, needle), (5, 5), BLUR_PX)
+    gray = smooth_without_needle(picture.darkest, picture.factor, needle)
     walk = respaced(walk, SPACING_PX)
     below = below_needle(needle, walk)
     thread = appearance_of(picture, gray, walk, ~below)

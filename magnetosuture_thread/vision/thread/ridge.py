@@ -61,14 +61,17 @@ def shrunk_hidden(hidden: np.ndarray, factor: int, window: np.ndarray, scale: in
     return cv2.resize(hidden, window.shape[::-1], interpolation=cv2.INTER_NEAREST), 1
 
 
-def black_hat(window: np.ndarray, hidden: np.ndarray, factor: int, scale: int) -> Ridge:
+def black_hat(
+    window: np.ndarray, hidden: np.ndarray, factor: int, scale: int, smooth: np.ndarray | None = None
+) -> Ridge:
     """Return how much darker a window is than the brightest background within a few pixels, in grey levels.
 
-    An edge has no black-hat, so that shadows, covers and the rim are no thread.
+    An edge has no black-hat, so that shadows, covers and the rim are no thread. `smooth` is the window smoothed, if it
+    is known and not shrunk.
     """
     window = shrunk(window, scale)
     hidden, factor = shrunk_hidden(hidden, factor, window, scale)
-    smooth = cv2.GaussianBlur(window, (5, 5), BLUR_PX)
+    smooth = cv2.GaussianBlur(window, (5, 5), BLUR_PX) if smooth is None or scale > 1 else smooth
     strength = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT, _WINDOW)
     noise = middle(strength[::5, ::5])
     faintest = max(FAINTEST, FAINTEST_NOISES * noise)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, shrunk, without_wall
-from magnetosuture_thread.vision.needle.erase import without_needle
+from magnetosuture_thread.vision.needle.erase import smooth_without_needle, without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.cross_section import CrossSection, centred_between_edges
@@ -120,11 +120,14 @@ class ThreadSearch:
 
     def dark(self) -> Walk:
         """Return the walk along the black-hat, at full size or at half of it."""
-        window = self._cleared(self._picture.darkest)
-        shade = SHADE * self._needle.contrast * middle(self._picture.darkest.floor)
+        darkest, factor = self._picture.darkest, self._picture.factor
+        window = self._cleared(darkest)
+        # At the wall the window is another.
+        smooth = None if self._at_wall else smooth_without_needle(darkest, factor, self._needle)[self._box]
+        shade = SHADE * self._needle.contrast * middle(darkest.floor)
 
         def at(scale: int) -> Walk:
-            ridge = black_hat(window, self._hidden, self._picture.factor, scale)
+            ridge = black_hat(window, self._hidden, factor, scale, smooth)
             self._clear_shade(ridge, shade)
             return self._walked(ridge)
 
