@@ -15,6 +15,7 @@ from magnetosuture_thread.vision.needle.erase import without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.forks import follow
+from magnetosuture_thread.vision.thread.joint import joins_passing_line
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.ridge import (
     DEVIATION,
@@ -73,6 +74,7 @@ class Walk:
         ridge: that was followed.
         path: the walk in the ridge's pixels; see `walk_on`.
         shown_strengths: strength of the ridge at each vertex that is not hidden.
+        passes: whether a line passes the tail, and was not followed; see `joins_passing_line`.
     """
 
     points: np.ndarray
@@ -81,6 +83,7 @@ class Walk:
     ridge: Ridge
     path: np.ndarray
     shown_strengths: np.ndarray
+    passes: bool = False
 
     @property
     def is_significant(self) -> bool:
@@ -195,6 +198,15 @@ class ThreadSearch:
         """Say whether a walk runs beside something that differs far more, which makes its surroundings look so."""
         near = cv2.dilate(np.abs(difference), np.ones((BESIDE, BESIDE), np.uint8))
         return self._median_along(walk.points, near, scale) > BESIDE_SHARE * walk.strength
+
+    def without_passing_line(self, walk: Walk) -> Walk:
+        """Return a walk, or its first vertex alone if it follows a line that passes the tail.
+
+        Among pixels as large as those that a wide thread is followed in, needle and thread run into each other.
+        """
+        if walk.ridge.scale == COARSE or not joins_passing_line(walk.points, walk.ridge, self._origin):
+            return walk
+        return replace(walk, points=walk.points[:1], path=walk.path[:1], shown=0.0, passes=True)
 
     @cached_property
     def _coarse(self) -> np.ndarray:
