@@ -11,7 +11,7 @@ from magnetosuture_thread.vision.needle.measure import measure_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
-from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.sampling import middle, straighten
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
@@ -22,6 +22,8 @@ WIDE_PX = 4.0  # a needle at least this wide is searched at half the size
 MIN_AREA = 0.33  # of the needle's own
 AROUND_PX = 24.0  # around a dark thing, that is measured on
 AXIS_POINTS = 15
+BEYOND_PX, BEYOND_ROWS = 14.0, 3  # beyond an end, that is looked at, and rows of it with steel that goes on there
+BODY, STEEL = 0.3, 0.75  # of the body's width, to both sides, that is dark there; of its darkness, at least
 MAX_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
 
@@ -90,6 +92,8 @@ def _measured(
         found = measure_needle(steel, size, toward)
         if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, size.width_px):
             found = "inside of a shape of the scene"
+        if isinstance(found, MeasuredNeedle) and _goes_on(picture, found):
+            found = "something over its end"
         if isinstance(found, MeasuredNeedle):
             needles.append(found)
         else:
@@ -131,6 +135,29 @@ def _dark_components(picture: Picture, view: DishView, radius_px: float, area: f
         at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
         result.append(at * factor + shift)
     return result
+
+
+def _goes_on(picture: Picture, needle: MeasuredNeedle) -> bool:
+    """Say whether steel as wide as the body lies beyond an end, behind something that crosses the needle there.
+
+    What crosses it slantwise grinds the part before it to a seeming point.
+    """
+    beyond = np.arange(0.0, BEYOND_PX, 1.0)
+    aside = BODY * needle.width_px * np.array([-1.0, 0.0, 1.0])
+    strip = np.empty((len(beyond), len(aside)))
+    u, v = (needle.arc.at(0.5 * needle.length_px) / picture.factor).astype(int)
+    floor = picture.brightest.floor
+    floor_there = float(floor[np.clip(v, 0, floor.shape[0] - 1), np.clip(u, 0, floor.shape[1] - 1)])
+    bound = floor_there * (1.0 - STEEL * needle.contrast)
+    for arc in (needle.arc.reversed_at(needle.length_px), needle.arc):
+        # The strip begins at an end and goes on beyond it, the end's own blurred edge first.
+        start = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
+        straighten(picture.brightest.pixels, start, -beyond, aside, strip)
+        steel = (strip < bound).all(axis=1)
+        light = np.flatnonzero(~(strip < bound).any(axis=1))
+        if len(light) and steel[light[0] :].sum() >= BEYOND_ROWS:
+            return True
+    return False
 
 
 def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
