@@ -172,6 +172,7 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("rod_in_path", 28, 12001),
         ("decoy_needle", 19, 14001),  # the thread passes beside its tip
         ("decoy_needle", 8, 6003),
+        ("rod_in_path", 11, 12001),  # a pale line grinds an end of a rod to a point
         ("decoy_needle", 97, 31001),  # a walk over bare floor reaches the thread
     ],
 )
