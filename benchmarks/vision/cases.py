@@ -274,15 +274,38 @@ def depth_inside(outline: Points, points: Points) -> float:
 
 
 def _second_needle(random: Random, *, glare: bool = False) -> Case:
-    """Return a frame with a needle that has no thread; with glare, the lamp is reflected on the one with the thread."""
+    """Return a frame with a needle that has no thread; with glare, the lamp is reflected on the other."""
     for _ in range(MAX_TRIES):
         case = usual_case(random)
         other = random_needle(random)
         axis, _ = other.axis(np.linspace(0.0, 1.0, 20))
         if case.needle.distances(axis).min() > 2e-3 and min(other.distances(case.thread[::4])) > 1.2e-3:
             break
-    if not glare:
-        return replace(case, beside=(other,))
+    return _in_glare(case, other, random) if glare else replace(case, beside=(other,))
+
+
+def _decoy_at_thread(random: Random) -> Case:
+    """Return a needle in glare, and one without a thread whose tail the thread of the other passes closely."""
+    for _ in range(MAX_TRIES):
+        case = usual_case(random)
+        index = int(np.searchsorted(arc_lengths(case.thread), random.uniform(4e-3, 15e-3)))
+        along = case.thread[index + 1] - case.thread[index - 1]
+        away = math.atan2(along[1], along[0]) + random.choice((-0.5, 0.5)) * np.pi
+        tail = case.thread[index] + random.uniform(0.3e-3, 1.2e-3) * unit_vector(away)
+        other = Needle(tail, away + random.uniform(-0.9, 0.9), float(random.choice(CURVATURES)), 0.007, 0.0004)
+        axis, _ = other.axis(np.linspace(0.0, 1.0, 20))
+        gap = float(np.linalg.norm(case.thread - tail, axis=1).min())
+        if (
+            is_inside(axis)
+            and case.needle.distances(axis).min() > 2e-3
+            and other.distances(case.thread).min() > 0.9 * gap
+        ):
+            return _in_glare(case, other, random)
+    raise RuntimeError("no second needle fits beside the thread")
+
+
+def _in_glare(case: Case, other: Needle, random: Random) -> Case:
+    """Return a frame in which the lamp is reflected on the needle, and another needle lies beside it."""
     at, _ = case.needle.axis(np.array([random.uniform(0.0, 1.0)]))
     turns = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
     axes = random.uniform(0.5e-3, 1.5e-3, 2)
@@ -412,6 +435,7 @@ def _classes() -> dict[str, MakeCase]:
         classes |= {f"thread_{colour}_{width:g}px": partial(_thread, colour, width) for width in WIDTHS_PX}
     classes |= {f"cover_{width:g}mm": partial(_covered, 1e-3 * width) for width in COVERS}
     classes |= {"second_needle": _second_needle, "decoy_needle": partial(_second_needle, glare=True)}
+    classes |= {"decoy_at_thread": _decoy_at_thread}
     classes |= {f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)}
     classes |= {"saturated": _saturated, "dark_field": _dark_field, "blunt_rod": _blunt_rod}
     classes |= {

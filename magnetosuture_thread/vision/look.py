@@ -23,7 +23,7 @@ from magnetosuture_thread.vision.needle.size import LengthEstimator
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.centreline import find_centreline
+from magnetosuture_thread.vision.thread.centreline import walk_from
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
 from magnetosuture_thread.vision.thread.observe import observe
 
@@ -273,7 +273,7 @@ def with_thread(
     Returns:
         The needle, the thread's centreline in the picture's pixels, and why there is none where there is none.
     """
-    walks = [centreline_of(picture, view, settings, diameter, needle) for needle in needles]
+    walks, passes = zip(*(centreline_of(picture, view, settings, diameter, needle) for needle in needles), strict=True)
     lengths = [float(arc_lengths(walk)[-1]) for walk in walks]
     best = int(np.argmax(lengths))
     thread = settings.thread_length / view.metres_per_pixel
@@ -283,20 +283,24 @@ def with_thread(
     if len(needles) > 1:
         return None, walks[best], f"{len(needles)} needles in the dish"
     wall = Wall(_local(view, picture).centre_px, 0.5 * diameter / view.metres_per_pixel)
-    if needles[0].heading_known and has_loose_thread(picture, needles[0], wall, MIN_LOOSE * thread):
+    if passes[0] or (needles[0].heading_known and has_loose_thread(picture, needles[0], wall, MIN_LOOSE * thread)):
         return None, walks[0], "a needle that no thread leaves, and a thread beside it"
     return needles[0], walks[0], ""
 
 
 def centreline_of(
     picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needle: MeasuredNeedle
-) -> np.ndarray:
-    """Return the thread's centreline from a needle's tail on, in the picture's pixels; one point if none is seen."""
+) -> tuple[np.ndarray, bool]:
+    """Return the thread's centreline from a needle's tail on, in the picture's pixels; one point if none is seen.
+
+    The other value is whether a line passes the tail instead, see `joins_passing_line`.
+    """
     if not needle.heading_known:
-        return needle.tail_px[None]
+        return needle.tail_px[None], False
     wall = 0.5 * diameter / view.metres_per_pixel
     max_length = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
-    return find_centreline(picture, needle, max_length, _local(view, picture).centre_px, wall)
+    walk = walk_from(picture, needle, max_length, _local(view, picture).centre_px, wall)
+    return walk.points, walk.passes
 
 
 def tracked(

@@ -211,7 +211,7 @@ class VisionTracker:
     def _tracked(self, picture: Picture, view: DishView, needle: MeasuredNeedle, *, search: bool) -> Track:
         """Return what a frame shows whose needle is known."""
         diameter = self._scene.dish.diameter
-        walk = centreline_of(picture, view, self._settings, diameter, needle)
+        walk, _ = centreline_of(picture, view, self._settings, diameter, needle)
         assert self._dish.found is not None
         found = tracked(picture, view, self._settings, needle, walk, diameter, self._missing(), search=search)
         return tilted(found, self._dish.found, self._scene.dish.radius)

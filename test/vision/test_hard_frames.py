@@ -85,6 +85,12 @@ def test_a_needle_that_no_thread_leaves_is_not_taken_for_the_one_in_glare():
     assert any("no thread leaves" in reason for reason in decoys.reasons)
 
 
+def test_a_thread_that_passes_a_tail_does_not_leave_it():
+    decoys = row("decoy_at_thread")
+    assert decoys.found == 0
+    assert any("no thread leaves" in reason for reason in decoys.reasons)
+
+
 @pytest.mark.parametrize("name", ["width_320", "width_1280", "width_1920", "dark_field"])
 def test_small_and_large_frames_and_a_dark_floor_are_tracked(name: str):
     figures = row(name)
@@ -166,6 +172,8 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("rod_in_path", 28, 12001),
         ("decoy_needle", 19, 14001),  # the thread passes beside its tip
         ("decoy_needle", 8, 6003),
+        ("rod_in_path", 11, 12001),  # a pale line grinds an end of a rod to a point
+        ("decoy_needle", 97, 31001),  # a walk over bare floor reaches the thread
     ],
 )
 def test_poses_that_were_reversed_once_are_not(name: str, index: int, seed: int):

@@ -11,7 +11,7 @@ from magnetosuture_thread.vision.needle.measure import measure_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
-from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.sampling import middle, straighten
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
@@ -22,6 +22,10 @@ WIDE_PX = 4.0  # a needle at least this wide is searched at half the size
 MIN_AREA = 0.33  # of the needle's own
 AROUND_PX = 24.0  # around a dark thing, that is measured on
 AXIS_POINTS = 15
+BEYOND_PX, BEYOND_ROWS = 14.0, 3  # beyond an end, that is looked at, and rows of it with steel that goes on there
+OTHER = 0.03  # of the floor's brightness, that an opaque line is paler or more coloured
+RIM_REACH_PX = 5.0  # off the wall, from which its rim is not mixed in
+BODY, STEEL = 0.3, 0.75  # of the body's width, to both sides, that is dark there; of its darkness, at least
 MAX_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
 
@@ -69,6 +73,7 @@ def _measured(
     radius = dish_radius / view.metres_per_pixel
     radius = radius - RIM_PX if tight else INSIDE * radius
     wall = Wall(view.centre_px, radius)
+    off_rim = Wall(view.centre_px, dish_radius / view.metres_per_pixel - RIM_REACH_PX)
     needles: list[MeasuredNeedle] = []
     refused: list[str] = []
     mask, factor = picture.mask, picture.factor
@@ -90,6 +95,8 @@ def _measured(
         found = measure_needle(steel, size, toward)
         if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, size.width_px):
             found = "inside of a shape of the scene"
+        if isinstance(found, MeasuredNeedle) and _goes_on(picture, found, off_rim):
+            found = "something over its end"
         if isinstance(found, MeasuredNeedle):
             needles.append(found)
         else:
@@ -131,6 +138,31 @@ def _dark_components(picture: Picture, view: DishView, radius_px: float, area: f
         at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
         result.append(at * factor + shift)
     return result
+
+
+def _goes_on(picture: Picture, needle: MeasuredNeedle, wall: Wall) -> bool:
+    """Say whether steel goes on beyond an end, behind an opaque line that is paler or more coloured than the floor.
+
+    A line that crosses a needle slantwise grinds the part before it to a seeming point.
+    """
+    beyond = np.arange(0.0, BEYOND_PX, 1.0)
+    aside = BODY * needle.width_px * np.array([-1.0, 0.0, 1.0])
+    bright, dark = np.empty((2, len(beyond), len(aside)))
+    u, v = (needle.arc.at(0.5 * needle.length_px) / picture.factor).astype(int)
+    rows, columns = picture.brightest.floor.shape
+    at = min(max(v, 0), rows - 1), min(max(u, 0), columns - 1)
+    floor, darkest_floor = float(picture.brightest.floor[at]), float(picture.darkest.floor[at])
+    for arc in (needle.arc.reversed_at(needle.length_px), needle.arc):
+        start = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
+        straighten(picture.brightest.pixels, start, -beyond, aside, bright)
+        straighten(picture.darkest.pixels, start, -beyond, aside, dark)
+        other = np.maximum(dark - darkest_floor, bright - dark - (floor - darkest_floor)).mean(axis=1)
+        inside = np.hypot(*(arc.at(-beyond) - wall.centre).T) < wall.radius
+        steel = (bright < floor * (1.0 - STEEL * needle.contrast)).all(axis=1) & inside
+        line = np.flatnonzero(other > OTHER * floor)
+        if len(line) and steel[line[0] :].sum() >= BEYOND_ROWS:
+            return True
+    return False
 
 
 def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:

@@ -64,7 +64,7 @@ def find_centreline(
     Returns:
         Vertices from the tail on, shape (m, 2) [px], m = 1 if no thread is seen.
     """
-    return _followed(picture, needle, max_length, centre, wall).points
+    return walk_from(picture, needle, max_length, centre, wall).points
 
 
 def follow_thread(
@@ -83,7 +83,7 @@ def follow_thread(
         centre: see there.
         wall: see there.
     """
-    walk = _followed(picture, needle, max_length, centre, wall)
+    walk = walk_from(picture, needle, max_length, centre, wall)
     if len(walk.path) < MIN_CENTRED:
         return FollowedThread(walk.points, 1.0 if len(walk.points) > 1 else 0.0, None)
     ridge, path = walk.ridge, walk.path
@@ -97,10 +97,10 @@ def follow_thread(
     return FollowedThread(walk.points, float(confidence), np.asarray(at))
 
 
-def _followed(
+def walk_from(
     picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
 ) -> Walk:
-    """Return the walk that shows the thread best; see `find_centreline`."""
+    """Return the walk that shows the thread best, and whether there is none as a line passes; see `find_centreline`."""
     reach = wall - WALL_PX
     search = ThreadSearch(picture, needle, max_length, centre, reach)
     dark = search.dark()
@@ -110,8 +110,8 @@ def _followed(
     if not whole and len(best.points) >= MIN_CENTRED and search.is_edge(best):
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
-            return search.centred(wide)[0]
-    return best
+            best = search.centred(wide)[0]
+    return search.without_passing_line(best)
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:

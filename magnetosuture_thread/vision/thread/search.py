@@ -15,6 +15,7 @@ from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.cross_section import CrossSection, centred_between_edges
 from magnetosuture_thread.vision.thread.forks import follow
+from magnetosuture_thread.vision.thread.joint import joins_passing_line
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.ridge import (
     DEVIATION,
@@ -67,6 +68,7 @@ class Walk:
         strength: median of the ridge along it [grey levels].
         ridge: that was followed.
         path: the walk in the ridge's pixels; see `walk_on`.
+        passes: whether a line passes the tail, and was not followed; see `joins_passing_line`.
     """
 
     points: np.ndarray
@@ -74,6 +76,7 @@ class Walk:
     strength: float
     ridge: Ridge
     path: np.ndarray
+    passes: bool = False
 
 
 def is_strong(dark: Walk, enough: float) -> bool:
@@ -184,6 +187,15 @@ class ThreadSearch:
         share = len(found.points) / len(whole.points)
         path = walk.path[: max(1, round(share * len(walk.path)))]
         return replace(walk, points=found.points, shown=share * walk.shown, path=path), found
+
+    def without_passing_line(self, walk: Walk) -> Walk:
+        """Return a walk, or its first vertex alone if it follows a line that passes the tail.
+
+        Among pixels as large as those that a wide thread is followed in, needle and thread run into each other.
+        """
+        if walk.ridge.scale == COARSE or not joins_passing_line(walk.points, walk.ridge, self._origin):
+            return walk
+        return replace(walk, points=walk.points[:1], path=walk.path[:1], shown=0.0, passes=True)
 
     @cached_property
     def _coarse(self) -> np.ndarray:
