@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.model.margins import Margins, node_clearance
 from magnetosuture_thread.model.predictor import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 
 MAP_GAP = 3.0  # times the usual interval; the error map is empty where nothing came for longer
 MAP_COLUMNS = 300
-WORST_FRAMES = 5
+WORST_FRAMES, WORST_ESTIMATES = 5, 2
 MIN_DISTANCE = 1.0  # s; between two of the worst frames
 MARGIN = "margin_"  # columns of margins, by the barrier's name
 BIN = 0.5  # s; of each bin the worst frame is kept
@@ -61,9 +62,34 @@ class Observation:
         return len(self.tail) > 0
 
 
+@dataclass(frozen=True)
+class EstimatedThread:
+    """What is kept of a thread's estimate.
+
+    Attributes:
+        vertices: shape (n + 1, 2) [m].
+        corrected: whether a measurement went into it; otherwise it is only a prediction.
+        squared: normalised innovation squared of each window of arc length, shape (w,); nan where nothing is measured.
+        disturbances: what the model does not know.
+        hidden: part of the thread that no point shows, 0 to 1.
+    """
+
+    vertices: Points
+    corrected: bool = False
+    squared: Array = field(default_factory=lambda: np.empty(0))
+    disturbances: tuple[Disturbance, ...] = ()
+    hidden: float = 1.0
+
+    @classmethod
+    def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
+        """Return what is kept of an estimate."""
+        squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
+        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
+
+
 @dataclass
 class FrameResult:
-    """Predicted thread of one frame, beside the measured one and the ground truth.
+    """Predicted and estimated thread of one frame, beside the measured one and the ground truth.
 
     Attributes:
         stamp: of the frame [ns].
@@ -80,6 +106,8 @@ class FrameResult:
         obstacles: in force.
         recorded: the prediction that the bag holds of the same frame, shape (n + 1, 2) [m].
         errors: prediction error by target, `truth` and `seen` [% of length]; set when it is computed.
+        estimate: of the thread; None where there is none.
+        observation: pieces of the thread that were measured; None where there is the centreline alone.
     """
 
     stamp: int
@@ -96,6 +124,8 @@ class FrameResult:
     obstacles: tuple[Obstacle, ...] = ()
     recorded: Points | None = None
     errors: dict[str, float] = field(default_factory=dict)
+    estimate: EstimatedThread | None = None
+    observation: ThreadObservation | None = None
 
     @classmethod
     def of(
@@ -105,6 +135,8 @@ class FrameResult:
         margins: Margins | None,
         step_time: float,
         *,
+        estimate: ThreadEstimate | None = None,
+        estimated: bool = False,
         recorded: Points | None = None,
         obstacles: tuple[Obstacle, ...] = (),
     ) -> FrameResult:
@@ -115,9 +147,16 @@ class FrameResult:
             prediction: of it.
             margins: of the prediction, if they prove anything.
             step_time: that the prediction took [s].
+            estimate: of the same frame.
+            estimated: whether the thread is estimated in this run; without an estimate the prediction stands for it.
             recorded: the prediction of the same frame that the bag holds.
             obstacles: in force.
         """
+        kept = None
+        if estimate is not None:
+            kept = EstimatedThread.of(estimate)
+        elif estimated:
+            kept = EstimatedThread(prediction.positions)
         return cls(
             observation.stamp,
             prediction.positions,
@@ -132,17 +171,42 @@ class FrameResult:
             math.atan2(observation.heading[1], observation.heading[0]),
             obstacles,
             recorded,
+            estimate=kept,
+            observation=observation.observation,
         )
 
     def target_curve(self, target: str) -> Points:
         """Return what the prediction is compared with, of `truth` and `seen`."""
         return self.ground_truth if target == "truth" else self.measured
 
+    def columns(self) -> dict[str, float]:
+        """Return the figures of the frame that need no other curve, by their columns' names."""
+        row = {"strain": self.strain, "residual": self.residual, "step_time": self.step_time}
+        if self.margins is not None:
+            row |= {f"{MARGIN}{least.barrier}": float(least.clearance[0]) for least in self.margins.minima}
+        if self.estimate is not None:
+            known = self.estimate.squared[np.isfinite(self.estimate.squared)]
+            row |= {"corrected": float(self.estimate.corrected), "innovations": len(known)}
+            row["innovation_squared"] = float(known.mean()) if len(known) else math.nan
+        return row
+
     @property
     def clearance(self) -> Array:
         """Minimum clearance of an obstacle or the wall for each node, shape (n + 1,) [m]; inf where none is near."""
         count = len(self.vertices)
         return np.full(count, np.inf) if self.margins is None else node_clearance(self.margins, count)
+
+
+def estimated_nodes(frames: Sequence[FrameResult]) -> Array:
+    """Return the estimated nodes of frames whose predictions have one number of nodes, shape (b, n + 1, 2) [m].
+
+    nan where a frame has no estimate, or one of another number of nodes.
+    """
+    nodes = np.full((len(frames), len(frames[0].vertices), 2), np.nan)
+    for row, frame in zip(nodes, frames, strict=True):
+        if frame.estimate is not None and frame.estimate.vertices.shape == row.shape:
+            row[:] = frame.estimate.vertices
+    return nodes
 
 
 class TimeSeries:
@@ -266,17 +330,19 @@ class ErrorMap:
 
 @dataclass(frozen=True)
 class WorstFrame:
-    """A frame in which the prediction is far off.
+    """A frame in which the prediction, or the estimate, is far off.
 
     Attributes:
         time: since the bag's start [s].
-        error: of the prediction [% of length].
-        frame: what was predicted, measured and true.
+        error: of it [% of length].
+        frame: what was predicted, estimated, measured and true.
+        of: `prediction` or `estimate`.
     """
 
     time: float
     error: float
     frame: FrameResult
+    of: str = "prediction"
 
 
 class WorstFrames:
@@ -285,10 +351,12 @@ class WorstFrames:
     Args:
         count: of frames to find.
         apart: least time between two of them [s].
+        of: whose errors are added, `prediction` or `estimate`.
     """
 
-    def __init__(self, count: int = WORST_FRAMES, apart: float = MIN_DISTANCE) -> None:
+    def __init__(self, count: int = WORST_FRAMES, apart: float = MIN_DISTANCE, of: str = "prediction") -> None:
         self._count = count
+        self._of = of
         self._apart = apart
         # A frame takes out the bins within `apart` of it, on both sides: no more of the worst bins are needed.
         self._enough = count * (2 * math.ceil(apart / BIN) + 3)
@@ -302,7 +370,7 @@ class WorstFrames:
         held = self._bins.get(bin_)
         if held is not None and held.error >= error:
             return
-        self._bins[bin_] = WorstFrame(time, error, frame)
+        self._bins[bin_] = WorstFrame(time, error, frame, self._of)
         if len(self._bins) > 2 * self._enough:
             kept = sorted(self._bins.items(), key=lambda item: -item[1].error)[: self._enough]
             # The bin that is being filled stays: its worst frame may be still to come.

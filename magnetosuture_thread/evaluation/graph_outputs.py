@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from magnetosuture_thread import interface
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.evaluation.frames import Array, FrameResult
+from magnetosuture_thread.errors import GraphError, InvalidInputError
+from magnetosuture_thread.evaluation.currents import CurrentDifference
+from magnetosuture_thread.evaluation.currents import CurrentSeries as CurrentSeries
+from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
+from magnetosuture_thread.evaluation.frames import Array, EstimatedThread, FrameResult
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, finite_or_none
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose
+from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose, thread_observation
+from magnetosuture_thread.model.estimator import Disturbance
+from magnetosuture_thread.thread_observation import ThreadObservation
 
-CURRENT_VALID = 0.05  # s; a recorded current counts as in force for this long
 TRACKED = 1  # as in the message TrackerState
 WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the ground truth, or ...
 WRONG_HEADING = np.radians(5.0)  # ... turned by more, is wrong
@@ -24,7 +29,9 @@ OF_FRAMES = {
     for c in (
         interface.NEEDLE_POSE,
         interface.MEASURED_THREAD,
+        interface.THREAD_OBSERVATION,
         interface.PREDICTED_THREAD,
+        interface.ESTIMATED_THREAD,
         interface.MARGINS,
         interface.GROUND_TRUTH_THREAD,
     )
@@ -70,8 +77,12 @@ class GraphCollector:
             frame.measured = _path(message)
         elif topic == interface.GROUND_TRUTH_THREAD.recorded:
             frame.ground_truth = _path(message)
+        elif topic == interface.THREAD_OBSERVATION.recorded:
+            frame.observation = _observation(message)
+        elif topic == interface.ESTIMATED_THREAD.recorded:
+            frame.estimate = _estimate(message)  # a later one of the same frame takes its place
         elif topic == interface.PREDICTED_THREAD.recorded:
-            frame.vertices = np.array([[p.x, p.y] for p in message.positions]).reshape(-1, 2)
+            frame.vertices = _points(message.positions)
             frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
             frame.residual, frame.step_time = message.residual, message.step_time
         elif message.valid:
@@ -98,69 +109,41 @@ class GraphCollector:
 
 
 def _path(message: Any) -> Points:
-    return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
+    return _points(each.pose.position for each in message.poses)
 
 
-@dataclass(frozen=True)
-class CurrentDifference:
-    """How far the currents of a replay are from the recorded ones, at the times of the replay's.
-
-    In places the coils can give the same velocity in two ways, far apart, and change from one to the other
-    within a hundredth of a second: the greatest differences are of such moments.
-
-    Attributes:
-        compared: how many replayed currents have a recorded one beside them.
-        difference: of a coil, median [A].
-        p99: 99th percentile [A].
-        greatest: [A].
-        recorded: root of the mean square of the recorded currents, to judge the difference by [A].
-        stopped_apart: share of the compared of which one is a stop and the other is not.
-    """
-
-    compared: int
-    difference: float
-    p99: float
-    greatest: float
-    recorded: float
-    stopped_apart: float
+def _points(points: Iterable[Any]) -> Points:
+    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
 
 
-class CurrentSeries:
-    """Currents over time, from messages in any order of arrival."""
+def _observation(message: Any) -> ThreadObservation:
+    try:
+        return thread_observation(message, interface.THREAD_OBSERVATION.name)
+    except InvalidInputError:
+        return ThreadObservation()
 
-    def __init__(self) -> None:
-        self._received: dict[int, tuple[Array, bool]] = {}
 
-    def add(self, message: Any) -> None:
-        """Add a message CoilCurrents, of ROS or of the bags' type store."""
-        stamp = nanoseconds(message.header.stamp)
-        self._received[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)
-
-    def against(self, recorded: CurrentSeries) -> CurrentDifference | None:
-        """Compare with what was recorded; None where nothing can be."""
-        theirs = np.array(sorted(recorded._received))
-        apart, sizes, stops = [], [], []
-        for stamp, (currents, stopped) in sorted(self._received.items()):
-            index = int(np.searchsorted(theirs, stamp, side="right")) - 1
-            if index < 0 or stamp - theirs[index] > CURRENT_VALID * 1e9:
-                continue
-            other, other_stopped = recorded._received[int(theirs[index])]
-            if other.shape != currents.shape:
-                continue
-            apart.append(currents - other)
-            sizes.append(other)
-            stops.append(stopped != other_stopped)
-        if not apart:
-            return None
-        difference = np.abs(np.array(apart))
-        return CurrentDifference(
-            compared=len(difference),
-            difference=float(np.median(difference)),
-            p99=float(np.percentile(difference, 99)),
-            greatest=float(difference.max()),
-            recorded=float(np.sqrt(np.mean(np.array(sizes) ** 2))),
-            stopped_apart=float(np.mean(stops)),
+def _estimate(message: Any) -> EstimatedThread:
+    degrees = int(message.innovation_degrees)
+    disturbances = tuple(
+        Disturbance(
+            found.arc_length,
+            found.extent,
+            np.array([found.position.x, found.position.y]),
+            np.array([found.direction.x, found.direction.y]),
+            found.force,
+            found.significance,
+            nanoseconds(found.since) * 1e-9,
         )
+        for found in message.disturbances
+    )
+    return EstimatedThread(
+        _points(message.positions),
+        not message.prediction_only,
+        np.full(degrees, message.innovation_squared / max(degrees, 1)),
+        disturbances,
+        message.hidden,
+    )
 
 
 @dataclass(frozen=True)
@@ -185,6 +168,9 @@ class ReplaySummary:
         seen_share: part of the thread's length that the camera saw, mean over the predicted frames.
         error_seen: prediction error against the seen centreline [% of length], over `count` frames.
         error_truth: the same against the truth, where the bag holds it.
+        prediction: errors of the prediction; see `compare_errors`.
+        estimate: errors of the estimate, under the same names.
+        estimation: what else there is of the estimate.
         currents: difference of the coils' currents from the recorded ones, where the bag holds any.
         source: `camera`, or `poses` where `frames` are recorded poses.
         speed: how many seconds of the bag were worked through in a second, of an offline replay; else None.
@@ -220,10 +206,16 @@ class ReplaySummary:
     damage: str = ""
     unverified: str = ""
     remark: str = ""
+    prediction: dict[str, float | None] = field(default_factory=dict)
+    estimate: dict[str, float | None] = field(default_factory=dict)
+    estimation: EstimationFigures = field(default_factory=EstimationFigures)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures as plain values; units as above."""
-        return asdict(self)
+        """Return the figures as plain values; units as above. Those of `estimation` stand beside the others."""
+        figures = asdict(replace(self, estimation=EstimationFigures()))
+        del figures["estimation"]
+        events = [event.to_json() for event in self.estimation.disturbances]
+        return figures | self.estimation.to_json() | {"disturbances": events}
 
 
 @dataclass(frozen=True)
@@ -252,6 +244,8 @@ class LoopSummary:
         error_seen: the same against the seen centreline.
         seen_share: part of the thread's length that the camera saw, mean.
         stretch: greatest absolute stretch of a segment.
+        prediction: errors of the prediction; see `compare_errors`.
+        estimate: errors of the estimate, under the same names.
     """
 
     setup: str
@@ -274,6 +268,8 @@ class LoopSummary:
     error_seen: dict[str, float] | None
     seen_share: float
     stretch: float
+    prediction: dict[str, float | None] = field(default_factory=dict)
+    estimate: dict[str, float | None] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none; units as above."""
@@ -343,7 +339,7 @@ class LoopCollector:
             raise GraphError(f"the needle was tracked in no frame; {said}")
         self.instants = self._threads.frames(first, last)
         metrics = self._threads.metrics(frames=self.instants)
-        errors = metrics.errors()
+        errors, compared = metrics.errors(), compare_errors(metrics.series)
         apart = np.array([self._tracked[stamp] - self._truth[stamp] for stamp in both])
         tail = np.hypot(apart[:, 0], apart[:, 1])
         heading = np.abs(np.angle(np.exp(1j * apart[:, 2])))
@@ -370,6 +366,8 @@ class LoopCollector:
             error_seen=errors["seen"],
             seen_share=metrics.mean("seen_share"),
             stretch=metrics.maximum("strain"),
+            prediction=compared["prediction"],
+            estimate=compared["estimate"],
         )
 
     def _tip(self, stamp: int) -> Points:

@@ -12,8 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.barrier import BUILT_IN
+from magnetosuture_thread.evaluation.estimation import (
+    ESTIMATE_COLUMNS,
+    DisturbanceLog,
+    EstimationFigures,
+    hidden_part,
+)
 from magnetosuture_thread.evaluation.frames import (
     MARGIN,
+    MIN_DISTANCE,
+    WORST_ESTIMATES,
     Array,
     ErrorMap,
     FrameResult,
@@ -21,16 +29,17 @@ from magnetosuture_thread.evaluation.frames import (
     TimeSeries,
     WorstFrame,
     WorstFrames,
+    estimated_nodes,
 )
+from magnetosuture_thread.evaluation.silence import SensorSilence as SensorSilence
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
+KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
 END_TOLERANCE = 1e-3  # of the length; the chords of a curve are always a little short, and its free end counts
 BATCH = 128  # frames that are compared together
-SILENT_PERIODS = 5.0  # usual intervals, beyond which nothing that came is a gap
-CLOCK_TOLERANCE = 1.0  # s; stamps farther outside of the bag are of another clock
 MAX_REASONS = 12  # kept, why the needle was not found
 
 
@@ -182,45 +191,6 @@ def prediction_error_percent(vertices: Points, curve: Points, length: float) -> 
 
 
 @dataclass(frozen=True)
-class SensorSilence:
-    """Time without frames, or recorded poses: gaps of more than `SILENT_PERIODS` usual intervals.
-
-    Attributes:
-        gaps: how many.
-        total: of all gaps [s].
-        max_gap: the longest gap [s].
-        at: when the longest gap begins, since the bag's start [s]; nan for none.
-    """
-
-    gaps: int = 0
-    total: float = 0.0
-    max_gap: float = 0.0
-    at: float = math.nan
-
-    @classmethod
-    def of(cls, times: Array, begin: float, end: float) -> SensorSilence:
-        """Return the gaps between frames, and before the first and after the last, where they are of one clock.
-
-        Args:
-            times: of the frames, since the bag's start [s].
-            begin: of what is evaluated [s].
-            end: of it [s].
-        """
-        times = np.sort(times)
-        if len(times) < 2:  # no interval is usual
-            return cls(1, end - begin, end - begin, begin) if end > begin else cls()
-        usual = float(np.median(np.diff(times)))
-        within = begin - CLOCK_TOLERANCE <= times[0] and times[-1] <= end + CLOCK_TOLERANCE
-        edges = np.concatenate([[begin], times, [end]]) if within else times
-        steps = np.diff(edges)
-        gaps = steps[steps > SILENT_PERIODS * usual]
-        if not len(gaps):
-            return cls()
-        longest = int(np.argmax(steps))
-        return cls(len(gaps), float(gaps.sum()), float(steps[longest]), float(edges[longest]))
-
-
-@dataclass(frozen=True)
 class MinimumMargin:
     """The minimum margin of one barrier, and where it was.
 
@@ -242,7 +212,7 @@ class MinimumMargin:
 class RunMetrics:
     """Accumulates errors, margins and times of a run.
 
-    Of each frame only numbers are kept, and of a few frames the threads: memory grows by 130 bytes a frame.
+    Of each frame only numbers are kept, and of a few frames the threads: memory grows by 210 bytes a frame.
 
     Args:
         length: of the thread [m].
@@ -257,6 +227,7 @@ class RunMetrics:
         lost: from and to when the needle was not found [s].
         reasons: why not.
         contact_frames: those in which the thread touches an obstacle or the wall.
+        disturbances: that the estimate reported.
     """
 
     def __init__(
@@ -266,7 +237,9 @@ class RunMetrics:
         errors = [f"error_{target}" for target in self.targets]
         of_bag = [f"recorded_{name}" for name in errors] if recorded else []
         margins = [f"{MARGIN}{barrier}" for barrier in BUILT_IN]
-        self._series = TimeSeries([*errors, *of_bag, *margins, "strain", "residual", "step_time", "seen_share"])
+        others = ["strain", "residual", "step_time", "seen_share", *ESTIMATE_COLUMNS]
+        of_estimate = [f"{kind}_{name}" for kind in ("estimate", "max_node", "max_node_estimate") for name in errors]
+        self._series = TimeSeries([*errors, *of_estimate, *of_bag, *margins, *others])
         self.observed = TimeSeries(["processing"])
         self.tracked = self.contact_frames = 0
         self.lost: list[list[float]] = []
@@ -274,8 +247,9 @@ class RunMetrics:
         self._found = True
         self._length, self._start = length, start
         self._minimum: dict[str, MinimumMargin] = {}
-        self._maps = {target: ErrorMap(length) for target in self.targets}
-        self._worst = {target: WorstFrames() for target in self.targets}
+        self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
+        self._worst = {(kind, target): WorstFrames(of=kind) for kind in KINDS for target in self.targets}
+        self.disturbances = DisturbanceLog()
         self._fresh: list[FrameResult] = []
         self._first: FrameResult | None = None
 
@@ -302,6 +276,7 @@ class RunMetrics:
                     place = int(row.node[0]), int(row.obstacle[0]), self._time(frame.stamp)
                     self._minimum[row.barrier] = MinimumMargin(row.barrier, float(row.clearance[0]), *place)
             self.contact_frames += frame.in_contact
+        self.disturbances.add(self._time(frame.stamp), frame)
         if self._fresh and len(frame.vertices) != len(self._fresh[0].vertices):  # the model's segments have changed
             self.compare()
         self._fresh.append(frame)
@@ -327,18 +302,27 @@ class RunMetrics:
 
     @property
     def error_map(self) -> ErrorMap | None:
-        """The map of the error along the thread."""
-        return self._maps.get(self.target)
+        """The map of the prediction's error along the thread."""
+        return self._maps.get(("prediction", self.target))
+
+    @property
+    def estimate_map(self) -> ErrorMap | None:
+        """The map of the estimate's error along the thread."""
+        return self._maps.get(("estimate", self.target))
 
     def worst_frames(self) -> list[WorstFrame]:
-        """Return the frames with the greatest errors, apart from one another, the worst first."""
-        return self._worst[self.target].found() if self.target else []
+        """Return the frames with the greatest errors of prediction, then of estimate, each time the worst first."""
+        if not self.target:
+            return []
+        found, others = (self._worst[kind, self.target].found() for kind in KINDS)
+        apart = [each for each in others if all(abs(each.time - one.time) >= MIN_DISTANCE for one in found)]
+        return found + apart[:WORST_ESTIMATES]
 
     @property
     def worst_measured(self) -> FrameResult | None:
         """The frame farthest from what was measured; where nothing was, from the truth, else the first one."""
         self.compare()
-        worst = [each for target in reversed(self.targets) for each in self._worst[target].found()[:1]]
+        worst = [each for target in reversed(self.targets) for each in self._worst["prediction", target].found()[:1]]
         return worst[0].frame if worst else self._first
 
     def errors(self, prefix: str = "error") -> dict[str, dict[str, float] | None]:
@@ -349,6 +333,11 @@ class RunMetrics:
             for target, name in columns.items()
             if name in self.series.names
         }
+
+    @property
+    def estimation(self) -> EstimationFigures:
+        """What the run tells of its estimate beside the errors."""
+        return EstimationFigures.of(self.series, self.disturbances)
 
     def percentiles(self, column: str) -> Percentiles | None:
         """Return the percentiles of a column."""
@@ -368,27 +357,28 @@ class RunMetrics:
         if not frames:
             return
         self._first = self._first or frames[0]
-        vertices = np.stack([frame.vertices for frame in frames])
-        rows = [{"strain": f.strain, "residual": f.residual, "step_time": f.step_time} for f in frames]
+        threads = {"prediction": np.stack([frame.vertices for frame in frames]), "estimate": estimated_nodes(frames)}
+        rows = [frame.columns() | {"hidden": hidden_part(frame, self._length)} for frame in frames]
         for target in TARGETS:
             curves = [frame.target_curve(target) for frame in frames]
-            means, errors, shares = prediction_errors(vertices, curves, self._length)
-            for index, (frame, row, mean) in enumerate(zip(frames, rows, means.tolist(), strict=True)):
+            compared = {kind: prediction_errors(nodes, curves, self._length) for kind, nodes in threads.items()}
+            for index, (frame, row) in enumerate(zip(frames, rows, strict=True)):
                 if target == "seen":
-                    row["seen_share"] = float(shares[index])
+                    row["seen_share"] = float(compared["prediction"][2][index])
                 if target not in self.targets:
                     continue
-                row[f"error_{target}"] = frame.errors[target] = mean
+                for kind, (means, errors, _) in compared.items():
+                    mean, time, column = float(means[index]), self._time(frame.stamp), f"{KINDS[kind]}error_{target}"
+                    row[column] = mean
+                    if math.isfinite(mean):
+                        row[f"max_node_{column}"] = float(np.nanmax(errors[index]))
+                        self._maps[kind, target].add(time, errors[index].copy())
+                        self._worst[kind, target].add(time, mean, frame)
+                frame.errors[target] = row[f"error_{target}"]
                 if frame.recorded is not None:
                     error = prediction_error_percent(frame.recorded, curves[index], self._length)
                     row[f"recorded_error_{target}"] = error
-                if math.isfinite(mean):
-                    time = self._time(frame.stamp)
-                    self._maps[target].add(time, errors[index].copy())
-                    self._worst[target].add(time, mean, frame)
         for frame, row in zip(frames, rows, strict=True):
-            if frame.margins is not None:
-                row |= {f"{MARGIN}{least.barrier}": float(least.clearance[0]) for least in frame.margins.minima}
             self._series.add(self._time(frame.stamp), row)
 
     def _time(self, stamp: int) -> float:

@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
+from magnetosuture_thread.evaluation import colours
+from magnetosuture_thread.evaluation.estimation import Consistency
 from magnetosuture_thread.evaluation.frames import FrameResult, TimeSeries
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.reference_scores import CaseResult
@@ -25,8 +28,9 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.texts import printable
 
-INK, FAINT = "#22303c", "#7b8794"
-SEEN, TRUTH, PREDICTED = "#0f6fc6", "#8a6d00", "#d1495b"
+INK, FAINT = colours.INK.light, "#7b8794"
+SEEN, TRUTH = colours.MEASURED.light, colours.GROUND_TRUTH.light
+PREDICTED, ESTIMATED = colours.PREDICTED.light, colours.ESTIMATED.light
 WIDE = {"color": SEEN, "alpha": 0.35, "solid_capstyle": "round"}  # where a thread was, beside what is predicted
 OBSTACLE = "#e9d8d3"
 MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", ["#c8102e", "#f28c28", "#1f9d55"])
@@ -60,22 +64,26 @@ def draw_summary(
     """
     figure = Figure(figsize=(14.0, 7.2), dpi=110, facecolor="white")
     scene = figure.add_axes((0.015, 0.115, 0.44, 0.775))
-    line = _draw_frame(scene, frame, view, chosen, obstacles)
+    nodes = _draw_frame(scene, frame, view, chosen, obstacles)
     _draw_close_up(scene, frame, view, chosen, obstacles)
-    _draw_colours(figure, line)
+    _draw_colours(figure, nodes, chosen)
     words = f"frame at {at:.2f} s, where the prediction is farthest from the measured thread"
     figure.text(0.015, 0.905, words, fontsize=9.5, color=INK)
-    plots = figure.subplots(
-        3, 1, sharex=True, gridspec_kw={"left": 0.51, "right": 0.985, "top": 0.87, "bottom": 0.085, "hspace": 0.33}
+    consistency = Consistency.of(series)
+    panels = (
+        [_draw_error, _draw_clearance, _draw_strain]
+        if consistency is None
+        else [_draw_error, _draw_consistency, _draw_clearance, _draw_strain]
     )
-    _draw_error(plots[0], series)
-    _draw_clearance(plots[1], series)
-    _draw_strain(plots[2], series)
+    layout = {"left": 0.51, "right": 0.985, "top": 0.87, "bottom": 0.085, "hspace": 0.38}
+    plots = figure.subplots(len(panels), 1, sharex=True, gridspec_kw=layout)
+    for axes, draw in zip(plots, panels, strict=True):
+        draw(axes, series)
     for axes in plots:
         axes.axvline(at, color=FAINT, linewidth=0.9, linestyle=(0, (2, 2)), zorder=0)
         tidy(axes)
-    plots[2].set_xlim(series.times[0], series.times[-1])
-    plots[2].set_xlabel("time since the bag's start [s]", color=INK)
+    plots[-1].set_xlim(series.times[0], series.times[-1])
+    plots[-1].set_xlabel("time since the bag's start [s]", color=INK)
     title = printable(_title(summary))  # with names from outside, and no mathematics in them
     figure.text(0.015, 0.938, title, fontsize=12, color=INK, linespacing=1.4, parse_math=False)
     figure.savefig(path)
@@ -91,9 +99,9 @@ def _title(summary: ReplaySummary) -> str:
 
 def _draw_frame(
     axes: Axes, frame: NDArray[np.uint8], view: DishView, chosen: FrameResult, obstacles: Sequence[Obstacle]
-) -> LineCollection:
-    """Draw the dish, filling the axes, and return the predicted thread's line."""
-    line = draw_threads(axes, frame, view, chosen, obstacles, magnified=1.0)
+) -> PathCollection:
+    """Draw the dish, filling the axes, and return the thread's nodes."""
+    nodes = draw_threads(axes, frame, view, chosen, obstacles, magnified=1.0)
     if len(chosen.tail):
         _draw_heading(axes, view, chosen)
     height, width = frame.shape[:2]
@@ -101,7 +109,7 @@ def _draw_frame(
     axes.set_xlim(max(-0.5, middle[0] - half), min(width - 0.5, middle[0] + half))
     axes.set_ylim(height - 0.5, -0.5)
     draw_scale_bar(axes, view, 0.15)
-    return line
+    return nodes
 
 
 def draw_threads(
@@ -111,8 +119,15 @@ def draw_threads(
     chosen: FrameResult,
     obstacles: Sequence[Obstacle],
     magnified: float,
-) -> LineCollection:
-    """Draw frame, obstacles, measured and predicted thread, without axes."""
+) -> PathCollection:
+    """Draw a frame, obstacles, and the threads that there are, without axes.
+
+    The measured thread is wide, the predicted one a line below the estimated one, the ground truth dashed. The nodes
+    of the estimated thread, else of the predicted one, have the colours of their margins.
+
+    Returns:
+        The nodes.
+    """
     axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
     axes.set_xticks([])
     axes.set_yticks([])
@@ -132,16 +147,20 @@ def draw_threads(
         axes.plot(
             measured[:, 0], measured[:, 1], color=SEEN, linewidth=5.0 * magnified, alpha=0.45, solid_capstyle="round"
         )
-    vertices = view.to_pixels(chosen.vertices)
-    clearance = chosen.clearance
-    segments = np.stack([vertices[:-1], vertices[1:]], axis=1)
+    nodes = view.to_pixels(chosen.vertices)
+    axes.plot(nodes[:, 0], nodes[:, 1], color=PREDICTED, linewidth=3.0 * magnified, solid_capstyle="round")
+    if chosen.estimate is not None:
+        nodes = view.to_pixels(chosen.estimate.vertices)
+        axes.plot(nodes[:, 0], nodes[:, 1], color=ESTIMATED, linewidth=1.7 * magnified, solid_capstyle="round")
+    if len(chosen.ground_truth) > 1:
+        points = view.to_pixels(chosen.ground_truth).T
+        axes.plot(*points, color=TRUTH, linewidth=0.9 * magnified, linestyle=(0, (4, 4)))
+    clearance = np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, FULL_CLEARANCE_MM)
     norm = Normalize(0.0, FULL_CLEARANCE_MM)
-    line = LineCollection(list(segments), cmap=MARGIN_COLOURS, norm=norm, linewidth=2.0, capstyle="round")
-    line.set_array(np.clip(1e3 * np.minimum(clearance[:-1], clearance[1:]), 0.0, FULL_CLEARANCE_MM))
-    axes.add_collection(line)
-    dots: dict[str, Any] = {"markersize": 2.0 * magnified, "markeredgecolor": INK, "markeredgewidth": 0.4}
-    axes.plot(vertices[:, 0], vertices[:, 1], "o", color="white", **dots)
-    return line
+    size = 9.0 * magnified**2
+    return axes.scatter(
+        nodes[:, 0], nodes[:, 1], s=size, c=clearance, cmap=MARGIN_COLOURS, norm=norm, linewidths=0.0, zorder=2.5
+    )
 
 
 def _draw_close_up(
@@ -172,14 +191,21 @@ def _draw_close_up(
     scene.indicate_inset(box, inset, edgecolor=INK, alpha=0.7, linewidth=0.7)
 
 
-def _draw_colours(figure: Figure, line: LineCollection) -> None:
-    """Draw the key: what is seen, what is predicted, and the colours of the margin."""
-    seen = figure.add_axes((0.015, 0.055, 0.03, 0.02))
-    seen.axhline(0.5, color=SEEN, linewidth=5.0, alpha=0.45)
-    seen.set_axis_off()
-    figure.text(0.05, 0.059, "measured by the camera", fontsize=9, color=INK)
-    bar = figure.colorbar(line, cax=figure.add_axes((0.185, 0.062, 0.25, 0.014)), orientation="horizontal")
-    bar.set_label("predicted, by its nodes' distance from the obstacles [mm]", fontsize=8.5, color=INK)
+def _draw_colours(figure: Figure, nodes: PathCollection, chosen: FrameResult) -> None:
+    """Draw the key: what each line is, and the colours of the margin."""
+    axes = figure.add_axes((0.015, 0.035, 0.24, 0.06))
+    lines: list[tuple[str, dict[str, Any]]] = [("predicted", {"color": PREDICTED, "linewidth": 2.2})]
+    if chosen.estimate is not None:
+        lines.append(("estimated", {"color": ESTIMATED, "linewidth": 1.6}))
+    if len(chosen.measured) > 1:
+        lines.append(("measured by the camera", {"color": SEEN, "linewidth": 5.0, "alpha": 0.45}))
+    if len(chosen.ground_truth) > 1:
+        lines.append(("ground truth", {"color": TRUTH, "linewidth": 1.3, "linestyle": (0, (4, 2.5))}))
+    handles = [Line2D([], [], label=name, **style) for name, style in lines]
+    axes.legend(handles=handles, loc="center left", ncols=2, fontsize=8.5, frameon=False, borderpad=0.0)
+    axes.set_axis_off()
+    bar = figure.colorbar(nodes, cax=figure.add_axes((0.285, 0.062, 0.17, 0.014)), orientation="horizontal")
+    bar.set_label("nodes, by distance from the obstacles [mm]", fontsize=8.5, color=INK)
     bar.ax.tick_params(labelsize=8, colors=INK, length=2)
     bar.outline.set_visible(False)
 
@@ -214,14 +240,30 @@ def draw_scale_bar(axes: Axes, view: DishView, share: float) -> None:
 
 
 def _draw_error(axes: Axes, series: TimeSeries) -> None:
-    seen = series.column("error_seen")
-    axes.plot(series.times, seen, color=SEEN, linewidth=1.4, label="against the measured centreline")
-    if series.has("error_truth"):
-        truth = series.column("error_truth")
-        axes.plot(series.times, truth, color=TRUTH, linewidth=1.4, label="against the ground truth")
-    axes.set_ylim(0.0, 1.3 * axes.get_ylim()[1])  # room for the legend
-    axes.set_title("prediction error [% of the thread's length]", fontsize=9.5, color=INK, loc="left")
-    axes.legend(loc="upper right", fontsize=8.5, frameon=False, ncols=2)
+    for kind, column, colour in (("prediction", "error", PREDICTED), ("estimate", "estimate_error", ESTIMATED)):
+        for target, name, dashes in (("truth", "ground truth", "-"), ("seen", "measured centreline", ":")):
+            if series.has(f"{column}_{target}"):
+                errors, label = series.column(f"{column}_{target}"), f"{kind}, against the {name}"
+                axes.plot(series.times, errors, color=colour, linewidth=1.4, linestyle=dashes, label=label)
+    axes.set_ylim(0.0, 1.5 * axes.get_ylim()[1])  # room for the legend
+    axes.set_title("error [% of the thread's length]", fontsize=9.5, color=INK, loc="left")
+    if axes.get_lines():
+        axes.legend(loc="upper right", fontsize=8.5, frameon=False, ncols=2)
+
+
+def _draw_consistency(axes: Axes, series: TimeSeries) -> None:
+    found = Consistency.of(series)
+    axes.set_title(
+        "normalised innovation squared, its mean over 5 s and their 95 % band", fontsize=9.5, color=INK, loc="left"
+    )
+    squared = series.column("innovation_squared")
+    axes.plot(series.times, squared, ".", color=FAINT, markersize=2.0, alpha=0.5)
+    if found is None:
+        return
+    axes.set_ylim(0.0, max(2.5, float(np.nanpercentile(squared, 98))))
+    for begin, end, mean, low, high in zip(found.begins, found.ends, found.means, found.low, found.high, strict=True):
+        axes.fill_between([begin, end], low, high, color=ESTIMATED, alpha=0.3, linewidth=0)
+        axes.plot([begin, end], [mean, mean], color=INK, linewidth=1.8)
 
 
 def _draw_clearance(axes: Axes, series: TimeSeries) -> None:

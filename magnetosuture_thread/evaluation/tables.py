@@ -14,6 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from magnetosuture_thread.barrier import BUILT_IN
+from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
+from magnetosuture_thread.evaluation.frames import TimeSeries
 from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import Percentiles, finite_or_none
 from magnetosuture_thread.evaluation.reference_scores import Evaluation
@@ -28,7 +30,8 @@ from magnetosuture_thread.evaluation.report.figures import (
 )
 from magnetosuture_thread.texts import printable
 
-Row: TypeAlias = "dict[str, str | int | float | None]"
+Value: TypeAlias = "str | int | float | None"
+Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
 
 ERRORS = {"mean": "mean", "median": "median", "p99": "p99", "maximum": "max"}
 SIMULATED, UNVERIFIED, SILENT = "*", "?", "!"  # marks of a bag
@@ -36,7 +39,10 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes the begin
 
 
 def row_of(about: BagDetails, figures: BagFigures) -> Row:
-    """Return the row of an evaluated bag: SI units and %, as the columns' names say; None where there is no value."""
+    """Return the row of an evaluated bag: SI units and %, as the columns' names say; None where there is no value.
+
+    `prediction`, `estimate` and `consistency` are mappings; in a table they are a column for each of their values.
+    """
     row: Row = {
         "bag": about.name,
         "path": about.path,
@@ -57,6 +63,8 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
             found = errors.get(target) or {}
             row[f"{prefix}_{target}_frames"] = found.get("count", 0)
             row |= {f"{prefix}_{target}_{short}_percent": found.get(name) for name, short in ERRORS.items()}
+    row |= {kind: dict(errors) for kind, errors in figures.compared.items()}
+    row |= figures.estimation.to_json()
     row |= {
         "seen_share": figures.measured_share,
         "stretch_max": figures.strain,
@@ -77,7 +85,7 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
 
 def failed_row(name: str, path: str, problem: str) -> Row:
     """Return the row of a bag that could not be evaluated."""
-    row: Row = dict.fromkeys(COLUMNS)
+    row: Row = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in _EMPTY.items()}
     words = ("setup", "simulated", "source", "formulation", "damage", "unverified")
     return row | dict.fromkeys(words, "") | {"bag": name, "path": path, "problem": problem}
 
@@ -87,7 +95,8 @@ def _percentiles(name: str, found: Percentiles | None) -> Row:
 
 
 _NOTHING = BagFigures(0, 0, 0, {}, {}, "", math.nan, math.nan, math.nan, {}, 0, None, None, math.nan)
-COLUMNS = tuple(row_of(BagDetails("", "", ""), _NOTHING))
+_EMPTY = row_of(BagDetails("", "", ""), _NOTHING)
+COLUMNS = tuple(_EMPTY)
 TIMES = tuple(column for column in COLUMNS if column.startswith(("step_", "tracker_")))  # differ from run to run
 
 
@@ -98,21 +107,45 @@ def table_csv(rows: Sequence[Row]) -> str:
     """
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow(COLUMNS)
+    writer.writerow(flat(_EMPTY))
     for row in rows:
-        writer.writerow([_cell(row[column]) for column in COLUMNS])
+        writer.writerow([_cell(value) for value in flat(row).values()])
     return stream.getvalue()
 
 
-def _cell(value: str | int | float | None) -> str | int | float | None:
+def flat(row: Row) -> dict[str, Value]:
+    """Return a row with a column for each value of its mappings, `estimate_error_measured_mean_percent` for example."""
+    columns: dict[str, Value] = {}
+    for name, value in row.items():
+        columns |= {f"{name}_{key}": own for key, own in value.items()} if isinstance(value, dict) else {name: value}
+    return columns
+
+
+def _cell(value: Value) -> Value:
     if not isinstance(value, str):
         return value
     return f"'{printable(value)}" if value.startswith(FORMULA) else printable(value)
 
 
 def table_json(rows: Sequence[Row]) -> str:
-    """Return the table as JSON: `bags`, a list of rows, and `mean` and `worst` over the bags that were evaluated."""
-    return json.dumps({"bags": list(rows), **totals(rows)}, indent=2, allow_nan=False) + "\n"
+    """Return the table as JSON.
+
+    `bags` is a list of rows, `mean` and `worst` are over the mean errors of the bags that were evaluated, and
+    `prediction` and `estimate` have the names of those of a bag: means of means, and maxima of maxima.
+    """
+    return json.dumps({"bags": list(rows), **totals(rows), **compared(rows)}, indent=2, allow_nan=False) + "\n"
+
+
+def compared(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
+    """Return the errors of `prediction` and `estimate` over bags; None where no bag has any."""
+    found: dict[str, dict[str, float | None]] = {}
+    for kind, errors in compare_errors(TimeSeries([])).items():
+        found[kind] = {}
+        for name in errors:
+            values = [own[name] for row in rows if isinstance(own := row[kind], dict) and own[name] is not None]
+            whole = np.mean if name.endswith("_mean_percent") else np.max
+            found[kind][name] = float(whole(values)) if values else None
+    return found
 
 
 def totals(rows: Sequence[Row]) -> dict[str, Any]:
@@ -139,8 +172,9 @@ def bags_table(rows: Sequence[Row]) -> Table:
         caption_justify="left",
     )
     table.caption = (
-        "errors in % of the length, mean and maximum over time;\n"
-        "margin: the minimum of an obstacle; step: median of the model's"
+        "errors in % of the length, mean and maximum over time, of the estimate,\n"
+        "and below of the prediction; margin: the minimum of an obstacle;\n"
+        "step: median of the model's"
     )
     if any(row["simulated"] for row in rows):
         table.caption += f";\n{SIMULATED} simulated, as the bag itself says"
@@ -159,24 +193,30 @@ def bags_table(rows: Sequence[Row]) -> Table:
             continue
         marks_of = ((SIMULATED, "simulated"), (UNVERIFIED, "unverified"), (SILENT, "silences"))
         marks = [mark for mark, why in marks_of if row[why]]
-        errors = [row[f"error_{target}_{which}_percent"] for target in AGAINST for which in ("mean", "max")]
         table.add_row(
             Text(" ".join([str(row["bag"]), *marks])),
             f"{row['predicted']}/{row['frames']}",
-            *(_shown(error, format_number) for error in errors),
+            *_errors_shown(row["estimate"]),
             _shown(row["least_obstacle_m"], micrometres),
             _shown(row["step_median_s"], milliseconds),
         )
-    summed = totals(rows)
+        errors = [row[f"error_{target}_{which}_percent"] for target in AGAINST for which in ("mean", "max")]
+        table.add_row(Text("  prediction", style="dim"), "", *(_shown(error, format_number) for error in errors))
     table.add_section()
-    for name in ("mean", "worst"):
-        means = [_shown(summed[name][f"error_{target}_mean_percent"], format_number) for target in AGAINST]
-        table.add_row(name, "", means[0], "", means[1])
+    found = compared(rows)
+    table.add_row("all bags", "", *_errors_shown(found["estimate"]))
+    table.add_row(Text("  prediction", style="dim"), "", *_errors_shown(found["prediction"]))
     return table
 
 
+def _errors_shown(errors: Any) -> list[str]:
+    names = [f"error_{name}_{which}_percent" for name in ("ground_truth", "measured") for which in ("mean", "max")]
+    return [_shown(errors[name], format_number) for name in names]
+
+
 def _silence(row: Row) -> tuple[float, float]:
-    return float(row["silent_s"] or 0.0), float(row["max_silence_s"] or 0.0)
+    total, longest = (own if isinstance(own := row[name], float) else 0.0 for name in ("silent_s", "max_silence_s"))
+    return total, longest
 
 
 def _shown(value: Any, how: Callable[[float], str]) -> str:
@@ -225,6 +265,7 @@ def summary_table(summary: ReplaySummary) -> Table:
     table.add_row("maximum residual", f"{summary.residual:.1e}", "scaled; checked apart from the solver")
     table.add_section()
     _add_errors(table, summary, missing="no frame could be scored")
+    _add_estimation(table, summary.estimation)
     if (apart := summary.currents) is not None:
         table.add_section()
         tail = f"{apart.p99:.2f}, {apart.greatest:.2f} A; recorded: {apart.recorded:.2f} A rms"
@@ -297,14 +338,37 @@ def _figures_table(title: str) -> Table:
 
 
 def _add_errors(table: Table, summary: ReplaySummary | LoopSummary, missing: str = "") -> None:
+    curves = (
+        ("measured centreline", "measured", summary.error_seen),
+        ("ground truth", "ground_truth", summary.error_truth),
+    )
     table.add_row("thread measured, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")
     table.add_row("prediction error, mean", "", "maximum; % of the length")
     if summary.error_seen is None and missing:
         table.add_row("  against the measured centreline", "none", missing)
-    for name, figures in (("measured centreline", summary.error_seen), ("ground truth", summary.error_truth)):
+    for title, _, figures in curves:
         if figures is not None:
             scored = f"{figures['maximum']:.3f} %; {figures['count']:.0f} frames scored"
-            table.add_row(f"  against the {name}", f"{figures['mean']:.3f} %", scored)
+            table.add_row(f"  against the {title}", f"{figures['mean']:.3f} %", scored)
+    if any(value is not None for value in summary.estimate.values()):
+        table.add_row("estimate error, mean", "", "maximum; % of the length")
+    for title, name, _ in curves:
+        if (mean := summary.estimate.get(f"error_{name}_mean_percent")) is not None:
+            maximum = summary.estimate[f"error_{name}_max_percent"]
+            table.add_row(f"  against the {title}", f"{mean:.3f} %", f"{maximum:.3f} %")
+
+
+def _add_estimation(table: Table, estimation: EstimationFigures) -> None:
+    if (hidden := estimation.hidden) is None:
+        return
+    table.add_row("thread hidden", f"{100.0 * hidden.time:.1f} %", "of the time, in part or all")
+    if (found := estimation.consistency) is None:
+        table.add_row("the estimate is a prediction only", "", "no measurement went in")
+        return
+    low, high = found.band
+    within = f"{low:.2f} to {high:.2f} in {found.within} of {found.windows} windows of {found.width:.1f} s"
+    table.add_row("normalised innovation squared", f"{found.mean:.3f}", within)
+    table.add_row("disturbances", str(estimation.disturbance_count), "that the model does not know")
 
 
 def _micrometres(metres: float) -> str:

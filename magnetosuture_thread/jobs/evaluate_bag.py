@@ -1,4 +1,4 @@
-"""Evaluation of one bag: predictions without a graph, latencies of the recorded graph, and the page."""
+"""Evaluation of one bag: predictions and estimates without a graph, latencies of the recorded graph, and the page."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def evaluate_bag(
 ) -> Row:
     """Evaluate a bag, write its page and return its row of the table.
 
-    Of each frame some numbers are kept, and of a few frames the threads: memory grows by 130 bytes a frame.
+    Of each frame some numbers are kept, and of a few frames the threads: memory grows by 210 bytes a frame.
 
     Args:
         path: of the bag.
@@ -134,20 +134,24 @@ def _predict(given: BagInput, model: ThreadModelSettings, metrics: RunMetrics, s
                 step.result.prediction,
                 step.margins,
                 step.step_time,
+                estimate=step.result.estimate,
+                estimated=step.settings.is_estimated,
                 recorded=recorded.of(step.observation.stamp),
                 obstacles=step.scene.obstacles if step.scene is not None else (),
             )
             metrics.add(frame)
-        elif step.result.problem is not None:
-            refused[_kind(step.result.problem)] += 1
+        if step.result.problem is not None:
+            refused[_kind("the model", step.result.problem)] += 1
+        elif step.result.estimate_problem is not None:
+            refused[_kind("the estimator", step.result.estimate_problem)] += 1
     refused += Counter({why: count for why, count in seen.refused.items() if why != NOT_FOUND})
     return refused + given.recording.refused
 
 
-def _kind(problem: Exception) -> str:
+def _kind(part: str, problem: Exception) -> str:
     if isinstance(problem, InvalidInputError):
-        return f"the model: {problem.field}, expected {problem.expectation}"
-    return "the model: a program that was not solved"
+        return f"{part}: {problem.field}, expected {problem.expectation}"
+    return f"{part}: a program that was not solved"
 
 
 def _pictures(given: BagInput, model: ThreadModelSettings, metrics: RunMetrics) -> list[ReportPicture]:

@@ -18,6 +18,7 @@ from magnetosuture_thread.bags.bag_folder import UNVERIFIED_NOTE
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import draw_summary
@@ -208,7 +209,7 @@ def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> Repla
         metrics: of its predictions, of which there are some.
         others: the fields of `ReplaySummary` that these do not give.
     """
-    errors = metrics.errors()
+    errors, compared = metrics.errors(), compare_errors(metrics.series)
     return ReplaySummary(
         bag=str(given.recording.path),
         setup=given.setup.name,
@@ -225,6 +226,9 @@ def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> Repla
         source=given.source,
         damage=str(given.recording.damage or ""),
         unverified=given.recording.unverified,
+        estimation=metrics.estimation,
+        prediction=compared["prediction"],
+        estimate=compared["estimate"],
         **others,
     )
 

@@ -99,8 +99,16 @@ def replay_offline(
             for step in steps:
                 made.write(step)
                 if step.result.prediction is not None:
-                    predicted = step.result.prediction
-                    metrics.add(FrameResult.of(step.observation, predicted, step.margins, step.step_time))
+                    predicted, estimate = step.result.prediction, step.result.estimate
+                    frame = FrameResult.of(
+                        step.observation,
+                        predicted,
+                        step.margins,
+                        step.step_time,
+                        estimate=estimate,
+                        estimated=step.settings.is_estimated,
+                    )
+                    metrics.add(frame)
                 elif step.result.problem is not None:
                     refused[_kind(step.result.problem)] += 1
                 if step.result.estimate_problem is not None and step.result.problem is None:

@@ -16,7 +16,7 @@ from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.solvers import SOLVERS, make_solver
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
+from magnetosuture_thread.model.thread import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -38,7 +38,6 @@ FIXED = {  # why a node cannot change it
     "scene": "what it starts with; the topic scene changes it",
 }
 _OPTIONS = EstimatorOptions()  # their defaults
-MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
 @dataclass(frozen=True)
@@ -125,6 +124,14 @@ class ThreadModelSettings(Configuration):
         unit="m/s^2",
         minimum=-20.0,
         maximum=20.0,
+        multiple=2,
+    )
+    flow: tuple[float, ...] = quantity(
+        (),
+        "velocity of the liquid or air in the plane of the camera, the same everywhere: x, y; for rod",
+        unit="m/s",
+        minimum=-0.1,
+        maximum=0.1,
         multiple=2,
     )
     initial_shape: str = quantity(
@@ -242,6 +249,7 @@ class ThreadModelSettings(Configuration):
         for name, pair, words in (
             ("attachment_offset", self.attachment_offset, "along and to the left"),
             ("gravity", self.gravity, "x and y"),
+            ("flow", self.flow, "x and y"),
         ):
             if len(pair) not in (0, 2):
                 raise ConfigurationError(f"{self.GROUP}.{name}", list(pair), f"two numbers, {words}, or none")
@@ -252,6 +260,10 @@ class ThreadModelSettings(Configuration):
                 raise self.refused("solver", error.expectation) from None
         if self.formulation == "paper" and self.medium != "liquid":
             raise self.refused("medium", "liquid, as the formulation paper has no inertia")
+        if self.formulation == "paper" and self.flow:
+            raise ConfigurationError(
+                f"{self.GROUP}.flow", list(self.flow), "none, as the formulation paper has no drag"
+            )
         if abs(self.rest_curvature) * self.thread_length / segments > MAX_REST_ANGLE:
             limit = MAX_REST_ANGLE * segments / self.thread_length
             words = f"at most {limit:.0f} 1/m with {segments} segments, which turn by half a radian then"
@@ -287,8 +299,8 @@ class ThreadModelSettings(Configuration):
         )
         if self.medium == "air":
             air = Medium.air(self.mass_per_length, self.gravity, self.air_drag, self.bending_damping)
-            return replace(thread, medium=air)
-        return thread
+            thread = replace(thread, medium=air)
+        return replace(thread, medium=replace(thread.medium, flow=self.flow)) if self.flow else thread
 
     def attachment_pose(self, pose: NeedlePose) -> NeedlePose:
         """Return the pose of the point where the thread is fixed, from that of the needle's tail, in the plane."""
@@ -329,6 +341,11 @@ class ThreadModelSettings(Configuration):
         predictor.warm_up()
         return predictor
 
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the thread is estimated too."""
+        return self.estimator and self.formulation == "rod" and self.medium == "liquid"
+
     def estimator_session(self, scene: Scene | None) -> EstimatorSession | None:
         """Return an estimator of this thread in a scene, its kernels compiled; None where it is not estimated.
 
@@ -338,7 +355,7 @@ class ThreadModelSettings(Configuration):
         Raises:
             ConfigurationError: see `predictor`.
         """
-        if not self.estimator or self.formulation != "rod" or self.medium != "liquid":
+        if not self.is_estimated:
             return None
         options = {about.name: getattr(self, f"estimator_{about.name}") for about in fields(EstimatorOptions)}
         estimator = ThreadEstimator(self.predictor(scene), EstimatorOptions(**options))

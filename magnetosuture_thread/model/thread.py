@@ -14,6 +14,8 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Scene
 
+MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
+
 
 @dataclass(frozen=True)
 class Medium:
@@ -21,7 +23,7 @@ class Medium:
 
     The force on a length ds that moves with velocity v and acceleration a is
 
-        -(zeta_perp (I - t t') + zeta_par t t') v ds + mu (g - a) ds
+        -(zeta_perp (I - t t') + zeta_par t t') (v - w) ds + mu (g - a) ds
 
     and bending is damped by a moment of EI tau times the rate of the curvature.
 
@@ -31,6 +33,7 @@ class Medium:
         mass_per_length: mu [kg/m]; 0 where inertia does not matter.
         gravity: g, one value for each dimension, or none [m/s^2]; it acts on the mass alone.
         bending_damping: tau [s].
+        flow: w, velocity of the medium, the same everywhere; one value for each dimension, or none [m/s].
     """
 
     drag_across: float
@@ -38,6 +41,7 @@ class Medium:
     mass_per_length: float = 0.0
     gravity: tuple[float, ...] = ()
     bending_damping: float = 0.0
+    flow: tuple[float, ...] = ()
 
     @classmethod
     def liquid(

@@ -210,7 +210,7 @@ class ObservationReader(Iterator[Observation]):
             points = _NOTHING
         if record.topic == _SEEN and len(points):
             self._check_place(record.topic, points)
-            if self._threads % MEASURED == 0:
+            if self._threads % MEASURED == 0 and np.isfinite(points).all():
                 length = float(arc_lengths(points)[-1]) / self._length
                 self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
                 self._measured += 1
@@ -276,8 +276,9 @@ class ObservationReader(Iterator[Observation]):
     def _check_place(self, topic: str, points: Points) -> None:
         """Refuse what is farther away than the dish is wide."""
         width = self._scene.dish.diameter
-        if np.maximum.reduce(np.abs(points), axis=None) > width:  # what is not finite is refused by the model
-            worst = points.reshape(-1, 2)[np.abs(points).reshape(-1, 2).max(axis=1).argmax()]
+        far = np.where(np.isfinite(points), np.abs(points), 0.0)  # what is not finite is refused by the model
+        if np.maximum.reduce(far, axis=None) > width:
+            worst = points.reshape(-1, 2)[far.reshape(-1, 2).max(axis=1).argmax()]
             where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {width:g} m wide"
             raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another setup's?")
 

@@ -164,7 +164,8 @@ def draw_behavior(path: Path, runs: Sequence[BehaviorRun]) -> None:
     figure.text(
         0.012,
         1.0 - 0.58 / height,
-        "wide and blue: what the camera sees; thin, with nodes: what the model predicts from the needle's pose alone",
+        "wide and blue: measured by the camera; magenta: predicted from the needle's pose alone; "
+        "teal, with nodes: estimated by both; dashed: ground truth",
         fontsize=9.5,
         color=FAINT,
     )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.untrusted import MAX_PIXELS
 from magnetosuture_thread.vision.image_header import image_header
+from magnetosuture_thread.vision.sampling import distances, sample_inside
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
@@ -30,11 +32,13 @@ class Layer:
         pixels: shape (rows, columns), uint8.
         small: the same, shrunk by area.
         floor: how bright what is behind all slender things is, in the pixels of `small`.
+        cleared: the last needle that was taken out of it, and the pixels without; see `without_needle`.
     """
 
     pixels: np.ndarray
     small: np.ndarray
     floor: np.ndarray
+    cleared: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
 
     def replaced(self, pixels: np.ndarray) -> Layer:
         """Return the layer with other pixels."""
@@ -128,10 +132,10 @@ class Wall:
 
     def distances(self, box: tuple[slice, slice]) -> np.ndarray:
         """Return how far the pixels of some rows and columns are from the centre [px]."""
-        rows, columns = np.ogrid[box]
-        across = (columns - self.centre[0]).astype(np.float32)
-        down = (rows - self.centre[1]).astype(np.float32)
-        return np.asarray(np.sqrt(across * across + down * down))
+        rows, columns = box
+        result = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.float32)
+        distances(rows.start, columns.start, self.centre, result)
+        return result
 
     def floor(self, channel: Layer, factor: int, box: tuple[slice, slice]) -> np.ndarray:
         """Return how bright the floor is in some rows and columns, `FLOOR_DEPTH_PX` inside of the wall and beyond.
@@ -139,15 +143,11 @@ class Wall:
         There the floor of a channel is mixed with the rim. What is farther out has the brightness of the place on
         the way to the centre that is so far inside.
         """
-        rows, columns = np.ogrid[box]
-        shrink = np.minimum(1.0, (self.radius - FLOOR_DEPTH_PX) / np.maximum(self.distances(box), 1.0))
-        shift = 0.5 * (factor - 1)
-        at_u, at_v = (
-            ((shrink * (place - middle) + middle - shift) / factor).astype(np.float32)
-            for place, middle in zip((columns, rows), self.centre, strict=True)
-        )
-        floor = cv2.remap(channel.floor, at_u, at_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(floor)
+        rows, columns = box
+        result = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
+        depth = self.radius - FLOOR_DEPTH_PX
+        sample_inside(channel.floor, factor, rows.start, columns.start, self.centre, depth, result)
+        return result
 
 
 def without_wall(channel: Layer, factor: int, wall: Wall, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.dish.ellipse import find_ellipse
-from magnetosuture_thread.vision.dish.find import find_dish
+from magnetosuture_thread.vision.dish.find import Guess, find_dish
 from magnetosuture_thread.vision.dish.tilt import MIN_ANGLE, Tilt, find_tilt, tilt_of, unseen_tilt_covariance
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
@@ -149,16 +149,17 @@ def see_dish(
         photographed: whether to look for a dish as in a photograph where there is no other, which takes long.
     """
     gray = measured_channel(image)
+    guesses: dict[int, Guess | None] = {}
     fixed = settings.fixed_view()
     if fixed is not None:
         # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
-        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _found_view(gray, settings, diameter) is None
-        dark = dark and _found_view(255 - gray, settings, diameter) is not None
+        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _found_view(gray, settings, diameter, guesses) is None
+        dark = dark and _found_view(255 - gray, settings, diameter, guesses) is not None
         return FoundDish(fixed, dark, homography=settings.homography())
     for dark_field in (False, True):
         if dark_field:
             gray = 255 - gray
-        found = _found_view(gray, settings, diameter)
+        found = _found_view(gray, settings, diameter, guesses)
         if found is None:
             continue
         view, remark = found
@@ -170,9 +171,11 @@ def see_dish(
     return _photographed(image, settings, diameter) if photographed else None
 
 
-def _found_view(gray: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> tuple[DishView, str] | None:
+def _found_view(
+    gray: np.ndarray, settings: VisionTrackerSettings, diameter: float, guesses: dict[int, Guess | None]
+) -> tuple[DishView, str] | None:
     """Return the view by a dish with a bright floor, and a remark on its scale; None if none is seen."""
-    found = find_dish(gray, diameter)
+    found = find_dish(gray, diameter, guesses)
     return _with_given(found, settings) if found is not None else None
 
 

@@ -36,6 +36,39 @@ def within(image, u, v):
 
 
 @compiled
+def distances(top, left, centre, result):
+    """Fill in how far pixels are from a point; the first one is in the row `top` and the column `left` [px]."""
+    for row in range(result.shape[0]):
+        v = top + row - centre[1]
+        for column in range(result.shape[1]):
+            u = left + column - centre[0]
+            result[row, column] = math.sqrt(u * u + v * v)
+
+
+@compiled
+def sample_inside(image, factor, top, left, centre, radius, result):
+    """Fill in an image that is shrunk by a factor, where pixels beyond a radius take what is on it, towards the centre.
+
+    Args:
+        image: shape (rows, columns), uint8.
+        factor: how much smaller it is.
+        top: row of the first pixel of the result in the image that is not shrunk [px].
+        left: column of it [px].
+        centre: u and v [px].
+        radius: [px]
+        result: filled, uint8.
+    """
+    shift = 0.5 * (factor - 1)
+    for row in range(result.shape[0]):
+        v = top + row - centre[1]
+        for column in range(result.shape[1]):
+            u = left + column - centre[0]
+            share = min(1.0, radius / max(math.sqrt(u * u + v * v), 1.0))
+            at_u, at_v = share * u + centre[0] - shift, share * v + centre[1] - shift
+            result[row, column] = int(within(image, at_u / factor, at_v / factor) + 0.5)
+
+
+@compiled
 def straighten(gray, start, along, aside, strip):
     """Fill a strip with the image along an arc; see `Arc.at`.
 

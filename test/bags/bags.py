@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from magnetosuture_thread.bags.message_types import own_definition, typestore
-from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 
 HEADER = "std_msgs/msg/Header"
@@ -119,3 +119,16 @@ def copy_with_notes(bag: Path, folder: Path, **notes: str) -> None:
         numbers = {connection: new.add_connection(connection) for connection in old.connections()}
         for item in old.stored():
             new.write_to(numbers[item.connection], item.time, item.data)
+
+
+def changed(bag: Path, folder: Path, change: Callable[[RecordedMessage, Any], Any]) -> Path:
+    """Write a bag again, each message as it comes out of a function; those that come out as None are left out."""
+    source = Bag(bag)
+    with BagWriter(folder, source.notes) as writer:
+        for topic, type_name in source.topics.items():
+            writer.add_topic(topic, type_name)
+        for old in source.records(set(source.topics)):
+            message = change(old, old.decode())
+            if message is not None:
+                writer.write_message(old.topic, old.time, message)
+    return folder

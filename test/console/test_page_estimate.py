@@ -9,7 +9,7 @@ from test.console.test_page import Operator, between, operator
 
 __all__ = ["operator"]  # the fixture
 
-TEAL, MAGENTA, GREEN, RED = "#00a3a8", "#b5179e", "#12a150", "#d1122f"
+TEAL, MAGENTA, GREEN, RED = "#00a3a8", "#99107f", "#12a150", "#d1122f"
 
 
 def test_estimate_prediction_and_measurement_have_their_own_colours(operator: Operator) -> None:

@@ -19,6 +19,7 @@ from magnetosuture_thread.evaluation.tables import (
     Row,
     bags_table,
     failed_row,
+    flat,
     row_of,
     table_csv,
     table_json,
@@ -56,7 +57,7 @@ def read(rows: list[Row]) -> list[dict[str, str]]:
 
 def test_a_row_has_the_figures_with_all_digits():
     (found,) = read([row("a")])
-    assert tuple(found) == COLUMNS
+    assert tuple(found) == tuple(flat(row("a")))  # each value of a mapping has a column
     assert float(found["error_truth_mean_percent"]) == 0.1 + 0.2
     assert found["error_seen_mean_percent"] == found["stretch_max"] == found["tracker_median_s"] == ""
     assert found["error_seen_frames"] == "0"

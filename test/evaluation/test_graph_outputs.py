@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import Percentiles, error_figures, stage_latencies
 from magnetosuture_thread.evaluation.tables import summary_table
@@ -81,6 +82,48 @@ def test_messages_of_one_stamp_are_put_together():
         ("connectivity", 1e-9, 1, -1, 0.0),
         ("obstacle", -0.1, 3, 0, 1.0),
     ]
+
+
+def estimate(nanoseconds: int, points: np.ndarray, degrees: int) -> Message:
+    """Return an estimated thread that is disturbed."""
+    found = Message(
+        arc_length=0.5,
+        extent=0.1,
+        position=Message(x=-0.5, y=0.0, z=0.0),
+        direction=Message(x=0.0, y=1.0, z=0.0),
+        force=1e-6,
+        significance=6.0,
+        since=header(nanoseconds - 10**8).stamp,
+    )
+    return Message(
+        header=header(nanoseconds),
+        positions=[Message(x=x, y=y) for x, y in points],
+        prediction_only=degrees == 0,
+        innovation_squared=1.5 * degrees,
+        innovation_degrees=degrees,
+        hidden=0.25,
+        disturbances=[found],
+    )
+
+
+def test_the_last_estimate_of_a_frame_is_compared_beside_the_prediction():
+    collector = GraphCollector(length=1.0)
+    for k in (1, 2):
+        collector.add("/thread/predicted", prediction(k * 10**9, STRAIGHT + np.array([0.0, 0.05])))
+        collector.add("/thread/estimated", estimate(k * 10**9, STRAIGHT + np.array([0.0, 0.04]), 0))
+        collector.add("/ground_truth/thread", path(k * 10**9, STRAIGHT))
+    collector.add("/thread/estimated", estimate(2 * 10**9, STRAIGHT + np.array([0.0, 0.01]), 16))
+    metrics = collector.metrics(start=10**9)
+    found = compare_errors(metrics.series)
+    assert found["prediction"]["error_ground_truth_mean_percent"] == pytest.approx(5.0)
+    assert found["estimate"]["error_ground_truth_mean_percent"] == pytest.approx(2.5)
+    estimation = metrics.estimation
+    assert estimation.corrected == 1
+    assert estimation.consistency is not None
+    assert estimation.consistency.mean == pytest.approx(1.5)
+    assert estimation.hidden is not None
+    assert estimation.hidden.length == pytest.approx((1.0 + 0.25) / 2)  # nothing measured was kept beside it
+    assert [event.begin_s for event in estimation.disturbances] == pytest.approx([-0.1, 0.9])
 
 
 def test_a_command_counts_as_driven_only_if_it_was_followed():

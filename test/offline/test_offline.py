@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,6 +39,7 @@ from magnetosuture_thread.model.margins import UNKNOWN, Friction, FrictionState
 from magnetosuture_thread.offline.predictions import predictions, read_observations
 from magnetosuture_thread.scene import SceneShape
 from magnetosuture_thread.setups import read_setup
+from test.bags.bags import changed
 
 SETUP = read_setup("petri_35mm_polyamide")
 
@@ -50,19 +50,6 @@ def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceT
     path = tmp_path_factory.mktemp("poses") / "pull"
     render_bag(straight_pull, SETUP, path, duration=1.0, poses=True, noise=1e-5)
     return path
-
-
-def changed(bag: Path, folder: Path, change: Callable[[RecordedMessage, Any], Any]) -> Path:
-    """Write a bag again, each message as it comes out of a function; those that come out as None are left out."""
-    source = Bag(bag)
-    with BagWriter(folder, source.notes) as writer:
-        for topic, type_name in source.topics.items():
-            writer.add_topic(topic, type_name)
-        for old in source.records(set(source.topics)):
-            message = change(old, old.decode())
-            if message is not None:
-                writer.write_message(old.topic, old.time, message)
-    return folder
 
 
 def at(message: Any, stamp: int) -> Any:

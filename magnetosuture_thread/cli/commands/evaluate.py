@@ -79,12 +79,12 @@ def add(subparsers: Subparsers) -> None:
 def run_evaluate(options: argparse.Namespace) -> int:
     """Score the thread model on bags, or on reference trajectories.
 
-    Bags: each is predicted without a graph, as fast as the machine can, and compared with the measured centreline
-    and, where the bag holds it, ground truth. PATH is an mcap or db3 file, the folder of a bag, or a folder of bags,
+    Bags: the thread of each is predicted and estimated without a graph, as fast as the machine can, and compared with
+    the measured centreline and, where the bag holds it, ground truth. PATH is an mcap or db3 file, the folder of a bag, or a folder of bags,
     which may be up to two folders below. DIR, which must not exist, gets
       NAME.html    a page for each bag, which needs no network: plots to zoom, the worst frames
       table.csv    a row for each bag, SI units and %
-      table.json   the same, with mean and worst
+      table.json   the same, with mean and worst, and prediction and estimate side by side
     A bag that cannot be evaluated has its row too, with the problem in it; the exit code is 1 then.
 
     Reference trajectories: files DIR/*.npz with the needle's poses and the thread that followed (arrays t, pose, X and

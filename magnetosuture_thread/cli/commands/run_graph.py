@@ -108,7 +108,7 @@ def run_replay(options: argparse.Namespace) -> int:
     DIR, which must not exist, gets
       bag/           all outputs of the graph, an mcap bag
       summary.json   the figures of the table
-      summary.png    a frame with the predicted and the measured thread; error and margins over time
+      summary.png    a frame with the threads; errors, consistency and margins over time
       logs/          what each node printed (live only)
     """
     for name in ("rate", "loop"):

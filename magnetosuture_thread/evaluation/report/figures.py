@@ -8,7 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, SensorSilence
+from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
+from magnetosuture_thread.evaluation.frames import TimeSeries
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.silence import SensorSilence
 from magnetosuture_thread.model.margins import SOLID
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
@@ -35,7 +38,7 @@ class LiveFigures:
 
 @dataclass(frozen=True)
 class BagFigures:
-    """How the prediction did on one bag. Lengths in m, times in s.
+    """How prediction and estimate did on one bag. Lengths in m, times in s.
 
     Attributes:
         frames: camera frames, or recorded poses.
@@ -55,6 +58,9 @@ class BagFigures:
         live: of the recorded graph.
         silence: time without frames, or poses.
         span: that is evaluated [s].
+        estimate_error: of the estimate, as `error`.
+        compared: errors of `prediction` and `estimate` under the same names; see `compare_errors`.
+        estimation: what else there is of the estimate.
     """
 
     frames: int
@@ -74,6 +80,9 @@ class BagFigures:
     live: LiveFigures = field(default_factory=LiveFigures)
     silence: SensorSilence = field(default_factory=SensorSilence)
     span: float = math.nan
+    estimate_error: Mapping[str, Mapping[str, float] | None] = field(default_factory=dict)
+    compared: Mapping[str, Mapping[str, float | None]] = field(default_factory=lambda: compare_errors(TimeSeries([])))
+    estimation: EstimationFigures = field(default_factory=EstimationFigures)
 
     @property
     def silent_share(self) -> float:
@@ -112,6 +121,9 @@ class BagFigures:
             live=live or LiveFigures(),
             silence=SensorSilence.of(times, begin, end),
             span=end - begin,
+            estimate_error=metrics.errors("estimate_error"),
+            compared=compare_errors(metrics.series),
+            estimation=metrics.estimation,
         )
 
 
@@ -184,7 +196,13 @@ class Headline:
 def headlines(about: BagDetails, figures: BagFigures) -> list[Headline]:
     """Return the figures of the page's head, in their order."""
     return [
-        *(_error(about, figures, target) for target in AGAINST if target in figures.error),
+        *(
+            _error(about, errors, kind, target)
+            for target in AGAINST
+            for kind, errors in (("estimate", figures.estimate_error), ("prediction", figures.error))
+            if target in errors and (kind == "prediction" or figures.estimation.estimated)
+        ),
+        *([_consistency(figures.estimation), _hidden(figures.estimation)] if figures.estimation.estimated else []),
         _frames(figures),
         _margin(about, figures),
         _strain(figures),
@@ -203,9 +221,9 @@ def _grade(value: float, *grades: tuple[float, str, str]) -> tuple[str, str]:
     return next((grade, words) for limit, grade, words in grades if value <= limit)
 
 
-def _error(about: BagDetails, figures: BagFigures, target: str) -> Headline:
-    name = f"error against {AGAINST[target]}"
-    found = figures.error[target]
+def _error(about: BagDetails, errors: Mapping[str, Mapping[str, float] | None], kind: str, target: str) -> Headline:
+    name = f"{kind}, error against {AGAINST[target]}"
+    found = errors[target]
     if found is None:
         missing = "not in this bag" if target == "truth" else "no frame shows half of the thread"
         return Headline(name, "none", missing, NONE, "not scored")
@@ -213,6 +231,27 @@ def _error(about: BagDetails, figures: BagFigures, target: str) -> Headline:
     millimetres = format_number(10.0 * found["mean"] * about.length)
     detail = f"mean over {_frames_of(found['count'])}; {millimetres} mm. Maximum {format_number(found['maximum'])} %"
     return Headline(name, f"{format_number(found['mean'])} %", detail, *_grade(found["mean"], *grades))
+
+
+def _consistency(estimation: EstimationFigures) -> Headline:
+    name, found = "normalised innovation squared", estimation.consistency
+    if found is None:
+        return Headline(name, "none", "no measurement went into the estimate", NONE, "a prediction only")
+    grades = ((-0.9, GOOD, "consistent"), (-0.5, MIDDLING, "often off"), (0.0, BAD, "not consistent"))
+    low, high = found.band
+    windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
+    detail = f"mean; in its 95 % band, {low:.2f} to {high:.2f}, in {found.within} of {windows} of {found.width:.1f} s"
+    return Headline(name, format_number(found.mean), detail, *_grade(-found.share, *grades))
+
+
+def _hidden(estimation: EstimationFigures) -> Headline:
+    name, found = "thread hidden", estimation.hidden
+    assert found is not None
+    grades = ((0.0, GOOD, "never"), (1.0 - 1e-9, NONE, "at times"), (1.0, NONE, "always"))
+    detail = f"of the time, in part or all; {100.0 * found.length:.1f} % of the length in the mean"
+    if found.all_time > 0.0:
+        detail += f"; nothing measured in {100.0 * found.all_time:.1f} % of the time"
+    return Headline(name, f"{100.0 * found.time:.1f} %", detail, *_grade(found.time, *grades))
 
 
 def _frames_of(count: float) -> str:

@@ -37,12 +37,13 @@
     };
   }
 
-  // Where the needle was not found.
+  // Where the needle was not found, and where something acted on the thread that the model does not know.
   function bands() {
-    return data.lost.map(([from, to]) => ({
+    const of = (times, name) => times.map(([from, to]) => ({
       type: "rect", xref: "x", yref: "paper", x0: from, x1: Math.max(to, from + 1e-3), y0: 0, y1: 1,
-      fillcolor: colour("lost"), line: { width: 0 }, layer: "below",
+      fillcolor: colour(name), line: { width: 0 }, layer: "below",
     }));
+    return [...of(data.lost, "lost"), ...of(data.disturbances, "disturbed")];
   }
 
   function line(series) {
@@ -50,6 +51,13 @@
     // A value without neighbours makes no line: it gets a dot.
     const values = series.values;
     const alone = values.map((value, k) => (value !== null && (values[k - 1] ?? null) === null && (values[k + 1] ?? null) === null ? 5 : 0));
+    if (series.band) {
+      return {
+        type: "scatter", name: series.name, x: data.times[series.at], y: values, mode: "lines", line: { width: 0 },
+        fill: series.band === "high" ? "tonexty" : "none", fillcolor: `${own.color}40`, showlegend: series.band === "high",
+        hovertemplate: `%{y:.3g}<extra>${series.band === "high" ? "band, upper end" : "band, lower end"}</extra>`,
+      };
+    }
     const mode = series.dots ? "markers" : alone.some(Boolean) ? "lines+markers" : "lines";
     return {
       type: "scatter", name: series.name, x: data.times[series.at], y: values, connectgaps: false,
@@ -77,6 +85,7 @@
     const y = { title: { text: plot.y } };
     if (plot.log) Object.assign(y, { type: "log", dtick: 1 });
     if (plot.floor === 0) y.rangemode = "tozero";
+    if (plot.top) y.range = [0, plot.top];
     if (plot.zero) y.range = aroundZero(plot.series);
     return [traces, layout(y, { shapes, showlegend: plot.series.length > 0 })];
   }
@@ -91,11 +100,17 @@
     return [low - room, high + room];
   }
 
-  function map() {
+  // Both maps have one scale of colours.
+  const greatest = [data.estimate_map, data.map].filter(Boolean).flatMap((grid) => grid.errors).reduce(
+    (high, row) => row.reduce((a, b) => Math.max(a, b ?? 0), high), 1e-9,
+  );
+
+  function map(grid) {
     const trace = {
-      type: "heatmap", x: data.map.times, y: data.map.lengths, z: data.map.errors, colorscale: "Viridis", hoverongaps: false,
+      type: "heatmap", x: grid.times, y: grid.lengths, z: grid.errors, colorscale: "Viridis", hoverongaps: false,
       colorbar: { title: { text: "% of length", side: "right" }, thickness: 14, outlinewidth: 0, exponentformat: "power", tickcolor: colour("faint") },
       hovertemplate: "%{x:.3f} s, %{y:.3g} mm: %{z:.3g} %<extra></extra>", zmin: 0,
+      zmax: greatest,
     };
     return [[trace], layout({ title: { text: "from the needle [mm]" } }, { hovermode: "closest", shapes: bands() })];
   }
@@ -135,7 +150,8 @@
   async function begin() {
     await loadLibrary();
     for (const plot of data.plots) add(plot.id, () => lines(plot));
-    if (data.map) add("map", map);
+    if (data.estimate_map) add("estimate_map", () => map(data.estimate_map));
+    if (data.map) add("map", () => map(data.map));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
     matchMedia("print").addEventListener("change", redraw);
     for (const button of document.querySelectorAll("button[data-time]")) {

@@ -17,7 +17,8 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
 from plotly.offline import get_plotlyjs
 
-from magnetosuture_thread.evaluation.frames import MARGIN, Array, WorstFrame
+from magnetosuture_thread.evaluation.colours import style_variables
+from magnetosuture_thread.evaluation.frames import MARGIN, Array, ErrorMap, WorstFrame
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report import figures as report
 from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, BagFigures
@@ -33,6 +34,12 @@ MIN_STRAIN = 1e-7  # %, on a scale of powers of ten
 LINE_GAP = 5.0  # times the usual interval; a line is broken where nothing came for longer
 DIGITS = 5  # of a value in the page
 LINE_COLOURS = ("kind0", "kind1", "kind3", "kind4")  # of the page
+
+ERROR_LINES = (
+    ("estimate_", "estimate", "estimated"),
+    ("", "prediction", "predicted"),
+    ("recorded_", "recorded prediction", "kind5"),
+)
 
 Line = tuple[str, str, str, str]  # column, name, colour, dash
 
@@ -62,7 +69,7 @@ def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pict
         times=[("model step", figures.step_time), ("tracker, one frame", figures.processing)],
         stages=STAGES,
         recorded=_date(about.start),
-        style=_source("page.css"),
+        style=style_variables() + _source("page.css"),
         script=script,
         library=packed,
         hashes=" ".join(f"'{_hash(text)}'" for text in (script, library)),
@@ -132,9 +139,9 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
     frame_times, tracked = with_gaps(*thinned(times, tracked, limit))
 
     errors = [
-        (f"{kind}error_{target}", f"{against} {words}", target, dash)
-        for kind, against, dash in (("", "against", ""), ("recorded_", "recorded, against", "dot"))
-        for target, words in AGAINST.items()
+        (f"{kind}error_{target}", f"{name} against {words}", colour, dash)
+        for kind, name, colour in ERROR_LINES
+        for (target, words), dash in zip(AGAINST.items(), ("", "dot"), strict=True)
     ]
     distances = [(f"{MARGIN}{name}", name, colour, "") for name, colour in zip(SOLID, ("good", "kind5"), strict=True)]
     margins = [
@@ -150,27 +157,74 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
             _lines(predicted, errors),
             {"moments": f"error_{metrics.target}", "floor": 0.0},
         ),
+        *_estimation_plots(metrics, predicted),
         ("stretch", "stretch [%]", _lines(predicted, [("strain", "maximum", "ink", "")]), {"log": True}),
         ("obstacle", "distance [mm]", _lines(predicted, distances), {"zero": True}),
         ("lengths", "margin [µm]", _lines(predicted, margins), {"zero": True}),
         ("pace", "time [ms]", durations, {"log": True}),
     ]
-    grid = metrics.error_map.grid() if metrics.error_map is not None else None
+    consistency = metrics.estimation.consistency
+    windows = np.empty(0) if consistency is None else _paired(consistency.begins, consistency.ends)
     return {
-        "times": {"predicted": _values(predicted_times, 8), "frames": _values(frame_times, 8)},
+        "times": {
+            "predicted": _values(predicted_times, 8),
+            "frames": _values(frame_times, 8),
+            "windows": _values(windows, 8),
+        },
         "range": _range(times),
         "lost": [[round(a, 4), round(b, 4)] for a, b in _bands(metrics.lost)],
         "moments": [
             {"number": number, "time": round(each.time, 4), "error": _rounded(each.error)}
             for number, each in enumerate(worst, 1)
         ],
+        "disturbances": [
+            [round(event.begin_s, 4), round(event.end_s, 4)] for event in metrics.disturbances.events[:MAX_BANDS]
+        ],
         "plots": [{"id": name, "y": label, "series": lines, **kind} for name, label, lines, kind in plots if lines],
-        "map": grid
-        and {
-            "times": _values(grid.times, 8),
-            "lengths": _values(1e3 * grid.lengths, 6),
-            "errors": [_values(row, 4) for row in grid.errors],
-        },
+        "map": _map(metrics.error_map),
+        "estimate_map": _map(metrics.estimate_map),
+    }
+
+
+def _estimation_plots(
+    metrics: RunMetrics, columns: Mapping[str, Array]
+) -> list[tuple[str, str, list[dict[str, Any]], dict[str, Any]]]:
+    """Return the plots of the estimate: its consistency, and how much of the thread was hidden."""
+    found = metrics.estimation
+    plots: list[tuple[str, str, list[dict[str, Any]], dict[str, Any]]] = []
+    if (consistency := found.consistency) is not None:
+        low, high, mean = (_paired(each, each) for each in (consistency.low, consistency.high, consistency.means))
+        lines = _lines(columns, [("innovation_squared", "of each frame", "kind5", "")], dots=True)
+        shown = {"low": low, "high": high, "mean": mean}
+        band, mean_name = "95 % band of such a mean", f"mean over {consistency.width:.1f} s"
+        names = [("low", "", "estimated", ""), ("high", band, "estimated", ""), ("mean", mean_name, "ink", "")]
+        lines += _lines(shown, names, at="windows")
+        for line in lines:
+            line["band"] = line["id"] if line["id"] in ("low", "high") else ""
+        top = max(
+            2.5, 1.1 * float(np.nanmax(consistency.means)), float(np.nanpercentile(columns["innovation_squared"], 98))
+        )
+        plots.append(("consistency", "squared innovation", lines, {"top": round(top, 2)}))
+    if found.estimated:
+        hidden = {"hidden": 100.0 * columns["hidden"]}
+        lines = _lines(hidden, [("hidden", "hidden", "kind5", "")])
+        plots.append(("hidden", "hidden [% of length]", lines, {"top": 102.0}))
+    return plots
+
+
+def _paired(first: Array, second: Array) -> Array:
+    """Return two columns as one, in turns."""
+    return np.column_stack([first, second]).ravel()
+
+
+def _map(errors: ErrorMap | None) -> dict[str, Any] | None:
+    grid = errors.grid() if errors is not None else None
+    if grid is None:
+        return None
+    return {
+        "times": _values(grid.times, 8),
+        "lengths": _values(1e3 * grid.lengths, 6),
+        "errors": [_values(row, 4) for row in grid.errors],
     }
 
 

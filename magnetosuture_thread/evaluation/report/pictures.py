@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
-from magnetosuture_thread.evaluation.frames import WorstFrame
+from magnetosuture_thread.evaluation.frames import FrameResult, WorstFrame
 from magnetosuture_thread.evaluation.metrics import node_errors, target_points
-from magnetosuture_thread.evaluation.plots import INK, TRUTH, draw_scale_bar, draw_threads, look_at
+from magnetosuture_thread.evaluation.plots import INK, draw_scale_bar, draw_threads, look_at
 from magnetosuture_thread.evaluation.report.figures import AGAINST, format_number
 from magnetosuture_thread.geometry.camera import DishView
 
@@ -63,7 +63,7 @@ def draw_worst_frame(
     dish_diameter: float,
     simulated: bool = False,
 ) -> ReportPicture:
-    """Draw one of the worst frames: the whole dish, and close by where the prediction is farthest off.
+    """Draw one of the worst frames: the whole dish, and close by where prediction or estimate is farthest off.
 
     Args:
         worst: what to show.
@@ -76,19 +76,17 @@ def draw_worst_frame(
     shown = photo or _plan(dish_diameter)
     frame = worst.frame
     targets = target_points([frame.target_curve(target)], length, len(frame.vertices) - 1)[0][0]
-    errors = node_errors(frame.vertices, targets, length)
+    vertices = frame.vertices if worst.of == "prediction" or frame.estimate is None else frame.estimate.vertices
+    errors = node_errors(vertices, targets, length)
     node = int(np.nanargmax(errors)) + 1
     figure = Figure(figsize=(12.0, 5.95), dpi=100, facecolor="#888e94")
     scene, close = (figure.add_axes((left, 0.0, 0.4985, 1.0)) for left in (0.0, 0.5015))
-    ends = np.vstack([frame.vertices[node], targets[node - 1]])
+    ends = np.vstack([vertices[node], targets[node - 1]])
     half = max(CLOSE_UP * length, 0.0075 * length * float(np.nanmax(errors)))
     middle = shown.view.to_pixels(np.zeros(2))
     for axes, magnified in ((scene, 1.0), (close, 1.8)):
         axes.set_facecolor(OUTSIDE)
         draw_threads(axes, shown.image, shown.view, frame, frame.obstacles, magnified)
-        if len(frame.ground_truth) > 1:
-            points = shown.view.to_pixels(frame.ground_truth).T
-            axes.plot(*points, color=TRUTH, linewidth=1.3 * magnified, linestyle=(0, (4, 2.5)))
         if photo is None:
             radius = 0.5 * dish_diameter / shown.view.metres_per_pixel
             axes.add_patch(Circle(tuple(middle), radius, fill=False, color=INK, linewidth=1.6))
@@ -109,11 +107,19 @@ def draw_worst_frame(
         box = {"facecolor": "#fff3d6", "alpha": 0.85, "edgecolor": "none", "pad": 2.5}
         scene.text(0.02, 0.98, "simulated", transform=scene.transAxes, color="#5c4300", fontsize=11, va="top", bbox=box)
     words = (
-        f"{kind} at {worst.time:.2f} s with predicted, seen and true thread, and a close-up of node {node}, which is "
-        f"{format_number(0.01 * float(np.nanmax(errors)) * length * 1e3)} mm from {AGAINST[target]}; "
-        f"prediction error {format_number(worst.error)} % of the length."
+        f"{kind} at {worst.time:.2f} s with {_threads_of(frame)}, and a close-up of node {node} of the {worst.of}, "
+        f"which is {format_number(0.01 * float(np.nanmax(errors)) * length * 1e3)} mm from {AGAINST[target]}; "
+        f"error of the {worst.of} {format_number(worst.error)} % of the length."
     )
     return ReportPicture(worst, _as_uri(figure), words, photo is None)
+
+
+def _threads_of(frame: FrameResult) -> str:
+    names = ["predicted"]
+    names += ["estimated"] if frame.estimate is not None else []
+    names += ["measured"] if len(frame.measured) > 1 else []
+    names += ["true"] if len(frame.ground_truth) > 1 else []
+    return f"{', '.join(names[:-1])} and {names[-1]} thread" if len(names) > 1 else "predicted thread"
 
 
 def _plan(dish_diameter: float) -> Photo:

@@ -7,5 +7,6 @@ from magnetosuture_thread.model.estimator.estimate import ThreadEstimate
 from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.session import EstimatorSession
+from magnetosuture_thread.model.estimator.slow_parameters import SlowParameter
 
-__all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"]
+__all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "SlowParameter", "ThreadEstimate", "ThreadEstimator"]

@@ -15,6 +15,7 @@ from magnetosuture_thread.model.estimator.disturbance import Disturbance, Distur
 from magnetosuture_thread.model.estimator.innovations import Innovations
 from magnetosuture_thread.model.estimator.noise import NoiseModel
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
+from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameter
 from magnetosuture_thread.model.formulations import ThreadState
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction
@@ -45,6 +46,7 @@ class ThreadEstimate:
         noise: intensity of the process noise in each window, shape (w,) [m^2/s].
         disturbances: what the model does not know.
         problems: why pieces or the whole observation were refused.
+        slow_parameters: what is learned of thread and liquid; empty if nothing is asked for.
         compute_rows: of the barriers, at its positions.
         contact_tolerance: a node this close to a shape or the wall touches it [m].
     """
@@ -64,6 +66,7 @@ class ThreadEstimate:
     noise: Vector
     disturbances: tuple[Disturbance, ...]
     problems: tuple[str, ...]
+    slow_parameters: tuple[SlowParameter, ...]
     compute_rows: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
     contact_tolerance: float = field(repr=False)
 
@@ -125,6 +128,7 @@ class FilterState:
     measured_at: float
     gross: int
     unknown: bool
+    slow: LearnedState
 
     def resampled(self, before: Thread, thread: Thread, options: EstimatorOptions) -> FilterState:
         """Return the state of the filter of another thread that takes this one's place.

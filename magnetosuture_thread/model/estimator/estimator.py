@@ -11,13 +11,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.estimator.correction import (
-    CORRECTED,
-    NO_ROOM,
-    CorrectionBuffers,
-    MeasuredPoints,
-    correct,
-)
+from magnetosuture_thread.model.estimator.correction import MeasuredPoints
+from magnetosuture_thread.model.estimator.corrector import Corrector
 from magnetosuture_thread.model.estimator.covariance import propagate
 from magnetosuture_thread.model.estimator.disturbance import DisturbanceTest
 from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
@@ -38,15 +33,13 @@ from magnetosuture_thread.model.estimator.pieces import (
     place_pieces,
     smoothed_line,
 )
+from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameters
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
-from magnetosuture_thread.model.formulations.step import StepBuffers
 from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
-from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
 
-RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselves are checked at its end point
 LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
@@ -82,21 +75,13 @@ class ThreadEstimator:
         nodes = self.thread.segments + 1
         self._unit = self.thread.segment_length
         self._length = max(self.options.error_correlation * self.thread.segments, 0.5)
-        self._stiffness = self.thread.bending_stiffness / (self.thread.medium.drag_across * self._unit**4)
-        self._solver = BandedSolver()
-        self._corrector = CorrectionBuffers.of(nodes)
-        self._use(StepBuffers.of(nodes, 2, 3 * self.thread.segments + 1, 2 * nodes))
-        self._known = np.zeros(nodes, dtype=np.bool_)
-        self._known[[0, *predictor.fixed_nodes]] = True
+        self._corrector = Corrector(predictor, formulation, self._length)
+        self._slow = SlowParameters(predictor, self.options)
         self._work, self._added = np.empty(nodes), np.empty(nodes)
         self._prediction: Prediction | None = None
         self._converged = False
         self._sums, self._applied = WindowSums.of(WINDOWS), np.zeros(WINDOWS)
         self._forget()
-
-    def _use(self, buffers: StepBuffers) -> None:
-        self._buffers = buffers
-        self._solver_buffers = self._solver.buffers(self.thread.segments + 1, 2, len(buffers.first))
 
     def _forget(self) -> None:
         nodes = self.thread.segments + 1
@@ -105,6 +90,12 @@ class ThreadEstimator:
         self._test = DisturbanceTest(self.thread, self.options.disturbance_time)
         self._measured_at = -math.inf
         self._gross, self._unknown = 0, True
+        self._slow.reset()
+
+    @property
+    def learned(self) -> LearnedState:
+        """What is known of the slow parameters."""
+        return self._slow.state
 
     @property
     def started(self) -> bool:
@@ -172,7 +163,7 @@ class ThreadEstimator:
             SolverError: see `ThreadPredictor.step`.
         """
         before = self.predictor.state
-        self._prediction = self.predictor.step(pose)
+        self._prediction = self._slow.step(pose)
         self._converged = self._prediction.converged
         state = self.predictor.state
         assert before is not None
@@ -203,7 +194,28 @@ class ThreadEstimator:
         points = measured_points(placed, nodes, unit, workspace, 0.5 * self.thread.diameter, scale, problems)
         if points is None:
             return self._estimate(tuple(problems))
-        return self._corrected(points, free_end(placed, nodes, float(self._variance[-1])), pose, state, problems)
+        end = free_end(placed, nodes, float(self._variance[-1]))
+        if (moved := self._learn_parameters(points, end, pose, state)) is not state:
+            state, nodes = moved, moved.positions / unit
+            end = free_end(placed, nodes, float(self._variance[-1]))
+            again = measured_points(placed, nodes, unit, workspace, 0.5 * self.thread.diameter, scale, problems := [])
+            points = again if again is not None else points
+        return self._corrected(points, end, pose, state, problems)
+
+    def _learn_parameters(
+        self, points: MeasuredPoints, end: tuple[float, float], pose: NeedlePose, state: ThreadState
+    ) -> ThreadState:
+        """Learn the slow parameters; return where the thread is predicted with them."""
+        if not self._slow.kinds:
+            return state
+        weights, noise = np.ones(len(points.place)), np.empty(self.thread.segments + 1)
+        interpolate_to_nodes(self._noise.intensity, len(noise), noise)
+        weigh(points, self._variance, weights, self._sums)
+        density, start = np.maximum(self._density, MIN_VARIANCE), np.ascontiguousarray(state.positions / self._unit)
+        done = self._corrector.solve(start, pose.heading, density, noise / self._unit**2, points, weights, end)
+        if not done.solved:
+            return state
+        return self._slow.learn(self._corrector, state, pose.stamp)
 
     def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
@@ -235,6 +247,7 @@ class ThreadEstimator:
         self._set_variance(known + (self.options.initial_error * np.maximum(arcs - end, 0.0)) ** 2)
         self._noise = NoiseModel(self.options.noise_time)
         self._test = DisturbanceTest(self.thread, self.options.disturbance_time)
+        self._slow.restart()
         return laid
 
     def _corrected(
@@ -253,41 +266,21 @@ class ThreadEstimator:
         interpolate_to_nodes(self._noise.intensity, segments + 1, noise)
         noise /= unit**2
         weigh(points, self._variance, weights, self._sums)
-        self._corrector.known[:] = self._known
         density = np.maximum(self._density, MIN_VARIANCE)
         start = np.ascontiguousarray(state.positions / unit)
-        while True:
-            code, solves, off, residuals = correct(
-                (0, 1),
-                self._formulation.rod,
-                self._buffers,
-                self._formulation.workspace.data,
-                self._solver_buffers,
-                self._corrector,
-                start,
-                np.ascontiguousarray(pose.heading, dtype=np.float64),
-                density,
-                noise,
-                self._length,
-                self._stiffness,
-                points,
-                weights,
-                end,
-                RESIDUAL_TOLERANCE,
-            )
-            if code != NO_ROOM:
-                break
-            self._use(self._buffers.enlarged())
-        if code != CORRECTED or off > 1.0:
-            problems.append(f"the correction was not solved: residual {max(residuals):.1e}, off by {off:.1g}")
+        done = self._corrector.solve(start, pose.heading, density, noise, points, weights, end)
+        if not done.solved:
+            problems.append(f"the correction was not solved: residual {done.residual:.1e}, off by {done.off:.1g}")
             return self._estimate(tuple(problems), innovations=innovations, points=len(weights))
         self._density, self._variance = density, np.empty(segments + 1)
-        hidden = take_over(points, weights, self._corrector, density, self._variance, self._applied)
+        work = self._corrector.work
+        hidden = take_over(points, weights, work, density, self._variance, self._applied)
+        self._slow.correct(self._corrector, self._variance)
         shift_errors(self._noise.bank, self._applied * unit)
         elapsed = elapsed if math.isfinite(elapsed) else 0.0
         own = self._sums.own * unit**2
-        self._test.add(self._corrector.moved * unit, self._corrector.normals, own, pose.stamp, elapsed)
-        corrected = ThreadState(self._corrector.about * unit, state.velocities, state.interval)
+        self._test.add(work.moved * unit, work.normals, own, pose.stamp, elapsed)
+        corrected = ThreadState(work.about * unit, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True
         self._unknown = False
@@ -296,8 +289,8 @@ class ThreadEstimator:
             tuple(problems),
             corrected=True,
             innovations=innovations,
-            residual=max(residuals),
-            solves=solves,
+            residual=done.residual,
+            solves=done.solves,
             points=len(weights),
             hidden=hidden,
         )
@@ -340,7 +333,7 @@ class ThreadEstimator:
         # Where innovations are larger than expected, so are the errors that are left.
         scale = self._unit**2 * max(self._noise.ratio, 1.0)
         if corrected:
-            covariance = scale * self._corrector.covariance
+            covariance = scale * self._corrector.work.covariance
         else:
             along = np.gradient(positions, axis=0)
             normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
@@ -366,6 +359,7 @@ class ThreadEstimator:
             noise=self._noise.bank.intensity.copy(),
             disturbances=self._test.found(pose.stamp, positions),
             problems=problems,
+            slow_parameters=self._slow.report(),
             compute_rows=compute_rows,
             contact_tolerance=self.predictor.contact_tolerance,
         )
@@ -388,6 +382,7 @@ class ThreadEstimator:
             self._measured_at,
             self._gross,
             self._unknown,
+            self._slow.state,
         )
 
     def restore(self, kept: FilterState) -> None:
@@ -398,3 +393,4 @@ class ThreadEstimator:
         self._density, self._variance = kept.density.copy(), kept.variance.copy()
         self._noise, self._test = kept.noise.copied(), kept.test.copied()
         self._measured_at, self._gross, self._unknown = kept.measured_at, kept.gross, kept.unknown
+        self._slow.restore(kept.slow)

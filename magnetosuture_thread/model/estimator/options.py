@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 
 from magnetosuture_thread.errors import ConfigurationError
 
+SLOW_PARAMETERS = ("stiffness_over_drag", "drag_anisotropy", "rest_curvature", "flow")
+
 
 @dataclass(frozen=True)
 class EstimatorOptions:
@@ -22,9 +24,11 @@ class EstimatorOptions:
             length.
         disturbance_time: averaging time of the test for what the model does not know [s].
         history: how late an observation may come [s].
+        slow_parameters: what is learned on line, some of `SLOW_PARAMETERS`; nothing by default.
+        slow_time: time over which those may change [s].
 
     Raises:
-        ConfigurationError: a value is not a positive number.
+        ConfigurationError: a value is not a positive number, or a parameter is unknown.
     """
 
     error_correlation: float = 0.1
@@ -34,10 +38,17 @@ class EstimatorOptions:
     initial_error: float = 0.2
     disturbance_time: float = 0.4
     history: float = 1.0
+    slow_parameters: tuple[str, ...] = ()
+    slow_time: float = 10.0
 
     def __post_init__(self) -> None:
         """Check the values."""
+        for name in self.slow_parameters:
+            if name not in SLOW_PARAMETERS:
+                raise ConfigurationError("estimator.slow_parameters", name, f"some of {', '.join(SLOW_PARAMETERS)}")
         for each in fields(self):
+            if each.name == "slow_parameters":
+                continue
             value = getattr(self, each.name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ConfigurationError(f"estimator.{each.name}", value, "a positive number")

@@ -11,6 +11,7 @@ from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
 from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
+from magnetosuture_thread.model.estimator.pieces import LENGTH_ERROR
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction, ThreadPredictor
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -81,8 +82,11 @@ class EstimatorSession:
         moment = other._moments[-1]
         state = kept.resampled(before.thread, now.thread, now.options)
         prediction = _carried_over(state, now.predictor)
-        # The multipliers of other rows are no warm start.
-        now.restore(replace(state, prediction=prediction, warm_start=now.predictor.formulation.warm_start()))
+        # What was learned of another thread, or of other parameters, says nothing of this one; and the multipliers of
+        # other rows are no warm start.
+        same = now.thread == before.thread and now.options.slow_parameters == before.options.slow_parameters
+        slow, warm_start = kept.slow if same else now.learned, now.predictor.formulation.warm_start()
+        now.restore(replace(state, prediction=prediction, warm_start=warm_start, slow=slow))
         self._moments.append(_Moment(moment.pose, moment.observation, now.snapshot()))
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
@@ -200,15 +204,19 @@ def _carried_over(state: FilterState, predictor: ThreadPredictor) -> Prediction:
 def observation_of(centreline: Points, length: float, deviation: float) -> ThreadObservation:
     """Return an observation of a measured centreline, from the needle's tail on, which may end early.
 
+    A centreline alone does not say whether it is all of the thread. It is taken for a part unless it is as long as the
+    thread, within twice the error to which the length is known: a part that is taken for all would pull the free end to
+    where the measurement ends.
+
     Args:
-        centreline: shape (m, 2) [m].
+        centreline: shape (m, 2) [m]; points that are not finite are left out.
         length: of the thread [m].
         deviation: of each point across it [m].
     """
     points = np.asarray(centreline, dtype=np.float64).reshape(-1, 2)
     fit = len(points) > 1 and bool(np.all(np.abs(points) <= MAX_COORDINATE))  # another is refused by the estimator
     along = float(arc_lengths(points)[-1]) if fit else 0.0
-    complete = along > 0.97 * length
+    complete = along > (1.0 - 2.0 * LENGTH_ERROR) * length
     last = PieceEnd.FREE if complete else PieceEnd.UNKNOWN
     piece = ThreadPiece(points, np.full(len(points), deviation), PieceEnd.TAIL, last, (0.0, 0.0))
     return ThreadObservation((piece,), complete)

@@ -14,6 +14,8 @@ the last, has a = 1, v = 0. In air there is besides the drag, with a = 1 and v =
 
     1/2 sum_i (m_i / dt) |u_i - (velocity_i + dt g)|^2
 
+A uniform flow w of the medium adds Z_i w to the drag's part of Z_i v: drag is on the velocity against the medium.
+
 The barriers are linearised about the end point that the last velocities predict, and again at the one
 that each solve predicts, as the discrete-time condition h(x + dt u) >= (1 - alpha dt) h(x) with
 alpha = 1 / dt, until segments are right to a thousandth and nodes to 1e-7 m, or for `MAX_SOLVES` times.
@@ -55,7 +57,7 @@ from magnetosuture_thread.model.formulations.step import (
 )
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, banded
-from magnetosuture_thread.model.thread import Attachment, Thread
+from magnetosuture_thread.model.thread import Attachment, Medium, Thread
 
 MAX_SOLVES = 8  # in a step
 
@@ -64,7 +66,7 @@ class RodFormulation(Formulation):
     """Steps a thread by the program above; see `Formulation` for the arguments.
 
     Raises:
-        ConfigurationError: gravity has not one value for each dimension.
+        ConfigurationError: gravity or flow has not one value for each dimension.
     """
 
     name = "rod"
@@ -97,6 +99,7 @@ class RodFormulation(Formulation):
             np.ascontiguousarray(thread.rest_angles),
             mechanics.end_corrected_weights(thread.segments),
             mechanics.bending_bands(thread.segments, clamped),
+            self._flow(medium),
         )
         self._axes, (self._banded, self._accepted) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
         if self.added:  # compiled code knows nothing of their rows, and leaves every solve to `step`
@@ -108,6 +111,28 @@ class RodFormulation(Formulation):
     def rod(self) -> RodProperties:
         """The thread, for compiled code."""
         return self._rod
+
+    def set_thread(self, thread: Thread) -> None:
+        """Change stiffness, rest curvature and medium from the next step on; the chain itself stays as it is.
+
+        Args:
+            thread: of the same length, segments, diameter and attachment.
+        """
+        medium, self._thread = thread.medium, thread
+        self._rod = self._rod._replace(
+            bending_stiffness=thread.bending_stiffness,
+            drag_across=medium.drag_across,
+            drag_along=medium.drag_along,
+            rest_angles=np.ascontiguousarray(thread.rest_angles),
+            flow=self._flow(medium),
+        )
+
+    def _flow(self, medium: Medium) -> Vector:
+        if len(medium.flow) not in (0, self.dimension):
+            raise ConfigurationError("medium.flow", medium.flow, f"{self.dimension} values, or none")
+        flow = np.zeros(self.dimension)
+        flow[: len(medium.flow)] = medium.flow
+        return flow
 
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""

@@ -43,6 +43,7 @@ class RodProperties(NamedTuple):
     rest_angles: Vector
     weights: Vector
     bands: NDArray[np.float64]
+    flow: Vector
 
 
 class StepInput(NamedTuple):
@@ -123,10 +124,10 @@ def assemble_step(
 def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, given: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
-        P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z v
+        P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z (v + flow)
 
     and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the prescribed nodes, which have
-    moved already. In air a = 1, and of Z v only the inertia's part is left.
+    moved already. In air a = 1, and of Z v only the inertia's part is left; the flow acts on the drag's part alone.
     """
     about, start, last, heading, interval = motion.about, motion.start, motion.last, given.heading, given.interval
     nodes, dimension = start.shape
@@ -148,7 +149,9 @@ def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, 
             for b in range(dimension):
                 value -= trailing * blocks[i, a, b] * last[i, b]
             value -= inertia * rod.weights[i] * (last[i, a] + interval / rod.unit * rod.gravity[a])
-            linear[i, a] = value
+            for b in range(dimension):
+                value -= blocks[i, a, b] * rod.flow[b] / rod.unit
+            linear[i, a] = value + inertia * rod.weights[i] * rod.flow[a] / rod.unit
         for a in range(dimension):
             for b in range(dimension):
                 blocks[i, a, b] *= leading

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.vision.dish.robust_fits import fit_circle
 from magnetosuture_thread.vision.sampling import rim_along_rays
 
 RAYS = 180
@@ -25,7 +26,10 @@ STILL_PX = 1.0  # a rim seen this near to where it was stands still
 RIM_SHARE = 0.4  # of the quick check's rays must see the rim
 
 
-def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
+Guess = tuple[float, float, float]  # u, v and radius of a circle [px]
+
+
+def find_dish(gray: np.ndarray, diameter: float, guesses: dict[int, Guess | None] | None = None) -> DishView | None:
     """Find the dish by the inner edge of its rim.
 
     A circle transform of a small image gives the first guess; then rays from its centre meet the edge
@@ -36,12 +40,16 @@ def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
     Args:
         gray: image, shape (rows, columns), uint8.
         diameter: the dish's inner diameter [m], which gives the scale.
+        guesses: first guesses by the rows of the small image; filled. Those of the negative are the same.
 
     Returns:
         The view, or None if no dish is seen: too few rays agree on a circle.
     """
+    guesses = {} if guesses is None else guesses
     for side in GUESS_SIDES:
-        guess = _first_guess(gray, side)
+        if side not in guesses:
+            guesses[side] = _first_guess(gray, side)
+        guess = guesses[side]
         if guess is None:
             continue
         u, v, radius = guess
@@ -92,7 +100,7 @@ def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> t
     return float(np.hypot(shift[0], shift[1])), int(kept.sum())
 
 
-def _first_guess(gray: np.ndarray, rows: int) -> tuple[float, float, float] | None:
+def _first_guess(gray: np.ndarray, rows: int) -> Guess | None:
     """Return centre and radius of the strongest large circle, found in a small image of about so many rows."""
     factor = max(1, round(min(gray.shape) / rows))
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if factor > 1 else gray
@@ -149,18 +157,7 @@ def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:
 
 
 def _fit_circle(points: np.ndarray, agreement: float) -> tuple[float, float, float, int] | None:
-    """Fit a circle by least squares, leaving out what is far from it; None with too few points."""
-    kept = points
-    for tolerance in (8.0 * agreement, 3.0 * agreement, agreement):
-        if len(kept) < 20:
-            return None
-        # Around the mean, where the normal equations are well conditioned.
-        mean = kept.mean(axis=0)
-        offset = kept - mean
-        system = np.column_stack([2.0 * offset, np.ones(len(kept))])
-        u, v, rest = np.linalg.solve(system.T @ system, system.T @ (offset**2).sum(axis=1))
-        radius = float(np.sqrt(max(rest + u * u + v * v, 0.0)))
-        u, v = mean + np.array([u, v])
-        distance = np.abs(np.hypot(points[:, 0] - u, points[:, 1] - v) - radius)
-        kept = points[distance < tolerance]
-    return float(u), float(v), radius, len(kept)
+    """Return centre and radius of a circle, and how many points agree on it; None if too few do. See `fit_circle`."""
+    circle = np.empty(3)
+    agreeing = fit_circle(points, agreement, circle)
+    return (float(circle[0]), float(circle[1]), float(circle[2]), agreeing) if agreeing else None

@@ -11,6 +11,7 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.ellipse import Ellipse
 from magnetosuture_thread.vision.dish.find import RAYS, rim_points
+from magnetosuture_thread.vision.dish.robust_fits import fit_rim
 
 MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
 ANGLE_ERROR = math.radians(2.0)  # by which light and noise change a tilt that is told
@@ -121,24 +122,13 @@ def find_tilt(gray: np.ndarray, view: DishView, diameter: float) -> tuple[Tilt |
     """
     radius = 0.5 * diameter / view.metres_per_pixel
     points = rim_points(gray, view.centre_px, radius)
-    if len(points) < RAYS // 2:
+    fitted = np.empty(5)
+    count, spread = fit_rim(points, view.centre_px, RAYS // 2, fitted)
+    if not count:
         return None, view
-    u, v = (points - view.centre_px).T
-    around, away = np.arctan2(v, u), np.hypot(u, v)
-    system = np.column_stack(
-        [np.ones(len(u)), np.cos(around), np.sin(around), np.cos(2.0 * around), np.sin(2.0 * around)]
-    )
-    kept = np.ones(len(u), bool)
-    for _ in range(4):
-        if kept.sum() < RAYS // 2:
-            return None, view
-        fitted, *_ = np.linalg.lstsq(system[kept], away[kept], rcond=None)
-        residual = np.abs(away - system @ fitted)
-        spread = 1.4826 * float(np.median(residual))
-        kept = residual < max(0.3, 3.0 * spread)
     shape = fitted[3:]
     half = float(np.hypot(*shape))
-    deviation = math.sqrt(float((residual[kept] ** 2).mean()) * 2.0 / float(kept.sum()))
+    deviation = spread * math.sqrt(2.0 / count)
     angle = math.acos(min(1.0, (fitted[0] - half) / (fitted[0] + half)))
     if angle < MIN_ANGLE or half < SURE * deviation:
         return None, view

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magnetosuture_thread.compiled import compiled
+
 
 @dataclass(frozen=True)
 class Arc:
@@ -32,15 +34,10 @@ class Arc:
         p = start + s sinc(k s / 2) (cos b, sin b) + d (-sin c, cos c),  b = angle + k s / 2,  c = angle + k s
         """
         s = np.asarray(along, dtype=float)
-        chord = s * np.sinc(self.curvature * s / (2.0 * math.pi))
-        middle, turned = self.angle + 0.5 * self.curvature * s, self.angle + self.curvature * s
-        return np.stack(
-            [
-                self.start[0] + chord * np.cos(middle) - aside * np.sin(turned),
-                self.start[1] + chord * np.sin(middle) + aside * np.cos(turned),
-            ],
-            axis=-1,
-        )
+        result = np.empty((s.size, 2))
+        apart = np.full(s.size, aside) if np.ndim(aside) == 0 else np.broadcast_to(aside, s.shape).ravel()
+        _points(self.start[0], self.start[1], self.angle, self.curvature, s.ravel(), apart, result)
+        return result.reshape(*s.shape, 2)
 
     def direction(self, along: float = 0.0) -> np.ndarray:
         """Return the unit tangent after a length, shape (2,)."""
@@ -81,23 +78,46 @@ def fit_arc(points: np.ndarray) -> Arc:
     Source: [Taubin1991] G. Taubin, "Estimation of planar curves, surfaces, and nonplanar space curves defined by
     implicit equations", IEEE T-PAMI 13(11). Deviation: none.
     """
-    mean = points.mean(axis=0)
-    x, y = (points - mean).T
+    u, v, angle, curvature = _fit_arc(np.ascontiguousarray(points, dtype=float))
+    return Arc(np.array([u, v]), angle, curvature)
+
+
+@compiled
+def _fit_arc(points):
+    """Return the arc of `fit_arc`: its first point, its direction there and its curvature."""
+    count = len(points)
+    mean_u, mean_v = points[:, 0].sum() / count, points[:, 1].sum() / count
+    x, y = points[:, 0] - mean_u, points[:, 1] - mean_v
     z = x * x + y * y
-    spread = max(float(z.mean()), 1e-12)
-    system = np.column_stack([(z - spread) / (2.0 * math.sqrt(spread)), x, y])
-    _, axes = np.linalg.eigh(system.T @ system)
-    a, b, c = axes[:, 0]
-    a /= 2.0 * math.sqrt(spread)
+    spread = max(z.sum() / count, 1e-12)
+    scaled = (z - spread) / (2.0 * math.sqrt(spread))
+    moments = np.empty((3, 3))
+    moments[0, 0], moments[1, 1], moments[2, 2] = (scaled * scaled).sum(), (x * x).sum(), (y * y).sum()
+    moments[0, 1] = moments[1, 0] = (scaled * x).sum()
+    moments[0, 2] = moments[2, 0] = (scaled * y).sum()
+    moments[1, 2] = moments[2, 1] = (x * y).sum()
+    _, axes = np.linalg.eigh(moments)
+    a, b, c = axes[0, 0] / (2.0 * math.sqrt(spread)), axes[1, 0], axes[2, 0]
     d = -spread * a
     size = math.sqrt(max(b * b + c * c - 4.0 * a * d, 1e-24))
-    a, b, c, d = (float(value) / size for value in (a, b, c, d))
+    a, b, c, d = a / size, b / size, c / size, d / size
     gradient = math.hypot(b, c)
     if gradient < 1e-9:  # The mean is the centre: any point is as near as another.
         b, c, gradient = 1.0, 0.0, 1.0
-    normal = np.array([b, c]) / gradient
+    normal_u, normal_v = b / gradient, c / gradient
     # Along the normal through the mean: a t^2 + gradient t + d = 0, the root of smaller size.
     root = math.sqrt(max(gradient * gradient - 4.0 * a * d, 0.0))
-    foot = mean + normal * (-2.0 * d / (gradient + root))
+    foot = -2.0 * d / (gradient + root)
     # Across the tangent (n_v, -n_u) lies the normal itself, and the circle's centre lies against it where a > 0.
-    return Arc(foot, math.atan2(-normal[0], normal[1]), -2.0 * a)
+    return mean_u + foot * normal_u, mean_v + foot * normal_v, math.atan2(-normal_u, normal_v), -2.0 * a
+
+
+@compiled
+def _points(u, v, angle, curvature, along, aside, points):
+    """Fill in the points of an arc; see `Arc.at`."""
+    for index in range(len(along)):
+        half = 0.5 * curvature * along[index]
+        chord = along[index] if abs(half) < 1e-9 else along[index] * math.sin(half) / half
+        middle, turned = angle + half, angle + 2.0 * half
+        points[index, 0] = u + chord * math.cos(middle) - aside[index] * math.sin(turned)
+        points[index, 1] = v + chord * math.sin(middle) + aside[index] * math.cos(turned)

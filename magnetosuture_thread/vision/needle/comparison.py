@@ -122,3 +122,45 @@ def bluntness(surely, start, length, half, result):
             more[end, side] += weight * (seen[row, column] - tapered)
             total[end, side] += weight * weight
     result[:] = more / np.maximum(total, 1e-9)
+
+
+@compiled
+def fading(surely, start, length, width):
+    """Return over how much more length the steel fades at a tail than at the body's sides [px].
+
+    Glare over a tail ends it less sharply than lens and sensor do.
+
+    Args:
+        surely: see `SteelMap`.
+        start: u, v, angle and curvature of the axis.
+        length: of the needle [px].
+        width: of its body [px].
+    """
+    beyond, share = np.arange(-4.0, 4.1, 0.25), np.empty((33, 5))
+    sample_along(surely, start, beyond, np.linspace(-0.3, 0.3, 5) * width, share)
+    least = np.empty(len(beyond))
+    for row in range(len(beyond)):
+        # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
+        least[row] = share[row].min()
+    tail = _fade(beyond, least)
+    body, outside = np.linspace(0.3, 0.6, 12) * length, np.arange(0.5 * width + 4.0, 0.0, -0.25)
+    across, usual, sides = np.empty((len(body), len(outside))), np.empty(len(outside)), np.inf
+    for side in (-1.0, 1.0):
+        sample_along(surely, start, body, side * outside, across)
+        for place in range(len(outside)):
+            usual[place] = np.median(across[:, place])
+        sides = min(sides, _fade(-outside, usual))
+    return tail - sides
+
+
+@compiled
+def _fade(along, share):
+    """Return the length over which a share rises from 0.2 to 0.8."""
+    low, high, last = -1, -1, len(along) - 1
+    for index in range(len(along)):
+        if low < 0 and share[index] >= 0.2:
+            low = index
+        if share[index] >= 0.8:
+            high = index
+            break
+    return along[last if high < 0 else high] - along[last if low < 0 else low]

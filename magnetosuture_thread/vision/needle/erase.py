@@ -19,13 +19,16 @@ def without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> np.nd
 
         I' = min(I + F c share, F)
 
-    with the floor F, the needle's contrast c, and the share of each pixel that a drawn needle covers.
+    with the floor F, the needle's contrast c, and the share of each pixel that a drawn needle covers. It is kept with
+    the channel, as the walk and the pieces need the same: it must not be changed.
 
     Args:
         channel: of the picture.
         factor: how much smaller its floor is.
         needle: in the picture's pixels.
     """
+    if channel.cleared.get("needle") is needle:
+        return np.asarray(channel.cleared["pixels"])
     half = 0.5 * needle.width_px + BLOOM_PX
     outline = needle.arc.at(np.linspace(0.0, needle.length_px, 24))
     rows, columns = channel.pixels.shape
@@ -36,6 +39,7 @@ def without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> np.nd
     start = np.array([arc.start[0], arc.start[1], arc.angle, arc.curvature])
     shape = np.array([needle.length_px, half, needle.contrast])
     _erase(result, np.ascontiguousarray(channel.floor), factor, start, shape, (left, top, right, bottom))
+    channel.cleared.update(needle=needle, pixels=result)
     return result
 
 
@@ -44,10 +48,14 @@ def _erase(pixels, floor, factor, start, shape, box):
     """Brighten the pixels of a box by what a drawn needle takes of the floor's light."""
     length, half, contrast = shape[0], shape[1], shape[2]
     cosine, sine, curvature = math.cos(start[2]), math.sin(start[2]), start[3]
+    # Off the tangent by more than the arc itself is, nothing is near the needle.
+    farthest = half + BESIDE_PX + 0.5 * abs(curvature) * (length + BESIDE_PX + half) ** 2
     for row in range(box[1], box[3] + 1):
         for column in range(box[0], box[2] + 1):
             u, v = column - start[0], row - start[1]
             s, d = u * cosine + v * sine, v * cosine - u * sine
+            if abs(d) > farthest:
+                continue
             if abs(curvature) > 1e-6:
                 turned = math.atan2(curvature * s, 1.0 - curvature * d)
                 d = (1.0 - math.hypot(curvature * s, 1.0 - curvature * d)) / curvature

@@ -9,7 +9,7 @@ import numpy as np
 
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.axis_guesses import axis_guesses
-from magnetosuture_thread.vision.needle.comparison import bluntness, excess, steel_rows
+from magnetosuture_thread.vision.needle.comparison import bluntness, excess, fading, steel_rows
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
@@ -49,7 +49,7 @@ FADES_PX = 0.7  # over which a tail may fade more than the sides do
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = 0.3, 0.3  # of the width, and more, off an end's middle: a thread passes, and does not leave
 VISIBLE_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
-ALIKE = "ends that look alike"
+ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
 TOWARD = 0.8  # cosine between a needle and where it must point
 
 
@@ -70,18 +70,22 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
     if steel.depth < FAINTEST:
         return "too faint"
     length, width = size.length_px, size.width_px
-    guesses: list[Arc] = []
+    ends = np.array([0.0, length])
+    guesses: list[np.ndarray] = []  # both ends of each
     fits: list[TemplateFit] = []
     for level in LEVELS:
         for guess in axis_guesses(steel.surely > level, length, width):
-            if not any(_is_same(guess, other, length) for other in guesses):
-                guesses.append(guess)
+            at = guess.at(ends)
+            if not any(np.abs(at - other).max() < SAME_PX for other in guesses):
+                guesses.append(at)
                 fits.append(fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS))
         fits.sort(key=lambda fit: fit.cost)
         if fits and fits[0].cost < CLEAR_COST * length:
             break
-    found: MeasuredNeedle | str = "no arc"
+    found: MeasuredNeedle | str = NO_SHAPE if fits else "no arc"
     for rough in fits[:MAX_FITS]:
+        if rough.cost > HOPELESS * MAX_COST * length:
+            break
         found = _checked(steel, rough, size, toward)
         if isinstance(found, MeasuredNeedle):
             found = found.shifted(steel.origin)
@@ -94,12 +98,6 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
     return found
 
 
-def _is_same(one: Arc, other: Arc, length: float) -> bool:
-    """Say whether two axes of a length have their ends at the same places [px]."""
-    ends = np.array([0.0, length])
-    return bool(np.abs(one.at(ends) - other.at(ends)).max() < SAME_PX)
-
-
 def _checked(
     steel: SteelMap,
     rough: TemplateFit,
@@ -110,6 +108,8 @@ def _checked(
     width = size.width_px
     one, other, rod = _fits(steel, rough, size, size.tolerance)
     best = min((one, other, rod), key=lambda each: each.cost)
+    if best.cost > CLEARLY * MAX_COST * best.length:  # Of the length as it is set it would cost more.
+        return NO_SHAPE
     apart = abs(best.length / size.length_px - 1.0)
     shows_ends = size.tolerance > 0.0 and _shows_ends(steel, best, size)
     is_measured = shows_ends and _needs_length(steel, best, size)
@@ -191,33 +191,6 @@ def _fits(
     return one, other, rod
 
 
-def _fading(steel: SteelMap, fit: TemplateFit) -> float:
-    """Return over how much more length the steel fades at a tail than at the body's sides [px].
-
-    Glare over a tail ends it less sharply than lens and sensor do.
-    """
-    axis = float(fit.arc.start[0]), float(fit.arc.start[1]), fit.arc.angle, fit.arc.curvature
-    beyond = np.arange(-4.0, 4.1, 0.25)
-    share = np.empty((len(beyond), 5))
-    straighten(steel.surely, axis, beyond, np.linspace(-0.3, 0.3, 5) * fit.width, share)
-    # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
-    tail = _fade(beyond, share.min(axis=1))
-    body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
-    sides = []
-    for side in (-1.0, 1.0):
-        share = np.empty((len(body), len(outside)))
-        straighten(steel.surely, axis, body, side * outside, share)
-        sides.append(_fade(-outside, np.partition(share, 6, axis=0)[6]))
-    return tail - min(sides)
-
-
-def _fade(along: np.ndarray, share: np.ndarray) -> float:
-    """Return the length over which a share rises from 0.2 to 0.8."""
-    rising = np.maximum.accumulate(share)
-    low, high = (np.searchsorted(rising, level).clip(max=len(along) - 1) for level in (0.2, 0.8))
-    return float(along[high] - along[low])
-
-
 def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """Say whether the image speaks for the length that was measured, and not as well for the one that is known."""
     if abs(fit.length - size.length_px) < SAME_LENGTH * size.length_px:
@@ -254,7 +227,7 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     excess(steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * size.width_px, beyond)
     if beyond[2:4].max() > GOES_ON:
         return False
-    if _fading(steel, fit) > FADES_PX:
+    if fading(steel.surely, _state(fit.arc, fit.width), fit.length, fit.width) > FADES_PX:
         return False
     return not steel.is_glaring(fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX])))
 
@@ -290,7 +263,7 @@ def _bluntness(steel: SteelMap, arc: Arc, length: float, width: float) -> tuple[
 def _what_covers(steel: SteelMap, fit: TemplateFit, width: float) -> str:
     """Say what covers a drawn needle; empty if nothing does."""
     if fit.cost > MAX_COST * fit.length:
-        return "no needle's shape"
+        return NO_SHAPE
     rows = np.empty((int(fit.length), 3))
     steel_rows(steel.surely, steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, THIN, rows)
     share, due, greatest = rows.T

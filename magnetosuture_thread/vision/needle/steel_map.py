@@ -101,7 +101,9 @@ class SteelMap:
         box = slice(top, bottom), slice(left, right)
         dark = _darkness(brightest, box, factor, wall)
         u, v = np.round(points - (left, top)).astype(int).T
-        depth = float(np.quantile(dark[v.clip(0, len(dark) - 1), u.clip(0, dark.shape[1] - 1)], DARKEST))
+        own = dark[v.clip(0, len(dark) - 1), u.clip(0, dark.shape[1] - 1)]
+        rank = round(DARKEST * (len(own) - 1))
+        depth = float(np.partition(own, rank)[rank])
         surely = _share(dark, depth)
         perhaps = surely if darkest is brightest else _share(_darkness(darkest, box, factor, wall), depth)
         pixels = np.ascontiguousarray(darkest.pixels[box])

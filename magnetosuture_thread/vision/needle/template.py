@@ -230,6 +230,41 @@ def sample_along(steel, state, along, aside, values):
 
 
 @compiled
+def _add_row(own, right, turned, bent, shape, end, rest):
+    """Add a row's sums to the lower half of the normal equations; slopes by angle and bend are multiples of b."""
+    aa, ab, bb, aw, bw, ww = shape
+    own[0, 0] += aa
+    own[1, 0] += ab
+    own[2, 0] += turned * ab
+    own[3, 0] += bent * ab
+    own[4, 0] += aw
+    own[1, 1] += bb
+    own[2, 1] += turned * bb
+    own[3, 1] += bent * bb
+    own[4, 1] += bw
+    own[2, 2] += turned * turned * bb
+    own[3, 2] += turned * bent * bb
+    own[4, 2] += turned * bw
+    own[3, 3] += bent * bent * bb
+    own[4, 3] += bent * bw
+    own[4, 4] += ww
+    ae, be, we, ee = end
+    own[5, 0] += ae
+    own[5, 1] += be
+    own[5, 2] += turned * be
+    own[5, 3] += bent * be
+    own[5, 4] += we
+    own[5, 5] += ee
+    ra, rb, rw, re = rest
+    right[0] += ra
+    right[1] += rb
+    right[2] += turned * rb
+    right[3] += bent * rb
+    right[4] += rw
+    right[5] += re
+
+
+@compiled
 def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeless, normal):
     """Fit; `state` (u, v, angle, curvature, half width, length) is changed, `normal` filled.
 
@@ -249,7 +284,7 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
     all_least, all_most = np.empty((most_rows, columns)), np.empty((most_rows, columns))
     all_drawn, all_wider = np.empty((most_rows, columns)), np.empty((most_rows, columns))
     all_longer = np.empty((most_rows, columns))
-    right, slope, own = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
+    right, own = np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
     best, best_missing, best_state, samples = np.inf, 0.0, state.copy(), 1
     prior = OTHER * OTHER / (deviations[0] * deviations[0])
     length_prior = OTHER * OTHER / (deviations[1] * deviations[1]) if free else 1.0
@@ -264,36 +299,37 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         _draw_with_slopes(along, aside, own_length, half, bloom, thin, drawn, wider, longer)
         own[:], right[:] = 0.0, 0.0
         cost, missing = 0.0, 0.0
-        slope[5] = 0.0
         for row in range(1, rows - 1):
-            t = along[row] - middle
+            # Slopes along (a), aside (b), by the width (w) and by the end of the length (e).
+            aa = ab = bb = aw = bw = ww = ae = be = we = ee = ra = rb = rw = re = 0.0
             for column in range(1, columns - 1):
                 seen, weight = least, 1.0
                 apart = least[row, column] - drawn[row, column]
-                if apart <= 0.0:
-                    seen = most
-                    apart = min(most[row, column] - drawn[row, column], 0.0)
                 if apart > 0.0:
-                    share = 1.0 / (1.0 + (apart / OTHER) ** 2)
+                    share = 1.0 / (1.0 + apart * apart * (1.0 / OTHER**2))
                     weight = share * share
                     cost += share * apart * apart
                 else:
+                    seen = most
+                    apart = min(most[row, column] - drawn[row, column], 0.0)
                     cost += apart * apart
                     missing -= apart
-                side = 0.5 * (seen[row, column + 1] - seen[row, column - 1]) / STEP_PX
-                slope[0] = 0.5 * (seen[row + 1, column] - seen[row - 1, column])
-                slope[1] = side
-                slope[2] = t * side
-                slope[3] = 0.5 * (t * t - middle * middle / 3.0) * side
-                slope[4] = -wider[row, column]
-                if slope[0] == 0.0 and side == 0.0 and slope[4] == 0.0:
+                a = 0.5 * (seen[row + 1, column] - seen[row - 1, column])
+                b = (seen[row, column + 1] - seen[row, column - 1]) * (0.5 / STEP_PX)
+                w = -wider[row, column]
+                if a == 0.0 and b == 0.0 and w == 0.0:
                     continue  # as on most of the floor, and in the middle of the body
+                by_a, by_b, by_w = weight * a, weight * b, weight * w
+                aa, ab, aw, ra = aa + by_a * a, ab + by_a * b, aw + by_a * w, ra - by_a * apart
+                bb, bw, rb = bb + by_b * b, bw + by_b * w, rb - by_b * apart
+                ww, rw = ww + by_w * w, rw - by_w * apart
                 if free:
-                    slope[5] = -longer[row, column]
-                for i in range(PARAMETERS):
-                    right[i] -= weight * slope[i] * apart
-                    for j in range(i + 1):
-                        own[i, j] += weight * slope[i] * slope[j]
+                    e = -longer[row, column]
+                    ae, be, we, ee = ae + by_a * e, be + by_b * e, we + by_w * e, ee + weight * e * e
+                    re -= weight * e * apart
+            t = along[row] - middle
+            turned, bent = t, 0.5 * (t * t - middle * middle / 3.0)  # times b: slopes by the angle and by the bend
+            _add_row(own, right, turned, bent, (aa, ab, bb, aw, bw, ww), (ae, be, we, ee), (ra, rb, rw, re))
         for i in range(PARAMETERS):
             right[i] *= STEP_PX
             for j in range(i + 1):

@@ -12,12 +12,20 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.thread.profiles import (
+    integrate_across,
+    middle_strengths,
+    sample_across,
+    usual_profile,
+)
 
 REACH_PX, STEP_PX = 16.0, 0.5  # of profiles: to both sides, and between samples
 BESIDE_PX = 2.5  # from a thread's edge to the floor beside it
 BLUR_PX = 0.7  # of the picture, before it is sampled
 MIN_SHARE = 0.3  # of the usual darkness: below, the thread isn't visible
 FAINTEST = 3.0  # grey levels; less is noise
+SURE_STRENGTH = 2.0 * FAINTEST  # grey levels; of a fainter thread noise hides single points
+FAINT_SHARE = 0.4  # of its usual strength, that it shows in the mean where it is visible
 SMOOTHED_PX = 9.0  # along the thread, over which its darkness is averaged
 LOCAL_PX = 4.0  # along the thread, over which its middle is averaged
 MIN_DEVIATION_PX = 0.12  # of a middle: by pixels, compression, and the evening out of bends
@@ -101,11 +109,9 @@ def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, vis
     """
     shown = np.flatnonzero(visible) if visible.sum() >= MIN_POINTS else np.arange(len(points))
     shown = shown[:: max(1, len(shown) // ENOUGH_POINTS)]
-    chosen, aside = points[shown], np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-    at = across(points, aside)[shown]
-    profiles = sampled(gray, at)
-    beside = np.abs(aside) > 0.5 * REACH_PX
-    usual = np.median(profiles - np.median(profiles[:, beside], axis=1, keepdims=True), axis=0)
+    aside = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
+    usual = np.empty(len(aside))
+    usual_profile(_profiles(gray, points, aside, shown), aside, 0.5 * REACH_PX, usual)
     centre = len(aside) // 2
     near = usual[centre - 2 : centre + 3]
     pale = bool(near.max() > -near.min())
@@ -117,31 +123,38 @@ def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, vis
     while right < len(aside) - 1 and usual[right + 1] > 0.5 * usual[peak]:
         right += 1
     width = STEP_PX * (right - left + 1)
-    raw = sampled(picture.darkest.pixels, at[:, :: round(1.0 / STEP_PX)])[:, np.abs(aside[::2]) > 0.5 * width + 3.0]
+    floor = aside[:: round(1.0 / STEP_PX)]
+    floor = floor[np.abs(floor) > 0.5 * width + 3.0]
+    raw = np.rint(_profiles(picture.darkest.pixels, points, floor, shown))  # Between pixels there is less noise.
     noise = 1.4826 * middle(np.abs(np.diff(raw, axis=1))) / math.sqrt(2.0)
     half = 0.5 * width + BESIDE_PX
-    darkness = np.array([np.median(_integrals(picture, layer, chosen, half, pale)) for layer in (0, 1)])
+    darkness = np.array([np.median(each) for each in _integrals(picture, points[shown], half, pale)])
     return Appearance(pale, width, darkness, max(float(usual[peak]), FAINTEST), max(noise, 0.5))
 
 
-def _integrals(picture: Picture, layer: int, points: Points, half: float, pale: bool) -> Values:
-    """Return at each vertex the integral across of the share that a thread takes of the floor's light [px]."""
-    pixels = (picture.darkest, picture.brightest)[layer].pixels
-    aside = np.arange(-half, half + 1e-9, STEP_PX)
-    profiles = sampled(pixels, across(points, aside)).astype(float)
-    ground = np.maximum(0.5 * (profiles[:, :2].mean(axis=1) + profiles[:, -2:].mean(axis=1)), 1.0)[:, None]
-    shares = profiles / ground - 1.0 if pale else 1.0 - profiles / ground
-    return np.asarray(shares.sum(axis=1) * STEP_PX)
+def _profiles(image: NDArray[np.uint8], points: Points, aside: Values, chosen: NDArray[np.intp]) -> Values:
+    """Return an image across some vertices of a polyline, shape (vertices, distances)."""
+    profiles = np.empty((len(chosen), len(aside)))
+    sample_across(image, points, chosen, aside, profiles)
+    return profiles
+
+
+def _integrals(picture: Picture, points: Points, half: float, pale: bool) -> Values:
+    """Return the integrals of `integrate_across` at each vertex, in the darkest and the brightest colour, (2, m)."""
+    values = np.empty((2, len(points)))
+    for layer, own in zip((picture.darkest, picture.brightest), values, strict=True):
+        integrate_across(layer.pixels, points, np.arange(len(points)), half, STEP_PX, pale, own)
+    return values
 
 
 def looks_alike(picture: Picture, thread: Appearance, points: Points, slack: float) -> bool:
     """Say whether a line is as dark across in both colours as a thread, up to a share and the noise."""
-    half = thread.beside_px
-    for layer in (0, 1):
-        values = _integrals(picture, layer, points, half, thread.pale)
+    for values, darkness in zip(
+        _integrals(picture, points, thread.beside_px, thread.pale), thread.darkness, strict=True
+    ):
         usual = float(np.median(values))
         noise = 1.4826 * middle(np.abs(values - usual)) / math.sqrt(max(1.0, len(values) / SMOOTHED_PX))
-        if abs(usual - thread.darkness[layer]) > slack * float(thread.darkness.max()) + 2.0 * noise:
+        if abs(usual - darkness) > slack * float(thread.darkness.max()) + 2.0 * noise:
             return False
     return True
 
@@ -153,12 +166,18 @@ def strengths(
 
     With `two_sided`, where it differs less: next to another strand nothing then, but nothing along an edge either.
     """
+    values = np.empty(len(points))
+    middle_strengths(gray, points, thread.beside_px, thread.pale, two_sided, values)
+    return values
+
+
+def faintly_visible(gray: NDArray[np.uint8], points: Points, thread: Appearance, spacing: float) -> NDArray[np.bool_]:
+    """Return where a thread is visible of which noise hides single points: by means across and along it, shape (m,)."""
     reach = thread.beside_px
-    profiles = sampled(gray, across(points, np.array([-reach, -1.0, -0.5, 0.0, 0.5, 1.0, reach]))).astype(float)
-    if thread.pale:
-        profiles = 255.0 - profiles
-    sides = profiles[:, (0, -1)]
-    return np.asarray((sides.min(axis=1) if two_sided else sides.max(axis=1)) - profiles[:, 1:-1].min(axis=1))
+    profiles = sampled(gray, across(points, np.array([-reach, -0.5, 0.0, 0.5, reach]))).astype(float)
+    differs = profiles[:, 1:-1].mean(axis=1) - 0.5 * (profiles[:, 0] + profiles[:, -1])
+    mean = smoothed(differs if thread.pale else -differs, spacing)
+    return np.asarray(mean > FAINT_SHARE * max(0.0, float(np.median(mean))))
 
 
 def smoothed(values: Values, spacing: float) -> Values:

@@ -12,6 +12,7 @@ from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.search import (
     ENOUGH,
     MIN_CENTRED,
+    SCALES,
     SURE_SHARE,
     WALL_PX,
     ThreadSearch,
@@ -21,7 +22,8 @@ from magnetosuture_thread.vision.thread.search import (
 from magnetosuture_thread.vision.thread.walk import min_confidence
 
 WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
-FAINT_SHARE = 0.8  # of enough, that a faint or pale thread must show: less may be another thread, or glare
+FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
+MIN_BEGINNING, MIN_EVIDENCE = 2.5, 4.0  # mean evidence where a thread comes out and of all of it: more than noise shows
 
 
 @dataclass(frozen=True)
@@ -103,16 +105,27 @@ def _followed(
     search = ThreadSearch(picture, needle, max_length, centre, reach)
     dark = search.dark()
     enough = ENOUGH * max_length
-    best = dark if is_strong(dark, enough) else _best_of(dark, search.faint(), enough)
-    if len(best.points) >= MIN_CENTRED and search.is_edge(best):
+    best = dark if is_strong(dark, enough) else _best_centred(search, dark, enough)
+    whole = best is not dark and best.shown > enough
+    if not whole and len(best.points) >= MIN_CENTRED and search.is_edge(best):
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
-            return wide
+            return search.centred(wide)[0]
     return best
 
 
-def _best_of(dark: Walk, faint: list[Walk], enough: float) -> Walk:
-    sure = [walk for walk in faint if walk.shown > FAINT_SHARE * enough and walk.is_significant]
-    if not sure:
-        return dark
-    return max(sure, key=lambda walk: walk.shown * walk.strength)
+def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
+    """Return the walk with the greatest evidence for a thread that leaves the needle; at first at full size."""
+    best, greatest = dark, 0.0
+    for scale in SCALES:
+        for walk in search.faint(scale) + ([dark] if scale == 1 else []):
+            if walk.shown < FAINT_SHARE * enough:
+                continue
+            centred, section = search.centred(walk)
+            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE:
+                continue
+            if centred.shown > FAINT_SHARE * enough and section.mean * centred.shown > greatest:
+                best, greatest = centred, section.mean * centred.shown
+        if best.shown > enough:
+            break
+    return best

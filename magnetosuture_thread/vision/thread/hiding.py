@@ -11,12 +11,14 @@ smears of the liquid explain. Brighter areas show the lamp, others an object; a 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Picture, Wall, glare_mask
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
@@ -62,7 +64,7 @@ class Hiding:
         u, v = round(float(point[0])), round(float(point[1]))
         if not (0 <= u < columns and 0 <= v < rows):
             return -1
-        if np.hypot(u - self.wall.centre[0], v - self.wall.centre[1]) > self.wall.radius - WALL_PX:
+        if math.dist((u, v), self.wall.centre) > self.wall.radius - WALL_PX:
             return -1
         return int(self.areas[v, u])
 
@@ -86,8 +88,11 @@ def find_hiding(picture: Picture, needle: MeasuredNeedle, wall: Wall, metres_per
     rows, columns = picture.shape
     glare = cv2.morphologyEx(glare_mask(picture), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     solid = cv2.resize(glare, (columns, rows), interpolation=cv2.INTER_NEAREST)
-    inside = wall.distances((slice(0, rows), slice(0, columns))) < wall.radius - WALL_PX
-    solid[~inside] = 0
+    within = np.zeros((rows, columns), np.uint8)
+    u, v, reach = (round(16.0 * value) for value in (*wall.centre, wall.radius - WALL_PX))
+    cv2.circle(within, (u, v), reach, 1, -1, cv2.LINE_8, 4)
+    inside = within.view(np.bool_)
+    cv2.multiply(solid, within, solid)
     objects, floor = _objects(picture, wall, MIN_AREA / metres_per_pixel**2)
     cv2.bitwise_or(solid, objects, solid)
     if picture.mask is not None:
@@ -111,21 +116,17 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Mask, NDArr
     inside = np.hypot(places[:, 1], places[:, 2]) < 1.0
     if inside.sum() < 4 * places.shape[1]:
         return np.zeros((rows, columns), np.uint8), np.full((rows, columns), 1.0, np.float32)
-    weights = np.stack([_fitted(places[inside], channel) for channel in means[inside].T.astype(float)], axis=1)
+    weights = np.zeros((places.shape[1], means.shape[1]))
+    fitted = inside & _every_second(cells)
+    _fit_light(places[fitted], means[fitted].astype(float), weights)
     light = np.maximum(places @ weights, 1.0)
     ratios = means[inside] / light[inside] - 1.0
     light = light.reshape(cells[1], cells[0], -1).astype(np.float32)
-    seen = [
-        cv2.divide(channel, cv2.resize(floor, size), dtype=cv2.CV_32F) - 1.0
-        for channel, floor in zip(cv2.split(small), cv2.split(light), strict=True)
-    ]
-    mean = sum(seen) / len(seen)
-    found = np.abs(mean) > _bound(ratios.mean(axis=1), MIN_CONTRAST)
-    if len(seen) > 1:
-        most, least = cv2.max(cv2.max(*seen[:2]), seen[2]), cv2.min(cv2.min(*seen[:2]), seen[2])
-        found |= most - least > _bound(np.ptp(ratios, axis=1), MIN_COLOUR)
-    found &= near.distances((slice(0, rows, SHRUNK), slice(0, columns, SHRUNK)))[: size[1], : size[0]] < near.radius
-    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    bounds = _bound(ratios.mean(axis=1), MIN_CONTRAST), _bound(np.ptp(ratios, axis=1), MIN_COLOUR)
+    found = np.zeros(small.shape[:2], np.uint8)
+    at_small = cv2.resize(light, size).reshape(*found.shape, -1)
+    _mark_unlike(small.reshape(at_small.shape), at_small, bounds, (*near.centre, near.radius), found)
+    opened = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     large = stats[:, cv2.CC_STAT_AREA] * SHRUNK**2 >= min_area
     large[0] = False
@@ -145,19 +146,69 @@ def _places(size: tuple[int, int], shape: tuple[int, int], wall: Wall) -> NDArra
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, far, far * far])
 
 
-def _fitted(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights of a sum of functions that is near most values: least squares with Tukey's biweight."""
-    weights = np.zeros(basis.shape[1])
-    weights[0] = middle(values)
-    for _ in range(ROUNDS):
-        residuals = values - basis @ weights
-        bound = TUKEY * max(0.5, 1.4826 * middle(np.abs(residuals)))
-        share = np.maximum(1.0 - (residuals / bound) ** 2, 0.0)[:, None] ** 2
-        normal = basis.T @ (share * basis) + 1e-6 * np.eye(len(weights))
-        before, weights = weights, np.linalg.solve(normal, basis.T @ (share[:, 0] * values))
-        if np.abs(weights - before).max() < SETTLED:
-            break
-    return weights
+def _every_second(size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return every second row and column of a grid, shape (cells,): far more than enough for the sum's few weights."""
+    chosen = np.zeros(size[::-1], np.bool_)
+    chosen[::2, ::2] = True
+    return chosen.ravel()
+
+
+@compiled
+def _fit_light(basis, values, weights):
+    """Fill in for each colour the weights of a sum of functions near most values: least squares, Tukey's biweight.
+
+    Args:
+        basis: the functions, shape (cells, functions).
+        values: of the colours, shape (cells, colours) [grey levels].
+        weights: filled, shape (functions, colours).
+    """
+    count, size = basis.shape
+    normal, right, residuals = np.empty((size, size)), np.empty(size), np.empty(count)
+    for colour in range(values.shape[1]):
+        own = np.zeros(size)
+        own[0] = np.median(values[:, colour])
+        for _ in range(ROUNDS):
+            for cell in range(count):
+                residuals[cell] = values[cell, colour] - (basis[cell] * own).sum()
+            bound = TUKEY * max(0.5, 1.4826 * np.median(np.abs(residuals)))
+            normal[:], right[:] = 1e-6 * np.eye(size), 0.0
+            for cell in range(count):
+                share = max(1.0 - (residuals[cell] / bound) ** 2, 0.0) ** 2
+                for i in range(size):
+                    weighted = share * basis[cell, i]
+                    right[i] += weighted * values[cell, colour]
+                    for j in range(i + 1):
+                        normal[i, j] += weighted * basis[cell, j]
+                        normal[j, i] = normal[i, j]
+            before = own
+            own = np.linalg.solve(normal, right)
+            if np.abs(own - before).max() < SETTLED:
+                break
+        weights[:, colour] = own
+
+
+@compiled
+def _mark_unlike(small, light, bounds, dish, found):
+    """Mark where the mean of q_c, or the greatest less the least, is beyond its bound, within a dish.
+
+    Args:
+        small: the shrunk image, shape (rows, columns, colours), uint8.
+        light: of the floor there, of the same shape [grey levels].
+        bounds: of the mean and of the range.
+        dish: u, v and radius in the image that is not shrunk [px].
+        found: set to 1 there, shape (rows, columns).
+    """
+    rows, columns, colours = small.shape
+    for row in range(rows):
+        for column in range(columns):
+            u, v = SHRUNK * column - dish[0], SHRUNK * row - dish[1]
+            if u * u + v * v >= dish[2] * dish[2]:
+                continue
+            total, least, most = 0.0, np.inf, -np.inf
+            for colour in range(colours):
+                ratio = small[row, column, colour] / light[row, column, colour] - 1.0
+                total, least, most = total + ratio, min(least, ratio), max(most, ratio)
+            found[row, column] = abs(total) > bounds[0] * colours or most - least > bounds[1]
 
 
 def _bound(values: NDArray[np.float64], minimum: float) -> float:

@@ -94,9 +94,10 @@ def observe(
     ends_bare = is_bare_beyond(picture, gray, thread, parts[0], needle)
     plain = strengths(gray, walk, thread, two_sided=True) > max(FAINTEST, MIN_SHARE * thread.strength)
     gapless = not gone.any() and not gaps_of(plain | below, OBJECT_GAP_PX, begin).any()
-    if gapless and ends_bare and _is_whole(line, length):
-        whole = in_dish.piece(line, PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), 1.0)
-        return ThreadObservation((whole,), complete=True, hidden=(_outline(needle, view),))
+    if gapless and _is_whole(line, length):  # Nothing is left of the thread to look for.
+        end = PieceEnd.FREE if ends_bare else PieceEnd.UNKNOWN
+        whole = in_dish.piece(line, PieceEnd.TAIL, end, (0.0, 0.0), 1.0)
+        return ThreadObservation((whole,), complete=ends_bare, hidden=(_outline(needle, view),))
     if not search:
         first = in_dish.piece(parts[0], PieceEnd.TAIL, PieceEnd.UNKNOWN, (0.0, 0.0), 1.0)
         return ThreadObservation((first,), hidden=(_outline(needle, view),))
@@ -114,7 +115,8 @@ def observe(
             first, last = np.flatnonzero(part.visible)[[0, -1]]
             fresh = fresh_parts(part.points[first : last + 1], known)
             known += [each for each in fresh if len(each) > MIN_LENGTH_PX]
-    others = known[1:] + find_pieces(picture, gray, thread, hiding, known, length)
+    remaining = length * (1.0 + LENGTH_TOLERANCE) - sum(float(arc_lengths(each)[-1]) for each in known)
+    others = known[1:] + find_pieces(picture, gray, thread, hiding, known, remaining)
     strands = cut_where_met(begun, others)
     strands += [strand_along(gray, thread, respaced(other, SPACING_PX)) for other in others]
     return _joined(picture, gray, thread, needle, hiding, strands, in_dish, length)

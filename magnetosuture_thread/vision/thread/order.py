@@ -113,8 +113,8 @@ def end_direction(points: Points) -> Points:
     near = points[min(first, len(points) - 2) :]
     if len(near) > 3:  # A parabola's tangent at its end: a bent thread turns on the way.
         s = arc_lengths(near)
-        weights = np.polynomial.polynomial.polyfit(s - s[-1], near, 2)
-        direction = weights[1]
+        powers = np.vander(s - s[-1], 3)
+        direction = np.linalg.solve(powers.T @ powers, powers.T @ near)[1]
     else:
         direction = near[-1] - near[0]
     return np.asarray(direction / max(float(np.hypot(*direction)), 1e-9))

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.sampling import middle
@@ -69,11 +70,13 @@ def find_pieces(
         thread: how the piece looks that leaves the needle.
         hiding: areas where nothing can be seen.
         known: pieces that are known, each of shape (m, 2) [px].
-        max_length: of a piece [px].
+        max_length: of all these pieces: what is left of the thread, so that anything longer is none of it [px].
 
     Returns:
         Pieces in the picture's pixels, the longest first, each of shape (m, 2), m >= 2 [px].
     """
+    if max_length < MIN_LENGTH_PX:
+        return []
     ridge = two_sided_ridge(gray, thread, hiding)
     (u, v), reach = hiding.wall.centre, hiding.wall.radius - WALL_PX
     ridge[~hiding.inside] = 0
@@ -90,11 +93,12 @@ def find_pieces(
         seed = _seed(fresh, ridge)
         if seed is None:
             break
-        line = _traced(ridge, noise, faintest, seed, thread.strength, dish, max_length)
+        line = _traced(ridge, noise, faintest, seed, thread.strength, dish, max_length + MIN_LENGTH_PX)
         _clear(fresh, line, thread.beside_px)
         cv2.circle(fresh, (round(seed[0]), round(seed[1])), MIN_SEED_PX, 0, -1)
         for part in fresh_parts(line, known + found):
-            if arc_lengths(part)[-1] >= MIN_LENGTH_PX and _is_thread(picture, gray, thread, hiding, part):
+            long = MIN_LENGTH_PX <= arc_lengths(part)[-1] <= max_length
+            if long and _is_thread(picture, gray, thread, hiding, part):
                 found.append(part)
     return sorted(found, key=lambda line: -arc_lengths(line)[-1])
 
@@ -151,16 +155,29 @@ def _clear(fresh: NDArray[np.uint8], line: Points, reach: float) -> None:
 def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
     """Return the parts of a line that run along no known one, nor along itself; they may cross them."""
     line = respaced(line, 1.0)
-    apart = ((line[:, None] - line[None]) ** 2).sum(axis=2)
-    index = np.arange(len(line))
-    twice = ((apart < TWICE_PX**2) & (index[None] < index[:, None] - MAX_TWICE_PX)).any(axis=1)
-    if known:
-        others = np.vstack([respaced(other, 1.0) for other in known])
-        twice |= ((line[:, None] - others[None]) ** 2).sum(axis=2).min(axis=1) < TWICE_PX**2
+    others = np.vstack([respaced(other, 1.0) for other in known]) if known else np.empty((0, 2))
+    twice = np.empty(len(line), np.bool_)
+    _mark_twice(line, others, twice)
     for first, last in runs(twice):
         if last - first < MAX_TWICE_PX and first > 0 and last < len(twice):
             twice[first:last] = False
     return [line[first:last] for first, last in runs(~twice) if last - first > 1]
+
+
+@compiled
+def _mark_twice(line, others, twice):
+    """Mark where a line with vertices 1 px apart comes near to other points, or to its own from long before."""
+    for index in range(len(line)):
+        u, v = line[index, 0], line[index, 1]
+        twice[index] = False
+        for own in range(index - int(MAX_TWICE_PX)):
+            if (line[own, 0] - u) ** 2 + (line[own, 1] - v) ** 2 < TWICE_PX**2:
+                twice[index] = True
+                break
+        for other in range(len(others)):
+            if twice[index]:
+                break
+            twice[index] = (others[other, 0] - u) ** 2 + (others[other, 1] - v) ** 2 < TWICE_PX**2
 
 
 def _is_thread(picture: Picture, gray: NDArray[np.uint8], thread: Appearance, hiding: Hiding, line: Points) -> bool:

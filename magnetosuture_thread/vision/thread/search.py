@@ -9,11 +9,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, shrunk, without_wall
 from magnetosuture_thread.vision.needle.erase import without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.thread.cross_section import CrossSection, centred_between_edges
 from magnetosuture_thread.vision.thread.forks import follow
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.ridge import (
@@ -30,7 +30,7 @@ from magnetosuture_thread.vision.thread.ridge import (
     faint_ridge,
     shrunk_hidden,
 )
-from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, refine, strengths_along
+from magnetosuture_thread.vision.thread.walk import refine
 
 COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
 BEYOND_PX = 3.0  # its tip, that is not seen either
@@ -44,8 +44,7 @@ FAINT = 25.0  # grey levels; a black-hat fainter than this may be a pale thread'
 STRONG_SHARE = 0.08  # of enough, that a strong dark thread must show to be the thread: the rest of it is covered
 SCALES = (1, 2)  # how much smaller the image is in which a faint, a pale or a wide thread is looked for
 RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
-THIN_SHARE = 0.5  # of its strength among larger pixels, that a thin thread shows at full size
-FAINT_ROUNDS, FAINT_HALF = 3, 3  # how often a faint walk is centred, and over how many vertices to both sides
+FAINT_HALF = 3  # vertices to both sides, over which a faint walk is centred
 COARSE, COARSE_MEDIAN = 4, 15  # how much smaller an image shows what is wide, and the window of its surroundings [px]
 COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
 WIDE_SHARE = 1.2  # of a walk's contrast, that what is wide has beside it in the shrunk image
@@ -54,10 +53,6 @@ WIDE_STIFFNESS = 3.0  # of a wide thread, that bends in many of its widths, in t
 OTHER_COLOUR = 0.5  # weight of what a pixel has of another colour, against it
 BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
 MIN_CENTRED = 4  # vertices
-LEAVING, NEXT = 5, 20  # vertices that are seen first, and up to which those lie that they are held against
-BEGINNING_SHARE = 0.4  # of the strength of the next ones, that the first must have
-BESIDE, BESIDE_SHARE = 13, 3.0  # window about a faint walk, and of its strength, that what it lies beside has there
-SIGNIFICANT = 2.5  # deviations of noise, above the 1.7 to 2.2 that the best of all walks over noise shows
 SURE_SHARE = 0.5  # of enough, that a faint, wide or pale thread must show: a little of one may be noise
 WIDER_SHARE = 1.3  # of what is seen at full size, that must be seen at half of it
 
@@ -72,7 +67,6 @@ class Walk:
         strength: median of the ridge along it [grey levels].
         ridge: that was followed.
         path: the walk in the ridge's pixels; see `walk_on`.
-        shown_strengths: strength of the ridge at each vertex that is not hidden.
     """
 
     points: np.ndarray
@@ -80,20 +74,6 @@ class Walk:
     strength: float
     ridge: Ridge
     path: np.ndarray
-    shown_strengths: np.ndarray
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether a walk along a signed ridge shows more than the best walk over noise, from the needle on.
-
-        A walk looks for the strongest way, and so finds more than the mean of noise where nothing is. One that begins
-        much fainter than it goes on has gone over such noise to something that does not leave the needle.
-        """
-        if len(self.shown_strengths) <= LEAVING:
-            return False
-        first, following = np.median(self.shown_strengths[:LEAVING]), np.median(self.shown_strengths[LEAVING:NEXT])
-        least = min(np.median(self.shown_strengths[:NEXT]), np.median(self.shown_strengths))
-        return bool(least > SIGNIFICANT * LEVELS and first > BEGINNING_SHARE * following)
 
 
 def is_strong(dark: Walk, enough: float) -> bool:
@@ -160,41 +140,47 @@ class ThreadSearch:
                 break
         return best
 
-    def faint(self) -> list[Walk]:
-        """Return the walks along what is a little darker or paler than its surroundings, at full size and at half."""
-        window = self._cleared(self._picture.luminance)
+    def faint(self, scale: int) -> list[Walk]:
+        """Return the walks along what is a little darker and along what is a little paler than its surroundings.
+
+        Args:
+            scale: how much smaller the image is in which to look: in a smaller one a thread and its shadow are one.
+        """
+        small = shrunk(self._luminance, scale)
         shade = SHADE * self._needle.contrast * middle(self._picture.luminance.floor)
+        difference, deviation = darker_than_around(small)
         walks: list[Walk] = []
-        thin: dict[bool, tuple[Ridge, np.ndarray]] = {}
-        for scale in SCALES:
-            small = shrunk(window, scale)
-            difference, deviation = darker_than_around(small)
-            for pale in (False, True):
-                # A pale thread may be as bright as the lamp's reflection.
-                hidden, factor = shrunk_hidden(
-                    self._covered if pale else self._hidden, self._picture.factor, small, scale
-                )
-                ridge = faint_ridge(difference, deviation, hidden, factor, scale, pale=pale)
-                self._clear_shade(ridge, shade * LEVELS / deviation)
-                self._clear_wall(ridge)
-                walk, sign = self._walked(ridge), -1.0 if pale else 1.0
-                if scale == 1:
-                    thin[pale] = ridge, difference
-                walk = replace(walk, strength=sign * self._median_along(walk.points, difference, scale))
-                if walk.is_significant and self._is_beside(walk, difference, scale):
-                    continue
-                if scale > 1 and len(walk.points) > MIN_CENTRED:
-                    # Among larger pixels a thread and its shadow are one: where it is thin, its own middle is taken.
-                    ridge, difference_1 = thin[pale]
-                    if sign * self._median_along(walk.points, difference_1, 1) > THIN_SHARE * walk.strength:
-                        walk = replace(walk, points=self._recentred(walk.points, ridge))
-                walks.append(walk)
+        for pale in (False, True):
+            # A pale thread may be as bright as the lamp's reflection.
+            hidden, factor = shrunk_hidden(self._covered if pale else self._hidden, self._picture.factor, small, scale)
+            ridge = faint_ridge(difference, deviation, hidden, factor, scale, pale=pale)
+            self._clear_shade(ridge, shade * LEVELS / deviation)
+            self._clear_wall(ridge)
+            walk = self._walked(ridge)
+            strength = (-1.0 if pale else 1.0) * self._median_along(walk.points, difference, scale)
+            walks.append(replace(walk, strength=strength))
         return walks
 
-    def _is_beside(self, walk: Walk, difference: np.ndarray, scale: int) -> bool:
-        """Say whether a walk runs beside something that differs far more, which makes its surroundings look so."""
-        near = cv2.dilate(np.abs(difference), np.ones((BESIDE, BESIDE), np.uint8))
-        return self._median_along(walk.points, near, scale) > BESIDE_SHARE * walk.strength
+    @cached_property
+    def _luminance(self) -> np.ndarray:
+        """The picture's luminance in the search's window without the needle."""
+        return self._cleared(self._picture.luminance)
+
+    def centred(self, walk: Walk) -> tuple[Walk, CrossSection]:
+        """Return a walk between the thread's edges up to where it ends, and how well it shows one there."""
+        ridge = walk.ridge
+        shift = 0.5 * (ridge.scale - 1)
+
+        def hidden(points: np.ndarray) -> np.ndarray:
+            at = np.round((points - self._origin - shift) / ridge.scale).astype(int) // ridge.factor
+            rows, columns = ridge.hidden.shape
+            return np.asarray(ridge.hidden[np.clip(at[:, 1], 0, rows - 1), np.clip(at[:, 0], 0, columns - 1)] > 0)
+
+        whole = centred_between_edges(self._picture.image, self._needle, walk.points, hidden)
+        found = whole.up_to_its_end()
+        share = len(found.points) / len(whole.points)
+        path = walk.path[: max(1, round(share * len(walk.path)))]
+        return replace(walk, points=found.points, shown=share * walk.shown, path=path), found
 
     @cached_property
     def _coarse(self) -> np.ndarray:
@@ -272,15 +258,6 @@ class ThreadSearch:
         at = ((points - self._origin - 0.5 * (scale - 1)) / scale).astype(np.float32)
         return float(np.median(cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)))
 
-    def _recentred(self, points: np.ndarray, ridge: Ridge) -> np.ndarray:
-        """Return a walk in the middle of a ridge at full size, with vertices as close as the walk's steps there."""
-        length = float(arc_lengths(points)[-1])
-        fine = points_at(points, np.linspace(0.0, length, max(2, round(length / STEP_PX) + 1))) - self._origin
-        seen = np.ones(len(fine), np.bool_)
-        for _ in range(FAINT_ROUNDS):
-            refine(ridge.strength, ridge.noise, fine, seen, FAINT_HALF)
-        return np.asarray(fine + self._origin)
-
     def _cleared(self, layer: Layer) -> np.ndarray:
         """Return a layer's pixels in the search's window, without the needle and what is beyond the wall beside it."""
         tail, factor = self._needle.tail_px, self._picture.factor
@@ -317,19 +294,16 @@ class ThreadSearch:
             strong,
         )
         points = path[:count, :2].copy()
-        values = strengths_along(ridge.strength, ridge.hidden, ridge.factor, ridge.noise, path, count)
-        kept = count_to_end(values, ridge.faintest, path) if ridge.signed else count
+        kept = count
         if self._picture.mask is not None:
             full = cv2.resize(ridge.strength, None, fx=scale, fy=scale) if scale > 1 else ridge.strength
             above = cv2.subtract(full, ridge.noise)
             kept = count_off_outline(points[:kept] * scale + shift, above, self._picture.mask, origin, ridge.faintest)
         shown = max(0.0, shown - (path[count - 1, 5] - path[kept - 1, 5]))
         points = points[:kept]
-        for _ in range(FAINT_ROUNDS if ridge.signed else 1):
-            refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
+        refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
         strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
-        seen = values[1:kept][~np.isnan(values[1:kept])]
-        return Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy(), seen)
+        return Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy())
 
     def _clear_wall(self, ridge: Ridge) -> None:
         """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""
@@ -354,12 +328,18 @@ class ThreadSearch:
         """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
         scale = ridge.scale
         axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24)) - self._origin
-        at = np.round((axis - 0.5 * (scale - 1)) / scale * 16.0).astype(np.int32)
-        zone = np.zeros_like(ridge.strength)
+        axis = (axis - 0.5 * (scale - 1)) / scale
         thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / scale)
+        left, top = np.maximum(axis.min(axis=0) - thickness, 0.0).astype(int)
+        right, bottom = np.maximum(axis.max(axis=0) + thickness, 0.0).astype(int)
+        near = ridge.strength[top:bottom, left:right]
+        if not near.size:
+            return
+        zone = np.zeros_like(near)
+        at = np.round((axis - (left, top)) * 16.0).astype(np.int32)
         cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
         floor = ridge.noise if ridge.signed else 0.0
-        ridge.strength[(zone > 0) & (ridge.strength < floor + shade)] = floor
+        near[(zone > 0) & (near < floor + shade)] = floor
 
 
 def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:

@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
-from magnetosuture_thread.vision.thread.appearance import FAINTEST, MIN_SHARE, Appearance, runs, strengths
+from magnetosuture_thread.vision.thread.appearance import (
+    FAINTEST,
+    MIN_SHARE,
+    SURE_STRENGTH,
+    Appearance,
+    faintly_visible,
+    runs,
+    strengths,
+)
 from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX
 
 SPACING_PX = 2.0  # of a line's vertices
@@ -48,6 +56,8 @@ def strand_along(
     """Return a line with where the thread is visible."""
     strength = strengths(gray, points, thread)
     shown = strength > max(FAINTEST, MIN_SHARE * thread.strength)
+    if thread.strength < SURE_STRENGTH:
+        shown |= faintly_visible(gray, points, thread, SPACING_PX)
     return Strand(points, strength, shown if below is None else shown & ~below)
 
 

@@ -20,12 +20,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from magnetosuture_thread.evaluation.frames import FrameResult, Observation
+from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
 from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures, headlines
 from magnetosuture_thread.evaluation.report.page import page_data, write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, draw_worst_frame
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.model.estimator import Disturbance
 from magnetosuture_thread.model.margins import BarrierMargins, Margins
 
 LENGTH = 0.019
@@ -42,8 +43,13 @@ def margins(clearance: float) -> Margins:
     return Margins((obstacle,), (7,) if clearance <= 0 else ())
 
 
-def made_metrics(frames: int = 300, targets: tuple[str, ...] = ("truth", "seen")) -> RunMetrics:
-    """Return the metrics of frames whose predictions are off by more and more, with a needle lost in between."""
+def made_metrics(
+    frames: int = 300, targets: tuple[str, ...] = ("truth", "seen"), *, estimated: bool = False
+) -> RunMetrics:
+    """Return the metrics of frames whose predictions are off by more and more, with a needle lost in between.
+
+    Estimates are off by half as much, and the thread is disturbed from frame 200 on.
+    """
     metrics = RunMetrics(LENGTH, 10**9, targets, recorded=True)
     for index in range(frames):
         stamp, off = 10**9 + index * 33_333_333, 1e-6 * index
@@ -55,13 +61,18 @@ def made_metrics(frames: int = 300, targets: tuple[str, ...] = ("truth", "seen")
         metrics.observe(sight)
         prediction: Any = SimpleNamespace(positions=NODES, strain=np.array([0.0, -1e-5]), residual=1e-9)
         frame = FrameResult.of(sight, prediction, margins(1e-3 - 1e-5 * index), 1e-4, recorded=seen)
+        if estimated:
+            found = Disturbance(8e-3, 2e-3, NODES[10], np.array([0.0, 1.0]), 3e-6, 9.0, 1.0 + 200 / 30)
+            squared = np.linspace(0.5, 1.5, 16)
+            disturbances = (found,) if index >= 200 else ()
+            frame.estimate = EstimatedThread(NODES + np.array([0.0, off]), index > 0, squared, disturbances)
         metrics.add(frame)
     return metrics
 
 
-def made_page(about: BagDetails = ABOUT, *, live: LiveFigures | None = None) -> str:
+def made_page(about: BagDetails = ABOUT, *, live: LiveFigures | None = None, estimated: bool = False) -> str:
     """Return a page."""
-    metrics = made_metrics()
+    metrics = made_metrics(estimated=estimated)
     figures = BagFigures.of(metrics, live)
     pictures = [
         draw_worst_frame(worst, None, target=metrics.target, length=LENGTH, dish_diameter=0.035)
@@ -157,6 +168,37 @@ def test_the_data_is_that_of_the_figures(page: str):
     assert len(data["times"]["predicted"]) == len(lines["strain"]["values"])
 
 
+def test_estimate_and_prediction_stand_side_by_side():
+    page = made_page(estimated=True)
+    reader = Reader(page)
+    assert reader.open == []
+    for text in (
+        "estimate, error against the ground truth",
+        "prediction, error against the ground truth",
+        "estimate, against the measured centreline",
+        "normalised innovation squared",
+        "thread hidden",
+        "6.67 to 9.97 s",
+        "3.00 µN",
+    ):
+        assert text in " ".join(reader.text.split())
+    data = json.loads(reader.scripts[0])
+    lines = {line["id"]: line for plot in data["plots"] for line in plot["series"]}
+    assert lines["estimate_error_truth"]["role"] == lines["estimate_error_seen"]["role"] == "estimated"
+    assert lines["error_truth"]["role"] == lines["error_seen"]["role"] == "predicted"
+    assert max(v or 0.0 for v in lines["estimate_error_truth"]["values"]) == pytest.approx(
+        0.5 * max(v or 0.0 for v in lines["error_truth"]["values"]), rel=1e-4
+    )
+    low, high, mean = (lines[name]["values"] for name in ("low", "high", "mean"))
+    assert all(a < m < b for a, m, b in zip(low, mean, high, strict=True))
+    assert len(data["times"]["windows"]) == len(mean) == 2 * 2
+    assert data["disturbances"] == [[pytest.approx(6.6667, abs=1e-3), pytest.approx(9.9667, abs=1e-3)]]
+    greatest = [np.nanmax(np.array(data[name]["errors"], dtype=float)) for name in ("estimate_map", "map")]
+    assert greatest[0] == pytest.approx(0.5 * greatest[1], rel=1e-2)
+    for name in ("measured", "predicted", "estimated"):
+        assert f"--{name}: #" in page
+
+
 def test_the_head_says_the_figures_in_words(page: str):
     text = Reader(page).text
     for words in ("280 of 300", "broken: obstacle", "The bag does not say whether it is simulated.", "not in this bag"):
@@ -244,16 +286,20 @@ def drawn(browser: str, folder: Path, page: str) -> str:
 BROWSERS = [path for name in ("chromium", "google-chrome") if (path := shutil.which(name))][:1]
 
 
+@pytest.mark.parametrize("estimated", [False, True])
 @pytest.mark.parametrize("browser", [None, *BROWSERS])
-def test_a_browser_draws_all_plots_where_there_is_one(tmp_path: Path, page: str, browser: str | None):
+def test_a_browser_draws_all_plots_where_there_is_one(tmp_path: Path, page: str, browser: str | None, estimated: bool):
     """The page's script has a place for each plot; a real browser, where there is one, fills them."""
+    page = made_page(estimated=True) if estimated else page
     plots = [plot["id"] for plot in json.loads(Reader(page).scripts[0])["plots"]]
-    assert {f"plot-{name}" for name in (*plots, "map")} <= {a.get("id") for _, a in Reader(page).tags}
+    assert ({"consistency", "hidden"} <= set(plots)) == estimated
+    plots += ["map", "estimate_map"] if estimated else ["map"]
+    assert {f"plot-{name}" for name in plots} <= {a.get("id") for _, a in Reader(page).tags}
     if browser is None:
         return
     shown = drawn(browser, tmp_path, page)
-    assert f'data-drawn="{len(plots) + 1}"' in shown
-    assert shown.count('class="main-svg"') >= len(plots) + 1
+    assert f'data-drawn="{len(plots)}"' in shown
+    assert shown.count('class="main-svg"') >= len(plots)
     assert "The plots cannot be drawn" not in shown.split("<script")[0]
 
 

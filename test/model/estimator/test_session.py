@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +31,7 @@ from test.model.estimator.threads import (
 )
 
 
-def session_of(**options: float) -> EstimatorSession:
+def session_of(**options: Any) -> EstimatorSession:
     return EstimatorSession(estimator_of(thread_of(), options=EstimatorOptions(**options)))
 
 

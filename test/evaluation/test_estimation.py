@@ -1,0 +1,220 @@
+"""Figures of the estimate itself: consistency, hidden parts, disturbances, and errors side by side."""
+
+from __future__ import annotations
+
+import math
+import re
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from magnetosuture_thread.evaluation import colours
+from magnetosuture_thread.evaluation.estimation import (
+    Consistency,
+    DisturbanceLog,
+    EstimationFigures,
+    HiddenShares,
+    compare_errors,
+    hidden_part,
+    mean_band,
+)
+from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, TimeSeries
+from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.model.estimator import Disturbance
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+
+NODES = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])  # a thread 1 m long
+LINE = np.column_stack([-np.linspace(0.0, 1.0, 21), np.zeros(21)])
+
+
+def frame(stamp: float, estimate: EstimatedThread | None, **others: Any) -> FrameResult:
+    """Return a frame whose prediction is 0.02 m off the line."""
+    return FrameResult(round(stamp * 1e9), NODES + np.array([0.0, 0.02]), estimate=estimate, **others)
+
+
+def piece(first: float, last: float, begins: PieceEnd = PieceEnd.UNKNOWN) -> ThreadPiece:
+    """Return a piece of the line between two arc lengths."""
+    points = np.array([[-first, 0.0], [-last, 0.0]])
+    return ThreadPiece(points, np.full(2, 1e-4), begins, PieceEnd.COVERED, (first, first))
+
+
+def consistency_of(squared: np.ndarray, rate: float = 10.0) -> Consistency:
+    """Return the consistency of innovations of shape (frames, windows)."""
+    run = RunMetrics(1.0)
+    for k, row in enumerate(squared):
+        run.add(frame(k / rate, EstimatedThread(NODES, True, row)))
+    found = Consistency.of(run.series)
+    assert found is not None
+    return found
+
+
+def test_errors_of_prediction_and_estimate_have_the_same_names():
+    run = RunMetrics(1.0)
+    for k, off in enumerate((0.004, 0.008)):
+        nodes = NODES + np.array([0.0, off])
+        nodes[3, 1] += 0.004
+        run.add(frame(k, EstimatedThread(nodes, True), measured=LINE, ground_truth=LINE + np.array([0.0, 0.001])))
+    found = compare_errors(run.series)
+    assert found["prediction"].keys() == found["estimate"].keys()
+    assert found["prediction"]["error_measured_mean_percent"] == pytest.approx(2.0)
+    assert found["prediction"]["error_ground_truth_max_node_percent"] == pytest.approx(1.9)
+    assert found["estimate"]["error_ground_truth_mean_percent"] == pytest.approx((0.4 + 0.8) / 2)
+    assert found["estimate"]["error_ground_truth_max_percent"] == pytest.approx(0.8)
+    assert found["estimate"]["error_ground_truth_max_node_percent"] == pytest.approx(1.1)
+    assert found["estimate"]["error_measured_max_percent"] == pytest.approx(0.9)
+
+
+def test_a_run_without_estimates_has_none():
+    run = RunMetrics(1.0)
+    run.add(frame(0.0, None, ground_truth=LINE))
+    found = compare_errors(run.series)
+    assert set(found["estimate"].values()) == {None}
+    assert found["prediction"]["error_ground_truth_mean_percent"] == pytest.approx(2.0)
+    assert not run.estimation.estimated
+    assert run.estimation == EstimationFigures()
+
+
+def test_the_band_is_that_of_a_mean_of_squares():
+    low, high = mean_band(np.array([16, 2400]))
+    for count, a, b in zip((16, 2400), low, high, strict=True):
+        assert chi2.cdf(a * count, count) == pytest.approx(0.025)
+        assert chi2.cdf(b * count, count) == pytest.approx(0.975)
+
+
+def test_innovations_as_expected_are_within_their_band():
+    random = np.random.default_rng(1)
+    squared = random.standard_normal((2000, 16)) ** 2
+    squared[::3, 5:] = np.nan  # hidden
+    found = consistency_of(squared)
+    assert found.windows == 40
+    assert found.within >= 34
+    assert found.mean == pytest.approx(np.nanmean(squared), rel=1e-9)
+    assert found.width == pytest.approx(199.9 / 40)
+    assert found.share == found.within / 40
+
+
+def test_innovations_larger_than_expected_are_not():
+    random = np.random.default_rng(2)
+    found = consistency_of(1.5 * random.standard_normal((500, 16)) ** 2)
+    assert found.within == 0
+    assert (found.means > found.high).all()
+
+
+def test_a_short_run_is_one_window_and_one_frame_too():
+    assert consistency_of(np.ones((20, 16))).windows == 1
+    assert consistency_of(np.ones((1, 16))).windows == 1
+
+
+def test_a_time_without_measurement_is_no_window():
+    squared = np.ones((200, 16))
+    squared[60:140] = np.nan
+    found = consistency_of(squared)
+    assert (found.windows, len(found.means)) == (4, 4)
+    squared[40:150] = np.nan
+    found = consistency_of(squared)
+    assert (found.windows, len(found.means)) == (2, 4)
+    assert found.share == 1.0
+
+
+def test_hidden_is_what_no_piece_shows():
+    estimate = EstimatedThread(NODES, True)
+    whole = ThreadObservation((piece(0.0, 0.9, PieceEnd.TAIL),), complete=True)
+    parts = ThreadObservation((piece(0.0, 0.3, PieceEnd.TAIL), piece(0.6, 0.9)))
+    assert hidden_part(frame(0, estimate, observation=whole), 1.0) == 0.0
+    assert hidden_part(frame(0, estimate, observation=parts), 1.0) == pytest.approx(0.4)
+    assert hidden_part(frame(0, estimate, measured=LINE), 1.0) == pytest.approx(0.0, abs=1e-12)
+    assert hidden_part(frame(0, estimate, measured=LINE[:11]), 1.0) == pytest.approx(0.5)
+    assert hidden_part(frame(0, estimate, measured=LINE, observation=ThreadObservation()), 1.0) == 1.0
+    assert hidden_part(frame(0, EstimatedThread(NODES), measured=LINE), 1.0) == 1.0  # it was refused
+    broken = LINE.copy()
+    broken[5:] = np.nan
+    assert hidden_part(frame(0, estimate, measured=broken), 1.0) == pytest.approx(0.8)
+
+
+def test_hidden_shares_are_of_time_and_not_of_frames():
+    run = RunMetrics(1.0)
+    times = [*np.arange(0.0, 1.0, 0.1), *np.arange(1.0, 2.0, 0.05)]
+    for time in times:
+        if time < 1.0:
+            run.add(frame(time, EstimatedThread(NODES, True), measured=LINE[:11]))
+        else:
+            run.add(frame(time, EstimatedThread(NODES, time < 1.5), measured=LINE))
+    found = HiddenShares.of(run.series)
+    assert found is not None
+    assert found.time == pytest.approx(0.75, abs=0.02)
+    assert found.all_time == pytest.approx(0.25, abs=0.02)
+    assert found.length == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_gap_does_not_count_for_the_frame_before_it():
+    series = TimeSeries(["hidden", "corrected"])
+    for time in (0.0, 0.1, 0.2, 9.0, 9.1):
+        series.add(time, {"hidden": 1.0 if time == 0.2 else 0.0, "corrected": 1.0})
+    found = HiddenShares.of(series)
+    assert found is not None
+    assert found.time == pytest.approx(0.2)
+
+
+def test_disturbances_of_one_beginning_are_one_event():
+    log = DisturbanceLog()
+
+    def disturbed(since: float, significance: float) -> EstimatedThread:
+        place, east = np.array([0.1, 0.2]), np.array([0.0, 1.0])
+        return EstimatedThread(
+            NODES, True, np.empty(0), (Disturbance(0.3 * significance, 0.1, place, east, 1e-6, significance, since),)
+        )
+
+    for time, estimate in (
+        (10.0, EstimatedThread(NODES, True)),
+        (10.5, disturbed(10.4, 5.0)),
+        (10.6, disturbed(10.4, 7.0)),
+        (10.7, disturbed(10.4, 6.0)),
+        (10.8, EstimatedThread(NODES, True)),
+        (10.9, disturbed(10.85, 5.0)),
+    ):
+        log.add(time - 10.0, frame(time, estimate))
+    assert log.count == 2
+    first, second = log.events
+    assert [first.begin_s, first.end_s] == pytest.approx([0.4, 0.7])
+    assert [first.significance, first.arc_length_m] == pytest.approx([7.0, 2.1])
+    assert [first.x_m, first.y_m, first.direction_rad] == pytest.approx([0.1, 0.2, math.pi / 2])
+    assert second.begin_s == pytest.approx(0.85)
+
+
+def test_each_thread_has_a_colour_of_its_own_for_the_colour_blind_too():
+    """Distances in CIE Lab as red-green blind readers see them (Machado 2009) of what is drawn as a plain line."""
+    deuteranopia = [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    protanopia = [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    for ground, names in (("light", list(colours.BY_NAME)), ("dark", ["measured", "predicted", "estimated"])):
+        linear = [linear_rgb(getattr(colours.BY_NAME[name], ground)) for name in names]
+        for seen_by in (np.eye(3), np.array(deuteranopia), np.array(protanopia)):
+            lab = [cie_lab(seen_by @ each) for each in linear]
+            for a in range(len(names)):
+                for b in range(a):
+                    assert np.linalg.norm(lab[a] - lab[b]) > 20.0, (names[a], names[b], ground)
+
+
+def test_the_colours_are_those_of_the_operator_s_page():
+    page = files("magnetosuture_thread.console").joinpath("page/colours.js").read_text(encoding="utf-8")
+    given = dict(re.findall(r'export const (\w+) = "(#\w{6}|rgba\([^)]*\))"', page))
+    assert given["ESTIMATED"] == colours.ESTIMATED.light
+    assert given["MODEL"] == colours.PREDICTED.light
+    parts = [int(part) for part in re.findall(r"\d+", given["MEASURED"])[:3]]
+    assert "#" + "".join(f"{part:02x}" for part in parts) == colours.MEASURED.light
+
+
+def linear_rgb(colour: str) -> np.ndarray:
+    """Return the linear components of a colour."""
+    parts = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+
+
+def cie_lab(linear: np.ndarray) -> np.ndarray:
+    """Return a colour in CIE Lab."""
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    scaled = to_xyz @ np.clip(linear, 0.0, 1.0) / np.array([0.9505, 1.0, 1.089])
+    f = np.where(scaled > 0.008856, np.cbrt(scaled), 7.787 * scaled + 16.0 / 116.0)
+    return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])

@@ -1,0 +1,227 @@
+"""Slow parameters: found from a wrong start, with intervals that hold, frozen without excitation, within bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.model.estimator.correction import MeasuredPoints, normals_of, prior_information
+from magnetosuture_thread.model.estimator.corrector import Corrector
+from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_95
+from magnetosuture_thread.model.formulations import RodFormulation
+from magnetosuture_thread.model.formulations.step import StepBuffers, program_of
+from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.program import as_quadratic_program
+from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from test.model.estimator.threads import (
+    RATE,
+    estimator_of,
+    piece_of,
+    poses,
+    predictor_of,
+    thread_of,
+    true_shapes,
+    whole,
+)
+
+KINDS_BY_NAME = {kind.name: kind for kinds in KINDS.values() for kind in kinds}
+ALL = tuple(KINDS)
+
+
+def learner(thread: Thread, *names: str) -> ThreadEstimator:
+    return estimator_of(thread, options=EstimatorOptions(slow_parameters=names))
+
+
+def changed(thread: Thread, **factors: float) -> Thread:
+    """Return a thread with parameters times a factor, or more by a sum where they may be 0."""
+    for name, by in factors.items():
+        kind = KINDS_BY_NAME[name]
+        thread = kind.write(thread, kind.read(thread) * by if kind.logarithmic else kind.read(thread) + by)
+    return thread
+
+
+def play(estimator: ThreadEstimator, way: list[NeedlePose], shapes: np.ndarray) -> list[ThreadEstimate]:
+    first = estimator.start_observed(way[0], whole(shapes[0], 0))
+    return [first, *(estimator.step(way[k], whole(shapes[k], k)) for k in range(1, len(way)))]
+
+
+def resting(count: int) -> list[NeedlePose]:
+    return [NeedlePose(k / RATE, np.zeros(2), np.array([1.0, 0.0])) for k in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("names", "truth"),
+    [
+        (("stiffness_over_drag",), {"stiffness_over_drag": 5.0}),
+        (("stiffness_over_drag",), {"stiffness_over_drag": 0.2}),
+        (("drag_anisotropy",), {"drag_anisotropy": 1.5}),
+        (("rest_curvature",), {"rest_curvature": 50.0}),
+        (("flow",), {"flow_x": 6e-4, "flow_y": -8e-4}),
+        (("flow", "stiffness_over_drag"), {"stiffness_over_drag": 5.0, "flow_x": 1e-3}),
+        (("stiffness_over_drag", "drag_anisotropy"), {"stiffness_over_drag": 0.2, "drag_anisotropy": 1.5}),
+    ],
+)
+def test_a_wrong_parameter_is_found_within_its_interval(names: tuple[str, ...], truth: dict[str, float]) -> None:
+    told, way = thread_of(material="polyamide_7_0"), poses(300)
+    real = changed(told, **truth)
+    estimates = play(learner(told, *names), way, true_shapes(real, way))
+    for each in estimates[-1].slow_parameters:
+        kind = KINDS_BY_NAME[each.name]
+        assert each.low <= kind.read(real) <= each.high, each
+        assert each.excited
+        assert kind.to_x(each.high) - kind.to_x(each.low) < 0.2 * (2.0 * NORMAL_95 * kind.deviation(told))
+    off = np.array([found.positions for found in estimates]) - true_shapes(real, way)
+    assert np.abs(off[60:]).max() < 3e-5
+
+
+def test_without_excitation_value_and_interval_are_frozen() -> None:
+    """A thread that lies straight behind a needle at rest says nothing about stiffness and drag."""
+    thread, way = thread_of(), resting(120)
+    estimates = play(learner(thread, "stiffness_over_drag", "drag_anisotropy"), way, true_shapes(thread, way))
+    for each in estimates[1:]:
+        assert each.slow_parameters == estimates[0].slow_parameters
+    assert not any(each.excited for each in estimates[-1].slow_parameters)
+
+
+def test_what_was_learned_stays_when_the_needle_rests() -> None:
+    told, way = thread_of(material="polyamide_7_0"), poses(150)
+    way += [replace(way[-1], stamp=way[-1].stamp + k / RATE) for k in range(1, 400)]
+    estimates = play(
+        learner(told, "stiffness_over_drag"), way, true_shapes(changed(told, stiffness_over_drag=3.0), way)
+    )
+    quiet = [each.slow_parameters for each in estimates[-100:]]
+    assert all(each == quiet[0] for each in quiet)
+    assert not quiet[0][0].excited
+    assert quiet[0][0].value == pytest.approx(3.0 * told.bending_stiffness / told.medium.drag_across, rel=0.02)
+
+
+def test_nothing_changes_where_nothing_is_learned() -> None:
+    """Neither the steps that give the derivatives, nor the first correction, leave a trace in the estimate."""
+    thread, way = thread_of(), resting(40)
+    shapes = true_shapes(thread, way)
+    off, on = play(learner(thread), way, shapes), play(learner(thread, "stiffness_over_drag"), way, shapes)
+    for one, other in zip(off, on, strict=True):
+        np.testing.assert_array_equal(one.positions, other.positions)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert off[-1].slow_parameters == ()
+
+
+def test_without_observations_the_estimate_is_the_prediction_to_the_last_bit() -> None:
+    thread, way = thread_of(), poses(60)
+    estimator, predictor = learner(thread, *ALL), predictor_of(thread)
+    estimator.start(way[0])
+    predictor.start(way[0])
+    for pose in way[1:]:
+        np.testing.assert_array_equal(estimator.step(pose).positions, predictor.step(pose).positions)
+
+
+def test_late_frames_give_what_frames_in_time_give() -> None:
+    told, way = thread_of(), poses(60)
+    shapes = true_shapes(changed(told, stiffness_over_drag=5.0), way)
+    sessions = [EstimatorSession(learner(told, "stiffness_over_drag", "flow")) for _ in range(2)]
+    for k, pose in enumerate(way):
+        sessions[0].on_observation(pose.stamp, whole(shapes[k], k))
+        in_time = sessions[0].on_pose(pose)
+        late = sessions[1].on_pose(pose)
+        if k == 0:
+            late = sessions[1].on_observation(pose.stamp, whole(shapes[k], k))
+        elif k % 5 == 4:
+            for j in range(k - 4 or 1, k + 1):
+                late = sessions[1].on_observation(way[j].stamp, whole(shapes[j], j))
+    assert in_time.estimate is not None
+    assert late.estimate is not None
+    np.testing.assert_array_equal(in_time.estimate.positions, late.estimate.positions)
+    assert in_time.estimate.slow_parameters == late.estimate.slow_parameters
+
+
+def test_no_data_leads_beyond_the_bounds() -> None:
+    """Pieces that no thread could make, in any order, at any distance."""
+    thread, rng = thread_of(), np.random.default_rng(5)
+    estimator, way = learner(thread, *ALL), poses(120, speed=5e-3)
+    shapes = true_shapes(thread, way)
+    estimator.start(way[0])
+    for k, pose in enumerate(way[1:], 1):
+        scale = 10.0 ** rng.uniform(-5.0, -1.0)
+        wild = shapes[k] + scale * rng.normal(0.0, 1.0, (1, 2)) + 0.3 * scale * rng.normal(0.0, 1.0, shapes[k].shape)
+        wild[rng.random(len(wild)) < 0.05] = rng.choice([np.nan, np.inf, 1e9])
+        piece = ThreadPiece(wild, np.full(len(wild), 1e-7), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0))
+        for each in estimator.step(pose, ThreadObservation((piece,), True)).slow_parameters:
+            low, high = KINDS_BY_NAME[each.name].bounds(thread)
+            assert low <= each.low <= each.value <= each.high <= high
+
+
+def test_sensitivities_information_and_score_are_those_of_a_dense_filter() -> None:
+    thread, rng = thread_of(12), np.random.default_rng(7)
+    predictor = predictor_of(thread)
+    formulation = predictor.formulation
+    assert isinstance(formulation, RodFormulation)
+    nodes, unit = 13, thread.segment_length
+    turns = np.concatenate([[0.3], rng.normal(0.0, 0.1, nodes - 2)]).cumsum()
+    start = np.vstack([np.zeros(2), np.column_stack([np.cos(turns), np.sin(turns)]).cumsum(axis=0)])
+    place = np.sort(rng.uniform(0.2, nodes - 1.0, 40))
+    points = MeasuredPoints(place, rng.normal(0.0, 1e-5, 40), rng.uniform(1e-4, 1e-3, 40), rng.uniform(0.3, 1.0, 40))
+    density, noise, length = rng.uniform(0.5e-3, 2e-3, nodes), rng.uniform(0.5e-3, 2e-3, nodes), 1.3
+    corrector, weights = Corrector(predictor, formulation, length), np.ones(40)
+    done = corrector.solve(start, np.array([-1.0, 0.0]), density, noise, points, weights, (0.0, np.inf))
+    assert done.solved
+    moved = rng.normal(0.0, 1.0, (2, nodes, 2))
+    moved[:, 0] = 0.0
+    found = corrector.sensitivities(moved)
+    # The chain's chords are not quite those of its arcs, which moves it without innovations too.
+    without = points._replace(innovation=np.zeros(40))
+    corrector.solve(start, np.array([-1.0, 0.0]), density, noise, without, weights.copy(), (0.0, np.inf))
+    score = found.score - corrector.sensitivities(moved).score
+
+    normals, buffers, known = np.zeros((nodes, 2)), StepBuffers.of(nodes, 2, 1, 2), np.zeros(nodes, dtype=np.bool_)
+    normals_of(start, normals)
+    stiffness = thread.bending_stiffness / (thread.medium.drag_across * unit**4)
+    scale = max((1.0 / density[1:]).max(), (points.share / points.variance).max())
+    prior_information(density, noise, length, stiffness, scale, False, normals, buffers)
+    upper = as_quadratic_program(program_of(buffers, known, 0)).P.toarray()[: 2 * nodes, : 2 * nodes]
+    prior = scale * (upper + upper.T - np.diag(np.diag(upper)))
+    for i in range(nodes - 1):  # chords that do not change
+        row = np.zeros(2 * nodes)
+        along = start[i + 1] - start[i]
+        row[2 * i : 2 * i + 2], row[2 * i + 2 : 2 * i + 4] = -along, along
+        prior += 1e9 * np.outer(row, row)
+    measured = np.zeros((40, 2 * nodes))
+    for p, at in enumerate(place):
+        i = min(int(at), nodes - 2)
+        along = start[i + 1] - start[i]
+        normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+        measured[p, 2 * i : 2 * i + 2], measured[p, 2 * i + 2 : 2 * i + 4] = (1 - at + i) * normal, (at - i) * normal
+    covariance = np.zeros((2 * nodes, 2 * nodes))
+    covariance[2:, 2:] = np.linalg.inv(prior[2:, 2:])
+    of_innovations = measured @ covariance @ measured.T + np.diag(points.variance / (weights * points.share))
+    by = measured @ moved.reshape(2, -1).T
+    gained = np.linalg.solve(of_innovations, by)
+    np.testing.assert_allclose(found.information, by.T @ gained, rtol=2e-3)
+    np.testing.assert_allclose(score, gained.T @ points.innovation, rtol=2e-3, atol=2e-3 * np.abs(score).max())
+    corrected = moved.reshape(2, -1).T - covariance @ measured.T @ gained
+    np.testing.assert_allclose(found.corrected.reshape(2, -1).T, corrected, atol=2e-3)
+
+
+def test_unknown_parameters_and_threads_without_drag_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="slow_parameters"):
+        EstimatorOptions(slow_parameters=("viscosity",))
+    thread = thread_of()
+    with pytest.raises(ConfigurationError, match="without stiffness or drag"):
+        learner(replace(thread, bending_stiffness=0.0), "stiffness_over_drag")
+
+
+def test_a_thread_half_hidden_is_learned_from_what_is_measured() -> None:
+    told, way = thread_of(material="polyamide_7_0"), poses(240)
+    real = changed(told, stiffness_over_drag=5.0)
+    shapes = true_shapes(real, way)
+    estimator = learner(told, "stiffness_over_drag")
+    estimate = estimator.start_observed(way[0], whole(shapes[0], 0))
+    for k in range(1, len(way)):
+        estimate = estimator.step(way[k], ThreadObservation((piece_of(shapes[k], k, 0.0, 0.5 * told.length),), False))
+    (found,) = estimate.slow_parameters
+    assert found.low <= KINDS_BY_NAME[found.name].read(real) <= found.high
+    assert np.abs(estimate.positions - shapes[-1]).max() < 1e-4
