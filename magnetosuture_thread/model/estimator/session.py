@@ -81,6 +81,8 @@ class EstimatorSession:
             return
         moment = other._moments[-1]
         state = kept.resampled(before.thread, now.thread, now.options)
+        if (before.thread, before.options.slow_parameters) != (now.thread, now.options.slow_parameters):
+            state = replace(state, slow=now.learned)  # of a thread of which something else is told
         prediction = _carried_over(state, now.predictor)
         # What was learned of another thread, or of other parameters, says nothing of this one; and the multipliers of
         # other rows are no warm start.
