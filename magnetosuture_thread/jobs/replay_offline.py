@@ -111,7 +111,7 @@ def replay_offline(
                     metrics.add(frame)
                 elif step.result.problem is not None:
                     refused[_kind(step.result.problem)] += 1
-                elif step.result.late and step.result.estimate_problem is not None:
+                if step.result.estimate_problem is not None and step.result.problem is None:
                     refused[_kind(step.result.estimate_problem)] += 1
             speed = given.duration / (time.perf_counter() - began)
         log(f"{speed:.3g} times as fast as it was recorded; evaluating the outputs")

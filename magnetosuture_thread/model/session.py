@@ -282,7 +282,7 @@ class ThreadSession:
             self._estimate_motion.update(found.estimate.positions, found.estimate.prediction.interval)
             changed = {stamp: found.measured, self._last_pose: found.estimate}
             self._late_estimates += [self._late(at, estimate) for at, estimate in changed.items()]
-        if found.problem is not None:
+        if found.problem is not None and not found.waits:
             self._late_estimates.append(replace(self._late(stamp, None), estimate_problem=found.problem))
 
     def _late(self, stamp: int, estimate: ThreadEstimate | None) -> PredictionResult:
@@ -327,8 +327,9 @@ class ThreadSession:
         speeds = self._estimate_motion.update(found.estimate.positions, found.estimate.prediction.interval)
         self._measured = math.isfinite(found.estimate.unmeasured_for)
         if not self._measured:
-            return result
-        return replace(result, estimate=found.estimate, law=self.settings.friction_law(), speeds=speeds)
+            return replace(result, estimate_problem=found.problem)
+        law = self.settings.friction_law()
+        return replace(result, estimate=found.estimate, estimate_problem=found.problem, law=law, speeds=speeds)
 
     def predict(self, stamp: int, pose: NeedlePose) -> PredictionResult:
         """Return what the model alone says of a pose; the first half of `on_pose`."""

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from magnetosuture_thread.barrier import load_barriers
-from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity
+from magnetosuture_thread.configuration import configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
+from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimator
+from magnetosuture_thread.model.estimator_settings import EstimatorSettings
 from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
@@ -37,11 +38,10 @@ FIXED = {  # why a node cannot change it
     "barriers": "what is imported when it starts",
     "scene": "what it starts with; the topic scene changes it",
 }
-_OPTIONS = EstimatorOptions()  # their defaults
 
 
 @dataclass(frozen=True)
-class ThreadModelSettings(Configuration):
+class ThreadModelSettings(EstimatorSettings):
     """Parameters of the thread model: thread, liquid and numerical settings; the scene is given apart."""
 
     GROUP: ClassVar[str] = "thread_model"
@@ -184,60 +184,6 @@ class ThreadModelSettings(Configuration):
         False, "whether the 99 % bound of an estimated clearance counts for friction, in place of the clearance"
     )
 
-    estimator: bool = quantity(
-        True, "whether the thread is estimated too: the model corrected by the camera; for rod in liquid"
-    )
-    estimator_error_correlation: float = quantity(
-        _OPTIONS.error_correlation,
-        "distance along the thread over which the model's errors are alike, as a part of its length",
-        minimum=0.01,
-        maximum=1.0,
-    )
-    estimator_point_correlation: float = quantity(
-        _OPTIONS.point_correlation,
-        "distance along the thread over which the errors of measured points are alike",
-        unit="m",
-        minimum=1e-6,
-        maximum=0.1,
-    )
-    estimator_min_deviation: float = quantity(
-        _OPTIONS.min_deviation,
-        "standard deviation of a measured point, at the least",
-        unit="m",
-        minimum=1e-7,
-        maximum=0.01,
-    )
-    estimator_path_deviation: float = quantity(
-        2e-5,
-        "standard deviation of the points of thread/measured, used where nobody publishes thread/observation",
-        unit="m",
-        minimum=1e-7,
-        maximum=0.01,
-    )
-    estimator_noise_time: float = quantity(
-        _OPTIONS.noise_time,
-        "time over which it is learned by how much the model errs",
-        unit="s",
-        minimum=0.05,
-        maximum=100.0,
-    )
-    estimator_initial_error: float = quantity(
-        _OPTIONS.initial_error,
-        "standard deviation of the free end before it is measured, as a part of the thread's length",
-        minimum=1e-3,
-        maximum=2.0,
-    )
-    estimator_disturbance_time: float = quantity(
-        _OPTIONS.disturbance_time,
-        "averaging time of the test for forces that the model does not know",
-        unit="s",
-        minimum=0.05,
-        maximum=10.0,
-    )
-    estimator_history: float = quantity(
-        _OPTIONS.history, "how late an observation of the thread may come", unit="s", minimum=0.05, maximum=5.0
-    )
-
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
         if self.friction_threshold > self.margin_range:
@@ -276,6 +222,7 @@ class ThreadModelSettings(Configuration):
         for node in self.fixed_nodes:
             if node > segments:
                 raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {segments}")
+        self.estimator_options()
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]
@@ -357,8 +304,7 @@ class ThreadModelSettings(Configuration):
         """
         if not self.is_estimated:
             return None
-        options = {about.name: getattr(self, f"estimator_{about.name}") for about in fields(EstimatorOptions)}
-        estimator = ThreadEstimator(self.predictor(scene), EstimatorOptions(**options))
+        estimator = ThreadEstimator(self.predictor(scene), self.estimator_options())
         estimator.warm_up()
         return EstimatorSession(estimator)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.configuration import from_mapping
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.predictor import NeedlePose
@@ -151,11 +151,16 @@ def test_observations_that_cannot_be_used_leave_the_estimate_with_a_reason():
     session = ThreadSession(made(), None)
     follow(session, 0, 20)
     last = stamp_of(WAY[19])
-    for stamp in (last, last + 60_000_000_000, last - 60_000_000_000):  # doubled, of the future, of long ago
+    for stamp in (last, last - 60_000_000_000):  # doubled, of long ago
         assert not list(session.on_observation(stamp, whole(NODES[19], 19)))
         (refused,) = session.late_estimates()
         assert isinstance(refused.estimate_problem, InvalidInputError)
         assert (refused.late, refused.waiting, refused.margins) == (True, False, None)
+    assert not list(session.on_observation(last + 60_000_000_000, whole(NODES[19], 19)))
+    assert not session.late_estimates()  # poses may have come to a stop; the next one says that they have not
+    future = session.on_pose(last + 1_000_000, replace(WAY[19], stamp=(last + 1_000_000) * 1e-9))
+    assert isinstance(future.estimate_problem, InvalidInputError)
+    assert future.estimate is not None
     good = piece_of(NODES[20], 20)
     bad = {
         "not finite": replace(good, points=np.full_like(good.points, math.nan)),
@@ -177,6 +182,17 @@ def test_observations_that_cannot_be_used_leave_the_estimate_with_a_reason():
     assert session.on_pose(stamp_of(WAY[22]), at(WAY[22])).estimate is not None
     found = estimated(follow(session, 23, 45)[-1])
     assert error_percent(found.positions, NODES[-1]) < 0.1
+
+
+def test_the_first_frame_after_a_long_pause_is_estimated():
+    session = ThreadSession(made(), None)
+    follow(session, 0, 5)
+    stamp = stamp_of(WAY[5]) + 20_000_000_000
+    assert not list(session.on_observation(stamp, whole(NODES[5], 5)))
+    assert not session.late_estimates()
+    estimate = estimated(session.on_pose(stamp, replace(WAY[5], stamp=stamp * 1e-9)))
+    assert estimate.corrected
+    assert error_percent(estimate.positions, NODES[5]) < 0.2
 
 
 def test_time_that_is_set_back_begins_the_estimate_anew():
@@ -206,6 +222,25 @@ def test_other_settings_keep_the_estimate(values: dict[str, Any]):
     assert (
         error_percent(estimated(follow(session, 31, 45)[-1]).positions[-1:], NODES[-1, -1:]) < 0.8
     )  # the longer thread is 0.5 % longer
+
+
+def test_what_is_learned_of_the_thread_is_kept_in_another_scene_and_not_of_another_thread():
+    session = ThreadSession(made(estimator_slow_parameters=["stiffness_over_drag"]), None)
+    before = estimated(follow(session, 0, 30)[-1])
+    session.change(session.settings, scene_with(Disc((0.05, 0.05), 1e-3)))
+    kept = estimated(follow(session, 30, 31)[-1])
+    assert kept.slow_parameters[0].value == pytest.approx(before.slow_parameters[0].value, rel=0.05)
+    told = session.thread.bending_stiffness / session.thread.medium.drag_across
+    assert abs(kept.slow_parameters[0].value / told - 1.0) > 0.1
+    session.change(replace(session.settings, viscosity=1.7), session.scene)
+    anew = estimated(session.on_pose(stamp_of(WAY[31]), at(WAY[31])))
+    told = session.thread.bending_stiffness / session.thread.medium.drag_across
+    assert anew.slow_parameters[0].value == pytest.approx(told, rel=1e-6)
+
+
+def test_a_slow_parameter_that_is_none_is_refused():
+    with pytest.raises(ConfigurationError, match=r"thread_model\.estimator_slow_parameters.*stiffness_over_drag"):
+        made(estimator_slow_parameters=["length"])
 
 
 def test_a_scene_that_appears_pushes_the_estimate_out():

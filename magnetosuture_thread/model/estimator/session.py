@@ -37,12 +37,14 @@ class EstimationResult:
     Attributes:
         estimate: at the last pose; None before the thread has a shape, or where a step was not solved.
         measured: at the observation's own stamp, where that came late; else the same as `estimate`.
-        problem: why there is no estimate, or why the observation was refused; None if nothing is wrong.
+        problem: why there is no estimate, or why an observation was refused; None if nothing is wrong.
+        waits: whether the observation waits for the pose of its frame.
     """
 
     estimate: ThreadEstimate | None
     measured: ThreadEstimate | None = field(default=None, repr=False)
     problem: InvalidInputError | SolverError | None = None
+    waits: bool = False
 
 
 class EstimatorSession:
@@ -79,6 +81,8 @@ class EstimatorSession:
             return
         moment = other._moments[-1]
         state = kept.resampled(before.thread, now.thread, now.options)
+        if (before.thread, before.options.slow_parameters) != (now.thread, now.options.slow_parameters):
+            state = replace(state, slow=now.learned)  # of a thread of which something else is told
         prediction = _carried_over(state, now.predictor)
         # What was learned of another thread, or of other parameters, says nothing of this one; and the multipliers of
         # other rows are no warm start.
@@ -109,25 +113,28 @@ class EstimatorSession:
         self._moments.append(moment)
         while self._moments[0].pose.stamp < pose.stamp - self._estimator.options.history:
             self._moments.popleft()
-        self._early = {stamp: early for stamp, early in self._early.items() if stamp > pose.stamp}
-        return EstimationResult(estimate, estimate)
+        latest = pose.stamp + self._estimator.options.history
+        problem = self._too_early(max(self._early)).problem if any(stamp > latest for stamp in self._early) else None
+        self._early = {stamp: early for stamp, early in self._early.items() if pose.stamp < stamp <= latest}
+        return EstimationResult(estimate, estimate, problem)
 
     def on_observation(self, stamp: float, observation: ThreadObservation) -> EstimationResult:
         """Take what a frame shows of the thread, at the pose of that frame.
 
-        An observation of a frame whose pose has not come yet waits for it. One that is older than what is kept, of a
-        frame without a pose, or of one that was observed already, is refused.
+        An observation of a frame whose pose has not come yet waits for it. One that is of long after the last pose is a
+        problem, but waits too, as poses may have come to a stop; it is refused once a pose says that they have not. One
+        that is older than what is kept, of a frame without a pose, or of one that was observed already, is refused.
         """
         if not np.isfinite(stamp):
             return self._refused(stamp, "a finite time [s]")
         last = self._moments[-1].pose.stamp if self._moments else -np.inf
         if stamp > last:
-            if self._moments and stamp > last + self._estimator.options.history:
-                return self._refused(stamp, f"at most {self._estimator.options.history:g} s after the last pose")
             self._early[stamp] = observation
             while len(self._early) > MAX_POSES:
                 del self._early[min(self._early)]
-            return EstimationResult(None)
+            if self._moments and stamp > last + self._estimator.options.history:
+                return self._too_early(stamp)
+            return EstimationResult(None, waits=True)
         index = next((k for k, moment in enumerate(self._moments) if moment.pose.stamp == stamp), None)
         if index is None:
             return self._refused(stamp, "the stamp of a pose that is kept")
@@ -171,6 +178,10 @@ class EstimatorSession:
             estimate = self._estimator.step(moment.pose, moment.observation)
         moment.after = self._estimator.snapshot()
         return estimate
+
+    def _too_early(self, stamp: float) -> EstimationResult:
+        expected = f"at most {self._estimator.options.history:g} s after the last pose"
+        return replace(self._refused(stamp, expected), waits=True)
 
     def _refused(self, stamp: float, expected: str) -> EstimationResult:
         return EstimationResult(None, problem=InvalidInputError("thread observation stamp", stamp, expected))
