@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
     from magnetosuture_thread.jobs.calibrate import calibrate_bags
     from magnetosuture_thread.jobs.replay_offline import replay_offline
+    from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
     from magnetosuture_thread.model.margins import BarrierMargins, Margins
     from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
     from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
@@ -26,6 +27,7 @@ _HOME = {
     "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
     "jobs.calibrate": ("calibrate_bags",),
     "jobs.replay_offline": ("replay_offline",),
+    "model.estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
     "model.margins": ("BarrierMargins", "Margins"),
     "model.predictor": ("NeedlePose", "Prediction", "ThreadPredictor"),
     "model.thread": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
@@ -42,6 +44,8 @@ __all__ = [
     "ConfigurationError",
     "Disc",
     "Dish",
+    "EstimatorOptions",
+    "EstimatorSession",
     "FilteredCommand",
     "Gradient",
     "InvalidInputError",
@@ -58,6 +62,8 @@ __all__ = [
     "SceneShape",
     "SolverError",
     "Thread",
+    "ThreadEstimate",
+    "ThreadEstimator",
     "ThreadPredictor",
     "Workspace",
     "calibrate_bags",

@@ -123,10 +123,10 @@ def margins_of(message: Any) -> Margins:
             (message.obstacle, np.int32),
             (message.value, np.float64),
             (message.clearance, np.float64),
-            # Bags that are older than the estimate hold none.
-            (getattr(message, "clearance_bound", np.full(len(row), -np.inf)), np.float64),
         )
     ]
+    bound = np.asarray(getattr(message, "clearance_bound", ()), np.float64)  # older bags have none
+    columns.append(bound if len(bound) else np.full(len(row), -np.inf))
     if any(len(column) != len(row) for column in columns) or (len(row) and row.max() >= len(names)):
         found = f"{[len(row), *map(len, columns)]} rows of {len(names)} barriers"
         raise InvalidInputError(MARGINS.name, found, "parallel arrays, each row of a barrier that is named")

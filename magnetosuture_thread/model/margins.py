@@ -75,8 +75,8 @@ class BarrierMargins:
         value: h, safe at >= 0, shape (m,); [m] for an obstacle and the wall, [m^4] for stiffness, [m^2] for
             connectivity and compression, else the barrier's own unit.
         clearance: the same margin as a distance, shape (m,) [m].
-        bound: the clearance is greater than this with a probability of 99 %, shape (m,) [m]; -inf where nothing is known
-            of the thread's covariance.
+        bound: the clearance is greater than this with a probability of 99 %, shape (m,) [m]; -inf where the thread's
+            covariance is not known.
     """
 
     barrier: str
@@ -84,11 +84,11 @@ class BarrierMargins:
     obstacle: NDArray[np.int32]
     value: NDArray[np.float64]
     clearance: NDArray[np.float64]
-    bound: NDArray[np.float64] = field(default=None)  # type: ignore[assignment]  # -inf
+    bound: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        """Without a bound there is none."""
-        if self.bound is None:
+        """Take no bound as one that is not known."""
+        if not len(self.bound):
             object.__setattr__(self, "bound", np.full(len(self.clearance), -np.inf))
 
     def __len__(self) -> int:

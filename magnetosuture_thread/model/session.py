@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -161,6 +162,7 @@ class ThreadSession:
         self._last: int | None = None
         self._initial_observation = InitialObservation()
         self._motion, self._estimate_motion = settings.node_motion(), settings.node_motion()
+        self._motion_before = self._estimate_motion  # the estimate's, before its last pose
 
     @property
     def thread(self) -> Thread:
@@ -184,16 +186,18 @@ class ThreadSession:
         if settings == self.settings and scene == self.scene:
             return lambda: None
         predictor, estimator = settings.predictor(scene), settings.estimator_session(scene)
-        motion, estimate_motion = settings.node_motion(), settings.node_motion()
+        motion, estimate_motion, motion_before = (settings.node_motion() for _ in range(3))
 
         def put_in_force() -> None:
             predictor.follow_on(self._predictor)
             motion.follow_on(self._motion)
             estimate_motion.follow_on(self._estimate_motion)
+            motion_before.follow_on(self._motion_before)
             if estimator is not None and self._estimator is not None:
                 estimator.follow_on(self._estimator)
             self.settings, self.scene, self._predictor, self._motion = settings, scene, predictor, motion
             self._estimator, self._estimate_motion = estimator, estimate_motion
+            self._motion_before = motion_before
             self._measured = self._measured and estimator is not None
 
         return put_in_force
@@ -273,6 +277,9 @@ class ThreadSession:
         found = self._estimator.on_observation(stamp * 1e-9, self.settings.attached_observation(observation))
         if found.measured is not None and found.estimate is not None and self._last_pose is not None:
             self._measured = self._measured or math.isfinite(found.estimate.unmeasured_for)
+            # As if the observation had come before the last pose.
+            self._estimate_motion = copy(self._motion_before)
+            self._estimate_motion.update(found.estimate.positions, found.estimate.prediction.interval)
             changed = {stamp: found.measured, self._last_pose: found.estimate}
             self._late_estimates += [self._late(at, estimate) for at, estimate in changed.items()]
         if found.problem is not None:
@@ -316,6 +323,7 @@ class ThreadSession:
         if found.estimate is None:
             return replace(result, estimate_problem=found.problem)
         self._last_pose = result.stamp
+        self._motion_before = copy(self._estimate_motion)
         speeds = self._estimate_motion.update(found.estimate.positions, found.estimate.prediction.interval)
         self._measured = math.isfinite(found.estimate.unmeasured_for)
         if not self._measured:

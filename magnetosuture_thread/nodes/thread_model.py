@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,64 +11,22 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene
-from magnetosuture_thread.configuration import configuration_fields
+from magnetosuture_thread import InvalidInputError, NeedlePose, Scene
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp, time_of
 from magnetosuture_thread.messages.markers import packed_markers
 from magnetosuture_thread.messages.packing import packed_estimate, packed_margins, packed_prediction
-from magnetosuture_thread.model.estimator import ThreadEstimate
-from magnetosuture_thread.model.predictor import STARTED
-from magnetosuture_thread.model.program import SOLVED
-from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
-from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings, parse_material
+from magnetosuture_thread.model.session import PredictionResult, ThreadSession
+from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import Changeable, declare
+from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.nodes.thread_health import ThreadHealth
+from magnetosuture_thread.nodes.thread_settings import ThreadSettings
 from magnetosuture_thread.thread_observation import ThreadObservation
-
-UNMEASURED_TOO_LONG = 1.0  # s; an estimate that is only a prediction for longer is a warning
-
-
-class ThreadSettings:
-    """Changes a session's settings by the node's parameters.
-
-    A message becomes parameters, so that these always tell what is in force, and there is one way to refuse.
-
-    Args:
-        node: has the session's settings declared as its parameters.
-        session: whose settings they are.
-        health: where a message is said to be refused; who calls a service is told.
-    """
-
-    def __init__(self, node: PackageNode, session: ThreadSession, health: Health) -> None:
-        self._node, self._session, self._health = node, session, health
-        self._names = [about.name for about in configuration_fields(ThreadModelSettings)]
-        self._parameters = Changeable(node, session.settings, self._prepare)
-        topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
-
-    def on_material(self, data: bytes) -> None:
-        """Apply a ThreadMaterial message, or report why it is refused."""
-        try:
-            self._parameters.set(parse_material(topics.MATERIAL.decode(data)))
-        except MagnetosutureError as error:
-            self._health.refuse(error)
-
-    def _prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
-        put_in_force = self._session.prepare(settings, self._session.scene)
-
-        def change() -> None:
-            before = self._session.settings
-            put_in_force()
-            changed = [name for name in self._names if getattr(settings, name) != getattr(before, name)]
-            if changed:
-                self._node.get_logger().info(f"changed: {', '.join(changed)}")
-
-        return change
 
 
 class ThreadModelNode(PackageNode):
@@ -88,16 +45,14 @@ class ThreadModelNode(PackageNode):
         scene = initial_scene(settings.scene)
         self._session = ThreadSession(settings, scene)
         self._scene = SceneFollower(self, self.health, scene, self.on_scene)
+        self._states = ThreadHealth(self.health)
         self._settings = ThreadSettings(self, self._session, self.health)
         self._predicted = topics.PREDICTED_THREAD.publisher(self)
         self._estimated = topics.ESTIMATED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         self._observed = False
-        self._waiting = True  # for a thread from which the prediction can start
         self._last_margins = 0  # stamp of those that were published [ns]
-        self._disturbance: tuple[float, str] | None = None  # when it was put into words [s], and these
-        self._refused_pieces = 0
         if listens:
             self.listen()
         self.health.warn("no needle pose yet")
@@ -192,7 +147,7 @@ class ThreadModelNode(PackageNode):
             self._estimated.publish(packed_estimate(time_of(result.stamp), result.estimate))
         if result.stamp >= self._last_margins or not result.late:  # those of an earlier frame are of no use any more
             self._publish_margins(result)
-        self._show_health(result, step_time)
+        self._states.show(result, step_time)
 
     def _publish_margins(self, result: PredictionResult) -> None:
         if result.late and result.estimate is None:
@@ -204,60 +159,6 @@ class ThreadModelNode(PackageNode):
         if self._markers.get_subscription_count() and (result.prediction or result.estimate):
             diameter = self._session.thread.diameter
             self._markers.publish(packed_markers(when, result.prediction, margins, diameter, result.estimate))
-
-    def _show_health(self, result: PredictionResult, step_time: float) -> None:
-        if isinstance(result.estimate_problem, InvalidInputError):
-            self.health.refuse(result.estimate_problem)
-            return
-        prediction, estimate = result.prediction, result.estimate
-        self._waiting = self._waiting if result.late else result.waiting
-        figures: dict[str, object] = {}
-        if prediction is not None:
-            figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
-        if estimate is not None:
-            figures |= self._estimate_figures(estimate)
-        if result.problem is not None:
-            self.health.error(str(result.problem), **figures)
-        elif self._waiting:
-            self.health.warn(WAITING if estimate is None else f"estimating; the prediction is {WAITING}", **figures)
-        elif trouble := self._troubles(result):
-            self.health.warn(f"predicting, but {'; '.join(trouble)}", **figures)
-        else:
-            self.health.ok("predicting", **figures)
-
-    def _troubles(self, result: PredictionResult) -> list[str]:
-        """Return what is wrong with prediction and estimate; figures in it change once a second at the most."""
-        found, prediction, estimate = [], result.prediction, result.estimate
-        if prediction is not None and prediction.status not in (SOLVED, STARTED):
-            found.append(prediction.status)
-        if result.estimate_problem is not None:
-            found.append(f"not estimating: {result.estimate_problem}")
-        if estimate is None:
-            return found
-        if not estimate.converged:
-            found.append(result.reason)
-        if estimate.disturbances:
-            if not self._disturbance or abs(estimate.stamp - self._disturbance[0]) >= 1.0:
-                self._disturbance = (estimate.stamp, "; ".join(map(str, estimate.disturbances)))
-            found.append(self._disturbance[1])
-        else:
-            self._disturbance = None
-        if estimate.unmeasured_for >= UNMEASURED_TOO_LONG:
-            why = f" ({estimate.problems[0]})" if estimate.problems else ""
-            found.append(f"the estimate is only a prediction since {math.floor(estimate.unmeasured_for)} s{why}")
-        return found
-
-    def _estimate_figures(self, estimate: ThreadEstimate) -> dict[str, object]:
-        self._refused_pieces += len(estimate.problems)
-        deviation = 1e3 * float(estimate.deviation.max())
-        figures: dict[str, object] = {
-            "measured": f"{100.0 * (1.0 - estimate.hidden):.0f} %",
-            "deviation": f"{deviation:.3f} mm",
-            "refused_pieces": self._refused_pieces,
-        }
-        if estimate.problems:
-            figures["last_refused_piece"] = estimate.problems[0]
-        return figures
 
 
 def main(arguments: list[str] | None = None) -> int:

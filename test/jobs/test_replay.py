@@ -31,6 +31,7 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.interface import (
+    ESTIMATED_THREAD,
     IMAGE,
     MARGINS,
     MEASURED_THREAD,
@@ -116,20 +117,24 @@ def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
     agree(tmp_path / "out", tmp_path / "offline", predictions=28)
 
 
+COMPARED = (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION, PREDICTED_THREAD, ESTIMATED_THREAD, MARGINS)
+
+
 def agree(live: Path, offline: Path, predictions: int) -> None:
     """Check that both replays made the same of a bag, to the last bit; but for the times that steps took."""
     made = [content(live), content(offline)]
-    for channel in (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION, PREDICTED_THREAD, MARGINS):
+    for channel in COMPARED:
         ours, theirs = ({key: what for key, what in each.items() if key[0] == channel} for each in made)
         assert ours == theirs
     assert sum(key[0] == PREDICTED_THREAD for key in made[0]) == predictions
+    assert sum(key[0] == ESTIMATED_THREAD for key in made[0]) >= predictions
 
 
 def content(output: Path) -> dict[tuple[Channel, int], bytes]:
     """Return what a replay said of each stamp, without times and without what waited for the thread to be seen."""
     bag, store = Bag(output / "bag"), typestore()
     found = {}
-    for channel in (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION, PREDICTED_THREAD, MARGINS):
+    for channel in COMPARED:
         for each in bag.records({channel.recorded}):
             message = each.decode()
             if channel == PREDICTED_THREAD:

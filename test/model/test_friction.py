@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,15 @@ def test_who_moves_elsewhere_pulls_nothing():
     assert LAW.classify(barriers(*GATE), speeds) == Friction(FrictionState.STUCK, (3, 4), 1.0)
     speeds[4] = 2.1e-4  # one is enough
     assert LAW.classify(barriers(*GATE), speeds) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
+
+
+def test_the_bound_counts_where_it_is_to_and_where_there_is_one():
+    margins, by_bound = barriers(*GATE), replace(LAW, threshold=0.95e-3, by_bound=True)
+    avoided = margins["obstacle"]
+    assert by_bound.classify(margins, np.ones(8)).nodes == ()
+    bounded = margins.with_bounds({"obstacle": avoided.clearance - 2e-5})
+    assert by_bound.classify(bounded, np.ones(8)).nodes == (3, 4)
+    assert replace(by_bound, by_bound=False).classify(bounded, np.ones(8)).nodes == ()
 
 
 def test_the_threshold_is_of_the_clearance():

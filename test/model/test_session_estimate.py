@@ -130,6 +130,23 @@ def test_late_observations_take_the_place_of_the_estimates_there_were():
         np.testing.assert_array_equal(found[each.stamp].covariance, estimated(each).covariance)
 
 
+def test_friction_is_that_of_observations_in_time():
+    post = (Disc((-0.004, 0.0016), 1e-3), Disc((-0.004, -0.0016), 1e-3))
+    results = []
+    for late in (False, True):
+        session = ThreadSession(made(friction_threshold=1.2e-3), scene_with(*post))
+        for k in range(20):
+            if not late:
+                show(session, k)
+            result = session.on_pose(stamp_of(WAY[k]), at(WAY[k]))
+            if late:
+                result = show(session, k)[-1]
+        assert result.margins is not None
+        assert result.margins.friction.nodes
+        results.append((result.margins.friction, result.speeds.tolist()))
+    assert results[0] == results[1]
+
+
 def test_observations_that_cannot_be_used_leave_the_estimate_with_a_reason():
     session = ThreadSession(made(), None)
     follow(session, 0, 20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,15 @@ import pytest
 import shapely
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, Vector3
 from magnetosuture_msgs.msg import (
     BarrierMargin,
     CoilBridgeState,
+    EstimatedThread,
     FilterState,
     PredictedThread,
     SafetyMargins,
+    ThreadDisturbance,
     TrackerState,
 )
 
@@ -70,6 +73,43 @@ def test_the_threads():
         "step_time": 1e-4,
         "status": "solved",
     }
+
+
+def test_the_estimated_thread():
+    found = ThreadDisturbance(arc_length=0.031, force=2e-4, position=Point(x=0.3), direction=Vector3(x=-1.0))
+    message = EstimatedThread(
+        positions=[Point(x=0.1, y=0.2)], deviation=[1e-5], unmeasured_for=0.5, prediction_only=True, hidden=1.0
+    )
+    message.disturbances = [found]
+    assert plain(messages.estimated(message)) == {
+        "vertices": [[0.1, 0.2]],
+        "deviation": [1e-5],
+        "prediction_only": True,
+        "unmeasured_for": 0.5,
+        "hidden": 1.0,
+        "disturbances": [
+            {
+                "position": [0.3, 0.0],
+                "direction": [-1.0, 0.0],
+                "force": 2e-4,
+                "text": "held at 31 mm of the thread: 0.2 mN to the left",
+            }
+        ],
+    }
+    message.deviation = []
+    with pytest.raises(InvalidInputError, match="a deviation for each position"):
+        messages.estimated(message)
+
+
+def test_the_page_is_told_which_thread_the_margins_are_of_and_their_least_bound():
+    message = SafetyMargins(valid=True, source=SafetyMargins.OF_ESTIMATE)
+    message.minimum = [BarrierMargin(barrier="wall", clearance_bound=b) for b in (3e-4, -math.inf, 2e-4)]
+    told = plain(messages.margins(message))
+    assert (told["of"], told["bound"]) == ("estimate", 2e-4)
+    message = SafetyMargins(valid=True, source=SafetyMargins.OF_PREDICTION)
+    message.minimum = [BarrierMargin(barrier="wall", clearance_bound=-math.inf)]
+    told = plain(messages.margins(message))
+    assert (told["of"], told["bound"]) == ("prediction", None)
 
 
 def test_of_each_node_the_least_clearance_of_wall_and_shapes():

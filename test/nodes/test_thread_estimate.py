@@ -258,6 +258,6 @@ def test_without_the_estimator_there_is_the_prediction_alone(graph: Any, monkeyp
     for k in range(3):
         bench.observe(k, whole(NODES[k], k))
         bench.pose(k)
-        graph.wait(lambda k=k: len(bench.margins) == k + 1, "margins")  # type: ignore[misc]
+        graph.wait(lambda k=k: len(bench.margins) == k + 1, "margins")
     assert [(each.reason, each.source) for each in bench.margins] == [("", SafetyMargins.OF_PREDICTION)] * 3
     assert not bench.estimated

@@ -101,7 +101,10 @@ _OWN = ("connectivity", "compression", "enhanced_connectivity", "stiffness", OBS
 
 
 def _bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
-    deviation = np.sqrt(np.einsum("rka,rkab,rkb->rk", rows.gradient, covariance[rows.nodes], rows.gradient)).sum(axis=1)
+    if not len(rows.clearance):
+        return rows.clearance
+    spread = np.einsum("rkab,rkb->rka", covariance[rows.nodes], rows.gradient)
+    deviation = np.sqrt(np.maximum(np.einsum("rka,rka->rk", rows.gradient, spread), 0.0)).sum(axis=1)
     slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
     return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
 
