@@ -269,17 +269,19 @@ def compare_errors(series: TimeSeries) -> dict[str, dict[str, float | None]]:
         series: columns of a run.
     """
     return {
-        kind: {
-            f"error_{name}_{figure}_percent": _figure(series, f"{column}error_{target}", np.mean if mean else np.max)
-            for target, name in (("truth", "ground_truth"), ("seen", "measured"))
-            for figure, column, mean in (
-                ("mean", own, True),
-                ("max", own, False),
-                ("max_node", f"max_node_{own}", False),
-            )
-        }
+        kind: {name: _figure(series, column.format(own=own), function) for name, (column, function) in _ERRORS.items()}
         for kind, own in (("prediction", ""), ("estimate", "estimate_"))
     }
+
+
+_ERRORS: dict[str, tuple[str, Callable[[Array], Any]]] = {
+    "error_ground_truth_mean_percent": ("{own}error_truth", np.mean),
+    "error_ground_truth_max_percent": ("{own}error_truth", np.max),
+    "error_ground_truth_max_node_percent": ("max_node_{own}error_truth", np.max),
+    "error_measured_mean_percent": ("{own}error_seen", np.mean),
+    "error_measured_max_percent": ("{own}error_seen", np.max),
+    "error_measured_max_node_percent": ("max_node_{own}error_seen", np.max),
+}
 
 
 def _figure(series: TimeSeries, name: str, function: Callable[[Array], Any]) -> float | None:

@@ -253,9 +253,8 @@ def _draw_error(axes: Axes, series: TimeSeries) -> None:
 
 def _draw_consistency(axes: Axes, series: TimeSeries) -> None:
     found = Consistency.of(series)
-    axes.set_title(
-        "normalised innovation squared, its mean over 5 s and their 95 % band", fontsize=9.5, color=INK, loc="left"
-    )
+    title = "normalised innovation squared, its mean in windows, and the 95 % band of such means"
+    axes.set_title(title, fontsize=9.5, color=INK, loc="left")
     squared = series.column("innovation_squared")
     axes.plot(series.times, squared, ".", color=FAINT, markersize=2.0, alpha=0.5)
     if found is None:

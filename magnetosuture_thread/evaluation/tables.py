@@ -184,7 +184,7 @@ def bags_table(rows: Sequence[Row]) -> Table:
     if silent:
         total, longest = sum(each for each, _ in silent), max(longest for _, longest in silent)
         table.caption += f";\n{SILENT} without frames for {total:.1f} s in all, {longest:.1f} s at the longest"
-    table.add_column("bag", overflow="fold", min_width=12)
+    table.add_column("bag", overflow="fold", min_width=10)
     for name in ("frames", "ground\ntruth", "max", "measured", "max", "margin", "step"):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
@@ -201,11 +201,11 @@ def bags_table(rows: Sequence[Row]) -> Table:
             _shown(row["step_median_s"], milliseconds),
         )
         errors = [row[f"error_{target}_{which}_percent"] for target in AGAINST for which in ("mean", "max")]
-        table.add_row(Text("  prediction", style="dim"), "", *(_shown(error, format_number) for error in errors))
+        table.add_row(Text(" predicted", style="dim"), "", *(_shown(error, format_number) for error in errors))
     table.add_section()
     found = compared(rows)
     table.add_row("all bags", "", *_errors_shown(found["estimate"]))
-    table.add_row(Text("  prediction", style="dim"), "", *_errors_shown(found["prediction"]))
+    table.add_row(Text(" predicted", style="dim"), "", *_errors_shown(found["prediction"]))
     return table
 
 

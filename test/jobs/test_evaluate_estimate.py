@@ -14,8 +14,10 @@ import pytest
 from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.evaluation.estimation import compare_errors
+from magnetosuture_thread.evaluation.graph_outputs import GraphCollector
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.interface import MEASURED_THREAD, THREAD_OBSERVATION
+from magnetosuture_thread.interface import GROUND_TRUTH_THREAD, MEASURED_THREAD, THREAD_OBSERVATION
 from magnetosuture_thread.jobs import replay_inputs
 from magnetosuture_thread.jobs.evaluate import evaluate_bags
 from magnetosuture_thread.jobs.render import render_bag
@@ -196,6 +198,25 @@ def test_the_summary_of_a_replay_has_both_side_by_side(tmp_path: Path, pushed_ba
     assert summary["consistency"]["windows"] == 1
     assert summary["disturbances"][0]["significance"] > 0.0
     assert summary["disturbances"][0]["begin_s"] >= 0.0
+
+
+def test_the_messages_of_a_replay_give_the_figures_of_its_summary(tmp_path: Path, pushed_bag: Path):
+    """As a live replay is evaluated: by what was published."""
+    summary = replay_offline(pushed_bag, tmp_path / "out")
+    collector = GraphCollector(0.019)
+    for bag, topics in ((Bag(pushed_bag), {GROUND_TRUTH_THREAD.recorded}), (Bag(tmp_path / "out" / "bag"), None)):
+        for record in bag.records(topics or set(bag.topics)):
+            collector.add(record.topic, record.decode())
+    metrics = collector.metrics(Bag(pushed_bag).start)
+    assert compare_errors(metrics.series) == {"prediction": summary.prediction, "estimate": summary.estimate}
+    found, expected = metrics.estimation, summary.estimation
+    assert (found.corrected, found.hidden) == (expected.corrected, expected.hidden)
+    assert found.consistency is not None
+    assert expected.consistency is not None
+    assert found.consistency.mean == pytest.approx(expected.consistency.mean, rel=1e-9)
+    assert [event.arc_length_m for event in found.disturbances] == [
+        event.arc_length_m for event in expected.disturbances
+    ]
 
 
 def test_the_formulation_of_the_paper_is_not_estimated(tmp_path: Path, pushed_bag: Path):

@@ -80,8 +80,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
     """Score the thread model on bags, or on reference trajectories.
 
     Bags: the thread of each is predicted and estimated without a graph, as fast as the machine can, and compared with
-    the measured centreline and, where the bag holds it, ground truth. PATH is an mcap or db3 file, the folder of a bag, or a folder of bags,
-    which may be up to two folders below. DIR, which must not exist, gets
+    the measured centreline and, where the bag holds it, ground truth. PATH is an mcap or db3 file, the folder of a
+    bag, or a folder of bags, which may be up to two folders below. DIR, which must not exist, gets
       NAME.html    a page for each bag, which needs no network: plots to zoom, the worst frames
       table.csv    a row for each bag, SI units and %
       table.json   the same, with mean and worst, and prediction and estimate side by side
