@@ -24,6 +24,7 @@ from benchmarks.estimator.measurements import (
     measure_long,
     measure_references,
 )
+from benchmarks.estimator.slow import measure_slow
 from magnetosuture_thread.cli.terminal import make_log, progress
 
 
@@ -37,6 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--trackers", action="store_true", help="compare with the camera alone and a registration tracker"
     )
     parser.add_argument("--references", type=Path, metavar="DIR", help="also on the reference trajectories of a folder")
+    parser.add_argument("--slow", action="store_true", help="also what is learned on line of thread and liquid")
     parser.add_argument("--long", type=float, default=0.0, metavar="MINUTES", help="also one long run")
 
 
@@ -58,6 +60,8 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         more: dict[str, Any] = {"cost": measure_cost(81, options.seed)}
         if options.references:
             more["references"] = measure_references(options.references, options.seed, lambda: None)
+        if options.slow:
+            more["slow_parameters"] = measure_slow(options.count, options.seed, lambda: None)
         if options.long > 0.0:
             more["long"] = measure_long(options.long, options.seed, options.segments)
     console.print(_table(figures, options.trackers))
@@ -71,6 +75,11 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         log(
             f"{name}: estimate {found['estimate_mean']:.3f}, {found['estimate_maximum']:.2f};"
             f" prediction {found['prediction_mean']:.3f}, {found['prediction_maximum']:.2f}"
+        )
+    for found in more.get("slow_parameters", []):
+        log(
+            f"{found['case']}, {found['material']}: {found['parameter']} off by {found['error_mean']:.2g} in the mean,"
+            f" half interval {found['half_interval_mean']:.2g}, {100.0 * found['coverage']:.0f} % inside"
         )
     if "long" in more:
         found = more["long"]

@@ -51,6 +51,9 @@ def made(**values: Any) -> ThreadModelSettings:
         ({"paper_damping": 1.0}, "from 0 to 0.999"),
         ({"paper_stiffness_weight": -1.0}, "from 0 to"),
         ({"formulation": "paper", "medium": "air"}, "paper has no inertia"),
+        ({"formulation": "paper", "flow": [1e-3, 0.0]}, "paper has no drag"),
+        ({"flow": [1e-3]}, "multiple of 2"),
+        ({"flow": [1e-3, 1.0]}, "from -0.1 to 0.1 m/s"),
         ({"segments": 400}, "longer than thick"),
     ],
 )
@@ -71,6 +74,7 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
         {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},
         {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
         {"margin_range": 0.02},
+        {"flow": [1e-3, -2e-3]},
     ],
 )
 def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
@@ -176,6 +180,12 @@ def test_inertia_and_weight_come_from_the_settings():
     assert thread.medium.drag_across == thread.medium.drag_along == 2e-4
     assert thread.medium.gravity == (0.0, -9.81)
     assert made().thread().medium.mass_per_length == 0.0
+
+
+@pytest.mark.parametrize("medium", ["liquid", "air"])
+def test_the_flow_comes_from_the_settings(medium: str):
+    assert made(medium=medium, flow=[1e-3, -2e-3]).thread().medium.flow == (1e-3, -2e-3)
+    assert made(medium=medium).thread().medium.flow == ()
 
 
 def kernels() -> int:

@@ -92,7 +92,7 @@ class LearnedState:
         effect: sums over frames of how far each moves the thread, squared and as it is, by unit of x, shape (2, p).
         block: sums of scores and of their expected squares in the block under way, shape (2, p).
         block_time: since it began [s].
-        spread: sums over blocks of squared scores and of what was expected, shape (2, p).
+        dispersion: sums over blocks of squared scores and of what was expected, shape (2, p).
     """
 
     x: Vector
@@ -104,7 +104,7 @@ class LearnedState:
     effect: NDArray[np.float64]
     block: NDArray[np.float64]
     block_time: float
-    spread: NDArray[np.float64]
+    dispersion: NDArray[np.float64]
 
 
 def _drags(thread: Thread) -> tuple[float, float]:
@@ -278,12 +278,12 @@ class SlowParameters:
 
     def _with_block(self, state: LearnedState, sums: NDArray[np.float64], elapsed: float) -> LearnedState:
         """Return a state in which a frame's score is counted, and its block of time where that ends."""
-        block, time, spread = state.block + sums, state.block_time + elapsed, state.spread
+        block, time, dispersion = state.block + sums, state.block_time + elapsed, state.dispersion
         if time >= self._time / BLOCKS:
             keep = np.where(block[1] > 0.0, math.exp(-time / self._time), 1.0)
-            spread = keep * spread + np.array([block[0] ** 2, block[1]])
+            dispersion = keep * dispersion + np.array([block[0] ** 2, block[1]])
             block, time = np.zeros_like(block), 0.0
-        return replace(state, block=block, block_time=time, spread=spread)
+        return replace(state, block=block, block_time=time, dispersion=dispersion)
 
     def report(self) -> tuple[SlowParameter, ...]:
         """Return the parameters as they are known now."""
@@ -292,7 +292,7 @@ class SlowParameters:
             return ()
         variance = np.diag(np.linalg.inv(state.information))
         own = 1.0 / np.sqrt(variance * np.diag(state.information))  # of the effect of each, no other makes up for
-        ratio = np.maximum(state.spread[0] / np.maximum(state.spread[1], 1e-300), 1.0)
+        ratio = np.maximum(state.dispersion[0] / np.maximum(state.dispersion[1], 1e-300), 1.0)
         square, effect = state.effect
         chain = CHAIN * self._thread.length * effect / (own * np.where(square > 0.0, square, 1.0))
         half = np.minimum(STUDENT_95 * np.sqrt(ratio * variance) + chain, NORMAL_95 * self._deviation)

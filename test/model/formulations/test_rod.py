@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
 from magnetosuture_thread.model.formulations import (
     Formulation,
@@ -461,3 +461,30 @@ def test_a_step_keeps_its_memory_to_itself():
     np.testing.assert_array_equal(first.state.velocities, kept[1])
     given = ThreadState(start, np.zeros_like(start), DT)
     assert_same(among_discs(BandedSolver()).step(given, lead(np.array([6e-5, 0.0])), DT), first)
+
+
+@pytest.mark.parametrize("attachment", list(Attachment))
+def test_a_flow_is_what_the_thread_sees_from_a_frame_that_moves_against_it(attachment: Attachment):
+    """In a flow w behind a needle of velocity v a thread moves as in still liquid behind one of v - w, plus w t."""
+    flow, velocity, turn = np.array([4e-4, -7e-4]), np.array([1.2e-3, 3e-4]), 0.8
+    still = polyamide(attachment)
+    moving = replace(still, medium=replace(still.medium, flow=tuple(flow)))
+    first = straight(still)
+    found = []
+    for thread, carried in ((moving, np.zeros(2)), (still, flow)):
+        formulation = formulated(thread)
+        state = ThreadState(first, np.tile(-carried, (len(first), 1)), DT)  # at rest in the dish
+        for step in range(1, 120):
+            time = step * DT
+            tail = first[0] + (velocity - carried) * time
+            heading = np.array([np.cos(turn * time), np.sin(turn * time)])
+            state = formulation.step(state, PrescribedMotion((0,), tail[None], heading), DT).state
+        found.append(state.positions + carried * 119 * DT)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-8)
+    assert np.abs(found[0] - first).max() > 1e-3
+
+
+def test_a_flow_must_have_a_value_for_each_dimension():
+    thread = polyamide()
+    with pytest.raises(ConfigurationError, match="2 values, or none"):
+        formulated(replace(thread, medium=replace(thread.medium, flow=(1e-3, 0.0, 0.0))))
