@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
+from typing import TypedDict
 
 import numpy as np
 
@@ -19,6 +20,14 @@ SPEED = 1.5e-3  # of the needle [m/s]
 DURATION = 25.0  # s
 POST_RADIUS = 1.2e-3  # m
 HIDDEN_TIME = (10.0, 15.0)  # s
+
+
+class TrueThread(TypedDict, total=False):
+    """What of thread and liquid is not as told; see `simulate`."""
+
+    stiffness: float
+    viscosity: float
+    flow: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,7 @@ class Case:
 
     name: str
     limits: tuple[float, float]
-    truth: dict[str, object] = field(default_factory=dict)
+    truth: TrueThread = field(default_factory=TrueThread)
     camera: CameraModel = field(default_factory=CameraModel)
     post: str = ""
     every: int = 1
@@ -122,7 +131,7 @@ def run_of(case: Case, material: str, attachment: str, seed: int, duration: floa
             return None
         posts = (post,)
     tails, headings = wander(seed, duration, RATE, SPEED)
-    return simulate(model_thread(material, 25, attachment), tails, headings, RATE, posts=posts, **case.truth)  # type: ignore[arg-type]
+    return simulate(model_thread(material, 25, attachment), tails, headings, RATE, posts=posts, **case.truth)
 
 
 def contact_frame(run: Run) -> int:

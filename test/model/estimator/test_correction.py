@@ -16,6 +16,7 @@ from magnetosuture_thread.model.estimator.correction import (
     prior_information,
 )
 from magnetosuture_thread.model.estimator.covariance import propagate, selected_inverse
+from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.step import StepBuffers, program_of
 from magnetosuture_thread.model.program import as_quadratic_program
 from magnetosuture_thread.model.solvers import BandedSolver
@@ -150,9 +151,10 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     buffers, memory = StepBuffers.of(NODES, 2, 3 * segments + 1, 2 * NODES), CorrectionBuffers.of(NODES)
     memory.known[0] = True
     formulation, solver = estimator.predictor.formulation, BandedSolver()
+    assert isinstance(formulation, RodFormulation)
     code, _, off, residuals = correct(
         (0, 1),
-        formulation.rod,  # type: ignore[attr-defined]
+        formulation.rod,
         buffers,
         formulation.workspace.data,
         solver.buffers(NODES, 2, len(buffers.first)),

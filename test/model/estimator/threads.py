@@ -53,7 +53,13 @@ def true_shapes(thread: Thread, way: list[NeedlePose], discs: tuple[Disc, ...] =
 
 
 def piece_of(
-    nodes: Points, seed: int, begin: float = 0.0, end: float = LENGTH, deviation: float = DEVIATION, **fields: object
+    nodes: Points,
+    seed: int,
+    begin: float = 0.0,
+    end: float = LENGTH,
+    deviation: float = DEVIATION,
+    *,
+    arc_length: tuple[float, float] | None = None,
 ) -> ThreadPiece:
     """Return a noisy piece of a thread between two arc lengths, by default all of it."""
     rng = np.random.default_rng(seed)
@@ -62,12 +68,13 @@ def piece_of(
     along = np.gradient(points, axis=0)
     normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.hypot(*along.T)[:, None]
     points = points + rng.normal(0.0, deviation, len(points))[:, None] * normal
-    values: dict[str, object] = {
-        "first_end": PieceEnd.TAIL if begin == 0.0 else PieceEnd.COVERED,
-        "last_end": PieceEnd.FREE if end >= LENGTH else PieceEnd.COVERED,
-        "arc_length": (begin, begin),
-    }
-    return ThreadPiece(points, np.full(len(points), deviation), **{**values, **fields})  # type: ignore[arg-type]
+    return ThreadPiece(
+        points,
+        np.full(len(points), deviation),
+        PieceEnd.TAIL if begin == 0.0 else PieceEnd.COVERED,
+        PieceEnd.FREE if end >= LENGTH else PieceEnd.COVERED,
+        (begin, begin) if arc_length is None else arc_length,
+    )
 
 
 def whole(nodes: Points, seed: int) -> ThreadObservation:
