@@ -23,7 +23,7 @@ from magnetosuture_thread.vision.thread.walk import min_confidence
 
 WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
 FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
-MIN_BEGINNING, MIN_EVIDENCE = 2.5, 4.0  # mean evidence where a thread comes out and of all of it: more than noise shows
+MIN_BEGINNING, MIN_EVIDENCE = 2.5, 5.0  # mean evidence where a thread comes out and of all of it: more than noise shows
 
 
 @dataclass(frozen=True)
@@ -115,17 +115,18 @@ def _followed(
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
-    """Return the walk with the greatest evidence for a thread that leaves the needle; at first at full size."""
-    best, greatest = dark, 0.0
+    """Return the walk with the greatest evidence for a thread that leaves the needle, at first at full size."""
+    best, greatest, weakest = dark, 0.0, 0.0
     for scale in SCALES:
         for walk in search.faint(scale) + ([dark] if scale == 1 else []):
             if walk.shown < FAINT_SHARE * enough:
                 continue
             centred, section = search.centred(walk)
-            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE:
+            total = section.mean * centred.shown
+            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE or total < greatest:
                 continue
-            if centred.shown > FAINT_SHARE * enough and section.mean * centred.shown > greatest:
-                best, greatest = centred, section.mean * centred.shown
-        if best.shown > enough:
+            if centred.shown > FAINT_SHARE * enough:
+                best, greatest, weakest = centred, total, section.weakest
+        if best.shown > enough and weakest > MIN_BEGINNING:
             break
     return best
