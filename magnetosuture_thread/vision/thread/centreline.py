@@ -15,6 +15,7 @@ from magnetosuture_thread.vision.thread.search import (
     SCALES,
     SURE_SHARE,
     WALL_PX,
+    WIDER_SHARE,
     ThreadSearch,
     Walk,
     is_strong,
@@ -122,10 +123,12 @@ def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
             if walk.shown < FAINT_SHARE * enough:
                 continue
             centred, section = search.centred(walk)
-            total = section.mean * centred.shown
-            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE or total < greatest:
+            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE:
                 continue
-            if centred.shown > FAINT_SHARE * enough:
+            # At half the size a thread and its shadow are one: what is as clear at full size is taken from there.
+            total = section.mean * centred.shown
+            clearer = total > (WIDER_SHARE if scale > 1 else 1.0) * greatest
+            if clearer and centred.shown > FAINT_SHARE * enough:
                 best, greatest, weakest = centred, total, section.weakest
         if best.shown > enough and weakest > MIN_BEGINNING:
             break
