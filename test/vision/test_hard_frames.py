@@ -58,6 +58,29 @@ def test_nothing_else_is_followed_in_place_of_a_faint_thread(name: str):
     assert (row(name).wrong_line or 0.0) < 0.01
 
 
+@pytest.mark.parametrize(
+    ("name", "index", "seed"),
+    [
+        ("thread_undyed_6px", 5, 21),  # followed along one edge
+        ("thread_undyed_4px", 2, 1033),  # in the middle between it and its shadow
+        ("thread_white_0.5px", 3, 21),  # reflections taken for pieces of it
+        ("thread_white_1.5px", 2, 21),
+        ("thread_undyed_0.75px", 0, 21),  # seen in part only
+        ("thread_undyed_0.75px", 2, 21),
+    ],
+)
+def test_pale_threads_that_were_followed_wrong_once_are_not(name: str, index: int, seed: int):
+    result = measure(*frame_of(name, index, seed))
+    assert result.pieces.covered > 0.95 * result.visible
+    assert result.wrong < 0.005 * result.line
+    assert result.pieces.wrong < 0.005 * result.pieces.length
+
+
+@pytest.mark.parametrize("name", ["thread_undyed_2px", "thread_white_1px", "thread_white_4px"])
+def test_standard_deviations_of_pale_threads_are_honest(name: str):
+    assert 0.5 < (row(name).normalised or 0.0) < 2.0
+
+
 def test_a_rod_never_points_the_wrong_way():
     rods = row("blunt_rod")
     assert (rods.wrong, rods.found) == (0, FRAMES)

@@ -15,6 +15,7 @@ from magnetosuture_thread.vision.thread.search import (
     SCALES,
     SURE_SHARE,
     WALL_PX,
+    WIDER_SHARE,
     ThreadSearch,
     Walk,
     is_strong,
@@ -23,7 +24,7 @@ from magnetosuture_thread.vision.thread.walk import min_confidence
 
 WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
 FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
-MIN_BEGINNING, MIN_EVIDENCE = 2.5, 4.0  # mean evidence where a thread comes out and of all of it: more than noise shows
+MIN_BEGINNING, MIN_EVIDENCE = 2.5, 5.0  # mean evidence where a thread comes out and of all of it: more than noise shows
 
 
 @dataclass(frozen=True)
@@ -115,8 +116,8 @@ def walk_from(
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
-    """Return the walk with the greatest evidence for a thread that leaves the needle; at first at full size."""
-    best, greatest = dark, 0.0
+    """Return the walk with the greatest evidence for a thread that leaves the needle, at first at full size."""
+    best, greatest, weakest = dark, 0.0, 0.0
     for scale in SCALES:
         for walk in search.faint(scale) + ([dark] if scale == 1 else []):
             if walk.shown < FAINT_SHARE * enough:
@@ -124,8 +125,11 @@ def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
             centred, section = search.centred(walk)
             if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE:
                 continue
-            if centred.shown > FAINT_SHARE * enough and section.mean * centred.shown > greatest:
-                best, greatest = centred, section.mean * centred.shown
-        if best.shown > enough:
+            # At half the size a thread and its shadow are one: what is as clear at full size is taken from there.
+            total = section.mean * centred.shown
+            clearer = total > (WIDER_SHARE if scale > 1 else 1.0) * greatest
+            if clearer and centred.shown > FAINT_SHARE * enough:
+                best, greatest, weakest = centred, total, section.weakest
+        if best.shown > enough and weakest > MIN_BEGINNING:
             break
     return best

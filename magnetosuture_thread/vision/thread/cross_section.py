@@ -28,6 +28,7 @@ BEND_PRICE = 1.0  # of a change of the shift by one step from vertex to vertex, 
 MAX_CHANGE = 3  # steps, by which the shift may change from vertex to vertex
 WINDOW = 4  # vertices to both sides of a stretch, in which floor has to be the better explanation for a thread to end
 MIN_FLOOR = 1.0  # mean evidence against a thread in a stretch, where it ends
+SHADOW = 0.5  # of a thread's usual contrast, that its shadow may show, whose edges are no sharp ones
 EVEN = 2  # vertices to both sides, over which shifts are averaged
 ROUNDS = 2  # of measuring the colour and then the shift
 OUTLIER = 4.0  # deviations, beyond which a difference on the floor is none of noise
@@ -63,16 +64,23 @@ class CrossSection:
         """Mean evidence."""
         return _mean_of(self.evidence[self.visible])
 
+    @property
+    def weakest(self) -> float:
+        """The least mean evidence of a stretch."""
+        return float(_mean(self.evidence[self.visible][:, None], WINDOW).min()) if self.visible.any() else 0.0
+
     def up_to_its_end(self) -> CrossSection:
         """Return the part up to where the thread ends.
 
         It is seen no farther than up to where floor explains a whole stretch better; of that part, the evidence up to
-        the end is the greatest (maximum likelihood).
+        the end is the greatest (maximum likelihood). A last part as weak as a thread's shadow may be no more than that.
         """
         stretches = _mean(self.evidence[:, None], WINDOW)[:, 0]
         floor = np.flatnonzero(stretches < -MIN_FLOOR)
         searched = self.evidence[: floor[0] + 1] if len(floor) else self.evidence
         count = int(np.argmax(np.cumsum(searched))) + 1
+        strong = np.flatnonzero(stretches[:count] > SHADOW**2 * float(np.median(stretches[:count])))
+        count = int(strong[-1]) + 1 if len(strong) else 1
         return CrossSection(self.points[:count], self.half_width, self.evidence[:count], self.visible[:count])
 
 
@@ -91,8 +99,8 @@ def centred_between_edges(
 
         sum_i c_i . D_i(s_i) - k (s_i - s_(i-1))^2
 
-    (Viterbi), and the ratio c . D - |c|^2 / 2 is the evidence. A shadow has no sharp edges, so the middle is the
-    thread's and not that of both.
+    (Viterbi), and the ratio c . D - |c|^2 / 2 is the evidence. A thread's shadow has no sharp edges, so the middle is
+    the thread's and not that of both.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3), uint8.

@@ -12,7 +12,15 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.sampling import middle
-from magnetosuture_thread.vision.thread.appearance import Appearance, across, looks_alike, respaced, runs, sampled
+from magnetosuture_thread.vision.thread.appearance import (
+    SURE_STRENGTH,
+    Appearance,
+    across,
+    looks_alike,
+    respaced,
+    runs,
+    sampled,
+)
 from magnetosuture_thread.vision.thread.hiding import WALL_PX, Hiding
 from magnetosuture_thread.vision.thread.walk import walk_on
 
@@ -75,7 +83,7 @@ def find_pieces(
     Returns:
         Pieces in the picture's pixels, the longest first, each of shape (m, 2), m >= 2 [px].
     """
-    if max_length < MIN_LENGTH_PX:
+    if max_length < MIN_LENGTH_PX or thread.strength < SURE_STRENGTH:  # The floor's texture looks like a faint thread.
         return []
     ridge = two_sided_ridge(gray, thread, hiding)
     (u, v), reach = hiding.wall.centre, hiding.wall.radius - WALL_PX

@@ -26,7 +26,6 @@ SMOOTHING = 0.05  # weight of the newest strength in the usual one
 ASIDE_PX, ACROSS = 0.5, 9  # between samples across a ridge, and how many
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
 FORK = 0.75  # of the usual strength, at least, along the other way
-END, END_FAINTEST = 0.6, 1.2  # of the usual strength, and of the faintest, that a faint thread shows to its end
 TELLING_BEND = 0.06  # 1/px; a way that bends more by this is less likely by a factor e
 FORCED = 4  # steps that a walk is held to the other way
 
@@ -175,41 +174,6 @@ def walk_on(
         if seen:
             last = count
     return last, fork_count
-
-
-@compiled
-def strengths_along(ridge, hidden, factor, noise, path, count):
-    """Return how strong the ridge is at each vertex of a path, NaN where it is hidden, shape (count,)."""
-    values = np.empty(count)
-    for index in range(count):
-        u, v = path[index, 0], path[index, 1]
-        _, values[index] = centred(ridge, noise, u, v, path[index, 2], 0.7)
-        if is_hidden(hidden, factor, u, v):
-            values[index] = np.nan
-    return values
-
-
-@compiled
-def count_to_end(values, faintest, path):
-    """Return how many vertices of a path show a faint thread, where the walk may have gone on along noise.
-
-    The thread ends where the sum of what is stronger than `END` of its usual strength, less that, is greatest.
-
-    Args:
-        values: see `strengths_along`.
-        faintest: a strength above noise that is no noise.
-        path: see `walk_on`.
-    """
-    count = len(values)
-    bound = max(END_FAINTEST * faintest, END * np.median(path[1:count, 4])) if count > 1 else 0.0
-    total, greatest, kept = 0.0, 0.0, 1
-    for index in range(1, count):
-        if np.isnan(values[index]):
-            continue
-        total += min(values[index], STRONGEST * path[index, 4]) - bound
-        if total >= greatest:
-            greatest, kept = total, index + 1
-    return kept
 
 
 @compiled
