@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -14,7 +14,9 @@ from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, gla
 from magnetosuture_thread.vision.needle.erase import without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
-from magnetosuture_thread.vision.thread.forks import follow
+from magnetosuture_thread.vision.thread.crossings import Crossing, resolve_crossings
+from magnetosuture_thread.vision.thread.forks import follow, worth
+from magnetosuture_thread.vision.thread.hiding import cover_needle
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.ridge import (
     DEVIATION,
@@ -32,13 +34,10 @@ from magnetosuture_thread.vision.thread.ridge import (
 )
 from magnetosuture_thread.vision.thread.walk import STEP_PX, count_to_end, refine, strengths_along
 
-COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
-BEYOND_PX = 3.0  # its tip, that is not seen either
 MAX_BEYOND_PX = 12.0  # hidden by the needle and what is next to it, beside its length
 SHADE, SHADE_PX = 0.12, 10.0  # of steel's darkness, that its shadow has, and how far beside it that lies
 WALL_PX = 4.0  # before which the walk ends
 AT_WALL_PX = 40.0  # from the wall, where its rim may look like the thread's beginning
-BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can leave
 ENOUGH = 0.85  # of the greatest length: so much thread seen, dark and strong, needs no other search
 FAINT = 25.0  # grey levels; a black-hat fainter than this may be a pale thread's shadow
 STRONG_SHARE = 0.08  # of enough, that a strong dark thread must show to be the thread: the rest of it is covered
@@ -73,6 +72,9 @@ class Walk:
         ridge: that was followed.
         path: the walk in the ridge's pixels; see `walk_on`.
         shown_strengths: strength of the ridge at each vertex that is not hidden.
+        strong: whether the thread is visible at each vertex of the path.
+        fine: ridge in whose middle the points lie, if that is not the one that was followed.
+        crossings: where it could have gone on along another strand; see `ThreadSearch.resolved`.
     """
 
     points: np.ndarray
@@ -81,6 +83,9 @@ class Walk:
     ridge: Ridge
     path: np.ndarray
     shown_strengths: np.ndarray
+    strong: np.ndarray
+    fine: Ridge | None = None
+    crossings: tuple[Crossing, ...] = field(default=())
 
     @property
     def is_significant(self) -> bool:
@@ -135,7 +140,7 @@ class ThreadSearch:
         # Copied: a slice of the mask is handed to compiled code and to drawing, which want their own memory.
         self._hidden = np.ascontiguousarray(hidden)
         self._covered = np.zeros_like(self._hidden)
-        _cover(self._covered, factor, needle, self._origin)
+        cover_needle(self._covered, factor, needle, self._origin)
         self._hidden |= self._covered
 
     def dark(self) -> Walk:
@@ -187,7 +192,7 @@ class ThreadSearch:
                     # Among larger pixels a thread and its shadow are one: where it is thin, its own middle is taken.
                     ridge, difference_1 = thin[pale]
                     if sign * self._median_along(walk.points, difference_1, 1) > THIN_SHARE * walk.strength:
-                        walk = replace(walk, points=self._recentred(walk.points, ridge))
+                        walk = replace(walk, points=self._recentred(walk.points, ridge), fine=ridge)
                 walks.append(walk)
         return walks
 
@@ -293,13 +298,10 @@ class ThreadSearch:
     def _walked(self, ridge: Ridge) -> Walk:
         """Walk along a ridge."""
         scale = ridge.scale
-        shift = 0.5 * (scale - 1)
         max_length = self._max_length / scale
-        max_steps = int(max_length) + 16  # steps are longer than a pixel
-        path, strong = np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
-        needle, origin = self._needle, self._origin
-        tail, direction = (needle.tail_px - origin - shift) / scale, needle.direction_px
-        dish = (np.append(np.subtract(self._centre, origin) - shift, self._reach) / scale).tolist()
+        path, strong = self._buffers(ridge)
+        needle, dish = self._needle, self._dish(ridge)
+        tail, direction = (needle.tail_px - self._origin - 0.5 * (scale - 1)) / scale, needle.direction_px
         count, shown = follow(
             ridge.strength,
             ridge.hidden,
@@ -309,13 +311,45 @@ class ThreadSearch:
             ridge.single,
             ridge.stiffness,
             np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
-            (dish[0], dish[1], dish[2]),
+            dish,
             max_length,
             (needle.length_px + MAX_BEYOND_PX) / scale,
             self._at_wall,
             path,
             strong,
         )
+        return self._ended(ridge, path, strong, count, shown)
+
+    def _buffers(self, ridge: Ridge) -> tuple[np.ndarray, np.ndarray]:
+        """Return room for a path along a ridge; see `walk_on`."""
+        max_steps = int(self._max_length / ridge.scale) + 16  # steps are longer than a pixel
+        return np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
+
+    def _dish(self, ridge: Ridge) -> tuple[float, float, float]:
+        """Return the dish's centre and how far from it a walk may go, in a ridge's pixels."""
+        u, v = (np.subtract(self._centre, self._origin) - 0.5 * (ridge.scale - 1)) / ridge.scale
+        return float(u), float(v), self._reach / ridge.scale
+
+    def resolved(self, walk: Walk) -> Walk:
+        """Return a walk that takes the most probable way at its crossings; see `resolve_crossings`."""
+        ridge, count = walk.ridge, len(walk.path)
+        if count < MIN_CENTRED:
+            return walk
+        path, strong = self._buffers(ridge)
+        path[:count], strong[:count] = walk.path, walk.strong
+        max_length = self._max_length / ridge.scale
+        count, crossings = resolve_crossings(ridge, self._dish(ridge), max_length, path, strong, count)
+        if count == len(walk.path) and np.array_equal(path[:count], walk.path):
+            return replace(walk, crossings=crossings)
+        found = self._ended(ridge, path, strong, count, float(worth(path, strong, count)))
+        points = found.points if walk.fine is None else self._recentred(found.points, walk.fine)
+        left = tuple(crossing for crossing in crossings if crossing.first < len(found.path))
+        return replace(found, points=points, fine=walk.fine, crossings=left)
+
+    def _ended(self, ridge: Ridge, path: np.ndarray, strong: np.ndarray, count: int, shown: float) -> Walk:
+        """Return the walk along a path up to where it shows the thread."""
+        scale, origin = ridge.scale, self._origin
+        shift = 0.5 * (scale - 1)
         points = path[:count, :2].copy()
         values = strengths_along(ridge.strength, ridge.hidden, ridge.factor, ridge.noise, path, count)
         kept = count_to_end(values, ridge.faintest, path) if ridge.signed else count
@@ -329,7 +363,8 @@ class ThreadSearch:
             refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
         strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
         seen = values[1:kept][~np.isnan(values[1:kept])]
-        return Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy(), seen)
+        points = points * scale + shift + origin
+        return Walk(points, shown * scale, strength, ridge, path[:kept].copy(), seen, strong[:kept].copy())
 
     def _clear_wall(self, ridge: Ridge) -> None:
         """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""
@@ -360,11 +395,3 @@ class ThreadSearch:
         cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
         floor = ridge.noise if ridge.signed else 0.0
         ridge.strength[(zone > 0) & (ridge.strength < floor + shade)] = floor
-
-
-def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
-    """Mark where the needle hides the thread."""
-    axis = needle.arc.at(np.linspace(BEHIND_TAIL_PX, needle.length_px + BEYOND_PX, 24)) - origin
-    small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
-    thickness = needle.width_px + 2.0 * COVERED_PX
-    cv2.polylines(hidden, [small], False, 255, max(1, round(thickness / factor)), cv2.LINE_8, 4)
