@@ -9,9 +9,10 @@ and k', a strand that goes on from one to the other has the errors and their cov
     F = [[1, g, g^2 / 2], [0, 1, g], [0, 0, 1]]
     Q = c [[g^5 / 20, g^4 / 8, g^3 / 6], [., g^3 / 3, g^2 / 2], [., ., g]] + t [[g^3 / 3, g^2 / 2, 0], [., g, 0], 0]
 
-and costs 1/2 e^T S^-1 e + 1/2 log |2 pi S|, the bending energy of the smoothest curve between the two, seen through the
-errors of what is measured. Bare floor along the joining curve, and a difference in strength of the two arms, cost more.
-A pairing costs the sum of its pairs and of its arms that end; all pairings are tried, and each counts by exp(-cost).
+and costs (n + 3) / 2 log(1 + e^T S^-1 e / n) + 1/2 log |2 pi S|: near e = 0 that is the bending energy of the smoothest
+curve between the two, seen through the errors of what is measured. Bare floor along the joining curve, and a difference
+in strength of the two arms, cost more. A pairing costs the sum of its pairs and of its arms that end; all pairings are
+tried, and each counts by exp(-cost).
 
 Source: [Mumford1994], and all pairings as in [Choi2023]. Deviation: the curvature turns at random too, so that arms
 that are bent alike belong together, and costs are probabilities, so that a confidence follows.
@@ -37,6 +38,7 @@ SHOWN = 0.45  # of the usual strength, at least, where a strand leaves it
 DIP = 0.8  # of the weaker of two peaks, at most, between them
 MAX_ARMS = 8
 ARM_PX, MIN_ARM = 28.0, 4  # length over which an arm is measured, and vertices that it has at least
+LEAVING = 7  # vertices, after which an arm is farther from the crossing than at first
 SAME_PX = 2.5  # from an arm, where another that begins is the same
 ON_ARM_PX = 4.0  # from an arm's beginning, where a path goes along it ...
 ALONG = 0.3  # ... if the cosine of the angle between them is greater
@@ -45,10 +47,11 @@ ALONG_PX = (-3.0, 0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
 TURNING, CURVATURE_RATE = 0.01, 1e-4  # 1 / px, 1 / px^3; variances of tangent and curvature for each length
 POSITION_ERROR, ANGLE_ERROR = 0.4, 0.15  # px, rad; of a walk's vertex across, and of the direction between two
 STRENGTH_ERROR = 0.3  # of the stronger, by which strengths of one strand differ
+FREEDOM = 4.0  # degrees of freedom of Student's distribution: some threads bend far more than most
 MAX_TURN = 2.0  # rad; from the chord, by which a strand leaves an arm
 BARE_COST = 0.5  # for each pixel of a joining curve that shows nothing
 END_COST = 12.0  # of an arm that ends, besides what its state costs among all states
-SHORT_COST, WHOLE = 3.0, 0.85  # of a way on which the thread ends early: before this share of its greatest length
+SHORT_COST, WHOLE = 4.0, 0.85  # of a way on which the thread ends early: before this share of its greatest length
 SPREAD = math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2)  # of states in all directions, bent up to 0.1 / px
 
 
@@ -129,10 +132,16 @@ def find_arms(ridge: Ridge, dish: tuple[float, float, float], part: NDArray[np.f
         score = np.minimum(along, STRONGEST * usual).mean(axis=0)
         score[ways @ outward < 0.0] = -np.inf
         arm = _arm(ridge, dish, start, float(turns[np.argmax(score)]), usual)
-        if arm is None or any(_lies_on(arm.start, other) for other in arms):
+        if arm is None or _stays(arm, part[:, :2]) or any(_lies_on(arm.start, other) for other in arms):
             continue
         arms = [other for other in arms if not _lies_on(other.start, arm)] + [arm]
     return sorted(arms, key=lambda arm: -arm.strength)[:MAX_ARMS]
+
+
+def _stays(arm: Arm, points: Points) -> bool:
+    """Say whether an arm leads back into the crossing instead of away from it."""
+    away = np.sqrt(((arm.path[:LEAVING, None, :2] - points) ** 2).sum(axis=2).min(axis=1))
+    return bool(away[-1] < away[0])
 
 
 def _edge_around(points: Points) -> Points:
@@ -244,7 +253,9 @@ def _cost(ridge: Ridge, one: Arm, other: Arm) -> float:
     )
     wander[:2, :2] += TURNING * np.array([[g**3 / 3.0, g**2 / 2.0], [g**2 / 2.0, g]])
     spread = carry @ one.covariance @ carry.T + other.covariance + wander
-    bend = 0.5 * float(error @ np.linalg.solve(spread, error) + np.log(np.linalg.det(2.0 * np.pi * spread)))
+    distance = float(error @ np.linalg.solve(spread, error))
+    bend = 0.5 * (FREEDOM + 3.0) * math.log1p(distance / FREEDOM)
+    bend += 0.5 * float(np.log(np.linalg.det(2.0 * np.pi * spread)))
     stronger = max(one.strength, other.strength)
     shown = (sampled(ridge.strength, curve[1:-1]) - ridge.noise) / (0.5 * SHOWN * (one.strength + other.strength))
     bare = g / (len(curve) - 1) * float(np.maximum(0.0, 1.0 - shown).sum())

@@ -26,6 +26,7 @@ from magnetosuture_thread.vision.thread.walk import STEP_PX
 RING = 48  # places around a vertex where other strands are looked for
 REACH = round(RADIUS_PX / STEP_PX)  # vertices
 MAX_GAP = 3  # vertices without another strand within a crossing
+FORK = 3  # arms, where two strands become one
 MERGED = 24  # vertices, over which two strands may be seen as one
 MAX_CROSSINGS = 16
 
@@ -55,8 +56,8 @@ def resolve_crossings(
 ) -> tuple[int, tuple[Crossing, ...]]:
     """Take the most probable way wherever other strands meet a path, and walk on from there.
 
-    Strands meet where more than two of them cross a ring around the path's vertices. Where the number of arms is odd
-    and another such place follows soon, strands are merged in between: both places are one crossing.
+    Strands meet where more than two of them cross a ring around the path's vertices. Where three arms meet, and soon
+    after that three again, two strands are merged in between: both places are one crossing.
 
     Args:
         ridge: that is followed.
@@ -77,9 +78,10 @@ def resolve_crossings(
             break
         low, high = places.pop(0)
         arms = find_arms(ridge, dish, path[low - 1 : high])
-        while len(arms) % 2 and places and places[0][0] - high <= MERGED:
-            high = places.pop(0)[1]
-            arms = find_arms(ridge, dish, path[low - 1 : high])
+        if len(arms) == FORK and places and places[0][0] - high <= MERGED:
+            after, end = places[0]
+            if len(find_arms(ridge, dish, path[after - 1 : end])) == FORK:
+                high, arms = end, find_arms(ridge, dish, path[low - 1 : end])
         begin = high + REACH
         first, beyond = max(0, low - 2 * REACH), min(count, high + 2 * REACH)
         entry = arm_of(arms, path[first : low + 1], leaving=False)
