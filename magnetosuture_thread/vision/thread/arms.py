@@ -51,7 +51,8 @@ FREEDOM = 4.0  # degrees of freedom of Student's distribution: some threads bend
 MAX_TURN = 2.0  # rad; from the chord, by which a strand leaves an arm
 BARE_COST = 0.5  # for each pixel of a joining curve that shows nothing
 END_COST = 12.0  # of an arm that ends, besides what its state costs among all states
-SHORT_COST, WHOLE = 4.0, 0.85  # of a way on which the thread ends early: before this share of its greatest length
+SHORT_COST = 4.0  # of a way on which the thread ends early ...
+WHOLE, EARLY = 0.85, 0.2  # ... before this share of its greatest length, in full where it lacks so much more
 SPREAD = math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2)  # of states in all directions, bent up to 0.1 / px
 
 
@@ -329,10 +330,10 @@ def continuations(
             costs[one, other] = costs[other, one] = cost
     closed, beyond = _beyond(ridge, dish, lengths[1], arms, entry)
     costs[closed] = np.inf
-    short = lengths[0] + beyond < WHOLE * lengths[1]
-    short[entry] = False
-    costs[entry, short] += SHORT_COST
-    costs[short, entry] += SHORT_COST
+    early = SHORT_COST * np.clip((WHOLE - (lengths[0] + beyond) / lengths[1]) / EARLY, 0.0, 1.0)
+    early[entry] = 0.0
+    costs[entry] += early
+    costs[:, entry] += early
     every = list(pairings(tuple(range(count))))
     totals = np.array([sum(costs[pair] for pair in pairing) for pairing in every])
     weights = np.exp(totals.min() - totals)

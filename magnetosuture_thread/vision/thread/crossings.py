@@ -28,6 +28,7 @@ REACH = round(RADIUS_PX / STEP_PX)  # vertices
 MAX_GAP = 3  # vertices without another strand within a crossing
 FORK = 3  # arms, where two strands become one
 MERGED = 24  # vertices, over which two strands may be seen as one
+MAX_TURN = 1.5  # rad; of the arms within a crossing's length, beyond which the walk's way isn't overruled
 MAX_CROSSINGS = 16
 
 
@@ -87,6 +88,10 @@ def resolve_crossings(
         entry = arm_of(arms, path[first : low + 1], leaving=False)
         if len(arms) < 3 or entry < 0:
             continue
+        # Bending energies mean little beyond small turns, where an arm is missing, and for a rope, merged with another
+        # over most of its arm's length. The walk knows the inside better: it isn't overruled, only doubted.
+        turn = (path[high - 1, 5] - path[low - 1, 5]) * float(np.mean([abs(arm.curvature) for arm in arms]))
+        overrules = turn < MAX_TURN and len(arms) % 2 == 0 and ridge.stiffness <= 1.0
         arms, entry = without_walked(arms, entry, path[:first, :2])
         taken = arm_of(arms, path[high - 1 : beyond], leaving=True)
         chances = continuations(ridge, dish, (float(path[low, 5]), max_length), arms, entry)
@@ -96,6 +101,9 @@ def resolve_crossings(
             crossings.append(
                 Crossing(low, high, float(chances[entry if ends else taken]) if ends or taken >= 0 else 0.0)
             )
+            continue
+        if best != taken and not overrules:
+            crossings.append(Crossing(low, high, 0.0 if taken < 0 else float(chances[taken])))
             continue
         if best == taken:
             crossings.append(Crossing(low, high, float(chances[best])))
