@@ -53,7 +53,7 @@ BARE_COST = 0.5  # for each pixel of a joining curve that shows nothing
 END_COST = 12.0  # of an arm that ends, besides what its state costs among all states
 SHORT_COST = 4.0  # of a way on which the thread ends early ...
 WHOLE, EARLY = 0.85, 0.2  # ... before this share of its greatest length, in full where it lacks so much more
-SPREAD = math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2)  # of states in all directions, bent up to 0.1 / px
+ANY_STATE = math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2)  # of states in all directions, bent up to 0.1 / px
 
 
 @dataclass(frozen=True)
@@ -323,7 +323,7 @@ def continuations(
         entry: number of the arm by which the strand comes; its own probability is that the strand ends.
     """
     count = len(arms)
-    costs = np.full((count, count), END_COST + 0.5 * SPREAD)
+    costs = np.full((count, count), END_COST + 0.5 * ANY_STATE)
     for one in range(count):
         for other in range(one + 1, count):
             cost = 0.5 * (_cost(ridge, arms[one], arms[other]) + _cost(ridge, arms[other], arms[one]))
