@@ -91,8 +91,10 @@ def _crossings(one: Points, other: Points, *, own: bool) -> list[tuple[float, fl
     return found
 
 
-def rope_case(count: int, shallow: bool, random: Random) -> RopeCase:
-    """Draw some ropes at random, of which the first is crossed at least once, at shallow angles or at others."""
+def rope_case(
+    count: int, shallow: bool, random: Random, crossings: tuple[int, int] = (1, 10), min_angle: float = SHALLOW[0]
+) -> RopeCase:
+    """Draw some ropes at random, of which the first is crossed so many times, at shallow angles or at others."""
     for _ in range(MAX_TRIES):
         lines = [_wound(random, random.uniform(*LENGTHS_PX), random.uniform(0.008, 0.02)) for _ in range(count)]
         if any(line is None for line in lines):
@@ -102,8 +104,11 @@ def rope_case(count: int, shallow: bool, random: Random) -> RopeCase:
         for line in every[1:]:
             crossed += _crossings(every[0], line, own=False)
         angles = np.array([angle for _, angle in crossed])
-        low = SHALLOW[0]
-        if not len(angles) or len(angles) > 10 or angles.min() < low or shallow != bool((angles < SHALLOW[1]).any()):
+        if (
+            not crossings[0] <= len(angles) <= crossings[1]
+            or angles.min() < min_angle
+            or shallow != bool((angles < SHALLOW[1]).any())
+        ):
             continue
         # Its beginning is free.
         rest = np.vstack([every[0][60:], *every[1:]])
@@ -241,5 +246,6 @@ def rope_row(name: str, count: int, seed: int) -> RopeRow:
 
 
 ROPES = {f"ropes_{count}": partial(rope_case, count, False) for count in (1, 2, 3)} | {
-    "ropes_shallow": partial(rope_case, 3, True)
+    "ropes_shallow": partial(rope_case, 3, True),
+    "ropes_tangled": partial(rope_case, 3, True, crossings=(2, 6), min_angle=10.0),
 }

@@ -23,7 +23,7 @@ from magnetosuture_thread.vision.needle.size import LengthEstimator
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.centreline import walk_from
+from magnetosuture_thread.vision.thread.centreline import certain_points, walk_from
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
 from magnetosuture_thread.vision.thread.observe import observe
 
@@ -300,7 +300,7 @@ def centreline_of(
     wall = 0.5 * diameter / view.metres_per_pixel
     max_length = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
     walk = walk_from(picture, needle, max_length, _local(view, picture).centre_px, wall)
-    return walk.points, walk.passes
+    return certain_points(walk), walk.passes
 
 
 def tracked(

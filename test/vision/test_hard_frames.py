@@ -52,6 +52,22 @@ def test_dark_pale_thin_and_wide_threads_are_followed(name: str):
     assert (row(name).wrong_line or 0.0) < 0.02
 
 
+@pytest.mark.parametrize(
+    ("name", "followed"), [("second_thread", 6), ("crossing_itself", 6), ("second_thread_shallow", 4)]
+)
+def test_where_threads_cross_the_needles_own_is_followed_or_none(name: str, followed: int):
+    assert row(name).found == FRAMES
+    assert round(row(name).covered_90 * FRAMES) >= followed
+    assert (row(name).wrong_line or 0.0) < 0.01
+    assert (row(name).misplaced, row(name).incomplete, row(name).not_free) == (0, 0, 0)
+
+
+def test_a_thread_beside_the_needles_own_is_not_taken_for_it():
+    assert row("second_thread_beside").found == FRAMES
+    assert row("second_thread_beside").covered > 0.95
+    assert (row("second_thread_beside").wrong_line or 0.0) < 0.005
+
+
 @pytest.mark.parametrize("name", ["thread_undyed_1px", "thread_undyed_4px"])
 def test_nothing_else_is_followed_in_place_of_a_faint_thread(name: str):
     assert row(name).found == FRAMES

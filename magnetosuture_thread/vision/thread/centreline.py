@@ -20,9 +20,9 @@ from magnetosuture_thread.vision.thread.search import (
     Walk,
     is_strong,
 )
-from magnetosuture_thread.vision.thread.walk import min_confidence
 
 WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
+MIN_CONFIDENCE = 0.9  # of a crossing, that the thread is followed beyond
 FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
 MIN_BEGINNING, MIN_EVIDENCE = 2.5, 5.0  # mean evidence where a thread comes out and of all of it: more than noise shows
 
@@ -51,7 +51,8 @@ def find_centreline(
     background within a few pixels, of the image without the needle. Where that shows too little, the thread is faint or
     pale, and a signed difference is taken, whose noise has no mean; see `ridge`. The walk leaves the tail along
     the arc that shows most of the thread, below the needle where it must, and goes by steps along arcs that look some
-    way ahead, a change of curvature having a price: so it goes straight through crossings and over gaps. Where the
+    way ahead, a change of curvature having a price: so it goes straight over gaps. At crossings the smoothest of all
+    pairings of the strands that meet decides. Where the
     needle or the lamp's reflection hides the thread, nothing counts for or against a way. A thread wider than the
     window is looked for at half the size.
 
@@ -63,19 +64,29 @@ def find_centreline(
         wall: the dish's radius; the walk stops before it [px].
 
     Returns:
-        Vertices from the tail on, shape (m, 2) [px], m = 1 if no thread is seen.
+        Vertices from the tail on, up to the first crossing where it is in doubt how the thread goes on, shape (m, 2)
+        [px], m = 1 if no thread is seen.
     """
-    return walk_from(picture, needle, max_length, centre, wall).points
+    return certain_points(walk_from(picture, needle, max_length, centre, wall))
+
+
+def certain_points(walk: Walk) -> np.ndarray:
+    """Return the vertices of a walk up to the first crossing where it is in doubt how the thread goes on."""
+    doubtful = [crossing for crossing in walk.crossings if crossing.confidence < MIN_CONFIDENCE]
+    if not doubtful:
+        return walk.points
+    at = arc_lengths(walk.points)
+    last = int(np.searchsorted(at, _share(walk, doubtful[0].first) * at[-1]))
+    return walk.points[: max(2, last)]
 
 
 def follow_thread(
     picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
 ) -> FollowedThread:
-    """Follow the thread as `find_centreline` does, and judge where it may have gone on along another way.
+    """Follow the thread as `find_centreline` does, but beyond doubtful crossings too, with a confidence.
 
-    At each vertex the arc ahead that was taken is held against the best other one that lies on a ridge too: a thread
-    that crosses, or an own loop. The confidence is the least of all vertices, see `min_confidence`: it falls with the
-    strength of the other way and rises with the bend that the other needs more.
+    At each crossing with another thread, or of the thread with itself, the confidence is how probable the way is that
+    was taken: the least of all crossings counts. See `arms`.
 
     Args:
         picture: see `find_centreline`.
@@ -85,17 +96,16 @@ def follow_thread(
         wall: see there.
     """
     walk = walk_from(picture, needle, max_length, centre, wall)
-    if len(walk.path) < MIN_CENTRED:
+    if not walk.crossings:
         return FollowedThread(walk.points, 1.0 if len(walk.points) > 1 else 0.0, None)
-    ridge, path = walk.ridge, walk.path
-    confidence, vertex = min_confidence(
-        ridge.strength, ridge.hidden, ridge.factor, ridge.noise, ridge.faintest, ridge.stiffness, path
-    )
-    if vertex < 0:
-        return FollowedThread(walk.points, 1.0, None)
-    share = path[vertex, 5] / path[-1, 5]
-    at = points_at(walk.points, np.array([share * arc_lengths(walk.points)[-1]]))[0]
-    return FollowedThread(walk.points, float(confidence), np.asarray(at))
+    least = min(walk.crossings, key=lambda crossing: crossing.confidence)
+    at = _share(walk, (least.first + least.last) // 2) * arc_lengths(walk.points)[-1]
+    return FollowedThread(walk.points, least.confidence, points_at(walk.points, np.array([at]))[0])
+
+
+def _share(walk: Walk, vertex: int) -> float:
+    """Return at which share of its length a walk passes a vertex of its path."""
+    return float(walk.path[min(vertex, len(walk.path) - 1), 5] / walk.path[-1, 5])
 
 
 def walk_from(
@@ -112,7 +122,7 @@ def walk_from(
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
             best = search.centred(wide)[0]
-    return search.without_passing_line(best)
+    return search.resolved(search.without_passing_line(best))
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:

@@ -28,6 +28,9 @@ from magnetosuture_thread.vision.sampling import middle
 SHRUNK = 3  # how much smaller the image is in which objects are looked for
 SLENDER_CELLS = 5  # side of the median window there: wider than twice a needle, narrower than an object
 FIT_CELL_PX = 8  # the floor's light is fitted to means of cells of this size
+COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
+BEYOND_PX = 3.0  # its tip, that is not seen either
+BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can leave
 ROUNDS, TUKEY = 8, 4.0  # of the robust fit, and standard deviations beyond which a cell counts nothing
 SETTLED = 0.1  # grey levels; weights that change by less in a round are the fit's
 MIN_CONTRAST, MIN_COLOUR = 0.05, 0.03  # of the floor's light, by which an object differs in brightness, in colour
@@ -222,3 +225,11 @@ def _bound(values: NDArray[np.float64], minimum: float) -> float:
     """Return beyond what a value is not the floor's, by the spread of those of cells."""
     usual = middle(values)
     return max(minimum, abs(usual) + CONTRAST_DEVIATIONS * 1.4826 * middle(np.abs(values - usual)))
+
+
+def cover_needle(hidden: NDArray[np.uint8], factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
+    """Mark where a needle hides the thread, in a mask `factor` times smaller than the picture from `origin` on."""
+    axis = needle.arc.at(np.linspace(BEHIND_TAIL_PX, needle.length_px + BEYOND_PX, 24)) - origin
+    small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
+    thickness = needle.width_px + 2.0 * COVERED_PX
+    cv2.polylines(hidden, [small], False, 255, max(1, round(thickness / factor)), cv2.LINE_8, 4)

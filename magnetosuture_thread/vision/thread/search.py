@@ -14,7 +14,9 @@ from magnetosuture_thread.vision.needle.erase import smooth_without_needle, with
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.cross_section import CrossSection, centred_between_edges
-from magnetosuture_thread.vision.thread.forks import follow
+from magnetosuture_thread.vision.thread.crossings import Crossing, resolve_crossings
+from magnetosuture_thread.vision.thread.forks import follow, worth
+from magnetosuture_thread.vision.thread.hiding import cover_needle
 from magnetosuture_thread.vision.thread.joint import joins_passing_line
 from magnetosuture_thread.vision.thread.outlines import count_off_outline
 from magnetosuture_thread.vision.thread.ridge import (
@@ -33,20 +35,17 @@ from magnetosuture_thread.vision.thread.ridge import (
 )
 from magnetosuture_thread.vision.thread.walk import refine
 
-COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
-BEYOND_PX = 3.0  # its tip, that is not seen either
 MAX_BEYOND_PX = 12.0  # hidden by the needle and what is next to it, beside its length
 SHADE, SHADE_PX = 0.12, 10.0  # of steel's darkness, that its shadow has, and how far beside it that lies
 WALL_PX = 4.0  # before which the walk ends
 AT_WALL_PX = 40.0  # from the wall, where its rim may look like the thread's beginning
-BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can leave
 ENOUGH = 0.85  # of the greatest length: so much thread seen, dark and strong, needs no other search
 FAINT = 25.0  # grey levels; a black-hat fainter than this may be a pale thread's shadow
 STRONG_SHARE = 0.08  # of enough, that a strong dark thread must show to be the thread: the rest of it is covered
 SCALES = (1, 2)  # how much smaller the image is in which a faint, a pale or a wide thread is looked for
 RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
 FAINT_HALF = 3  # vertices to both sides, over which a faint walk is centred
-COARSE, COARSE_MEDIAN = 4, 15  # how much smaller an image shows what is wide, and the window of its surroundings [px]
+COARSE, COARSE_MEDIAN = 4, 25  # how much smaller an image shows what is wide, and the window of its surroundings [px]
 COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
 WIDE_SHARE = 1.2  # of a walk's contrast, that what is wide has beside it in the shrunk image
 WIDE_FAINTEST = 0.3  # of the contrast at the tail, that it shows everywhere
@@ -68,6 +67,9 @@ class Walk:
         strength: median of the ridge along it [grey levels].
         ridge: that was followed.
         path: the walk in the ridge's pixels; see `walk_on`.
+        strong: whether the thread is visible at each vertex of the path.
+        between_edges: whether the points are centred between the thread's edges; see `ThreadSearch.centred`.
+        crossings: where it could have gone on along another strand; see `ThreadSearch.resolved`.
         passes: whether a line passes the tail, and was not followed; see `joins_passing_line`.
     """
 
@@ -76,6 +78,9 @@ class Walk:
     strength: float
     ridge: Ridge
     path: np.ndarray
+    strong: np.ndarray
+    between_edges: bool = False
+    crossings: tuple[Crossing, ...] = ()
     passes: bool = False
 
 
@@ -118,7 +123,7 @@ class ThreadSearch:
         # Copied: a slice of the mask is handed to compiled code and to drawing, which want their own memory.
         self._hidden = np.ascontiguousarray(hidden)
         self._covered = np.zeros_like(self._hidden)
-        _cover(self._covered, factor, needle, self._origin)
+        cover_needle(self._covered, factor, needle, self._origin)
         self._hidden |= self._covered
 
     def dark(self) -> Walk:
@@ -185,8 +190,9 @@ class ThreadSearch:
         whole = centred_between_edges(self._picture.image, self._needle, walk.points, hidden)
         found = whole.up_to_its_end()
         share = len(found.points) / len(whole.points)
-        path = walk.path[: max(1, round(share * len(walk.path)))]
-        return replace(walk, points=found.points, shown=share * walk.shown, path=path), found
+        kept = max(1, round(share * len(walk.path)))
+        path, strong, shown = walk.path[:kept], walk.strong[:kept], share * walk.shown
+        return replace(walk, points=found.points, shown=shown, path=path, strong=strong, between_edges=True), found
 
     def without_passing_line(self, walk: Walk) -> Walk:
         """Return a walk, or its first vertex alone if it follows a line that passes the tail.
@@ -195,7 +201,7 @@ class ThreadSearch:
         """
         if walk.ridge.scale == COARSE or not joins_passing_line(walk.points, walk.ridge, self._origin):
             return walk
-        return replace(walk, points=walk.points[:1], path=walk.path[:1], shown=0.0, passes=True)
+        return replace(walk, points=walk.points[:1], path=walk.path[:1], strong=walk.strong[:1], shown=0.0, passes=True)
 
     @cached_property
     def _coarse(self) -> np.ndarray:
@@ -285,13 +291,10 @@ class ThreadSearch:
     def _walked(self, ridge: Ridge) -> Walk:
         """Walk along a ridge."""
         scale = ridge.scale
-        shift = 0.5 * (scale - 1)
         max_length = self._max_length / scale
-        max_steps = int(max_length) + 16  # steps are longer than a pixel
-        path, strong = np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
-        needle, origin = self._needle, self._origin
-        tail, direction = (needle.tail_px - origin - shift) / scale, needle.direction_px
-        dish = (np.append(np.subtract(self._centre, origin) - shift, self._reach) / scale).tolist()
+        path, strong = self._buffers(ridge)
+        needle, dish = self._needle, self._dish(ridge)
+        tail, direction = (needle.tail_px - self._origin - 0.5 * (scale - 1)) / scale, needle.direction_px
         count, shown = follow(
             ridge.strength,
             ridge.hidden,
@@ -301,13 +304,45 @@ class ThreadSearch:
             ridge.single,
             ridge.stiffness,
             np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
-            (dish[0], dish[1], dish[2]),
+            dish,
             max_length,
             (needle.length_px + MAX_BEYOND_PX) / scale,
             self._at_wall,
             path,
             strong,
         )
+        return self._ended(ridge, path, strong, count, shown)
+
+    def _buffers(self, ridge: Ridge) -> tuple[np.ndarray, np.ndarray]:
+        """Return room for a path along a ridge; see `walk_on`."""
+        max_steps = int(self._max_length / ridge.scale) + 16  # steps are longer than a pixel
+        return np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
+
+    def _dish(self, ridge: Ridge) -> tuple[float, float, float]:
+        """Return the dish's centre and how far from it a walk may go, in a ridge's pixels."""
+        u, v = (np.subtract(self._centre, self._origin) - 0.5 * (ridge.scale - 1)) / ridge.scale
+        return float(u), float(v), self._reach / ridge.scale
+
+    def resolved(self, walk: Walk) -> Walk:
+        """Return a walk that takes the most probable way at its crossings; see `resolve_crossings`."""
+        ridge, count = walk.ridge, len(walk.path)
+        if count < MIN_CENTRED:
+            return walk
+        path, strong = self._buffers(ridge)
+        path[:count], strong[:count] = walk.path, walk.strong
+        max_length = self._max_length / ridge.scale
+        count, crossings = resolve_crossings(ridge, self._dish(ridge), max_length, path, strong, count)
+        if count == len(walk.path) and np.array_equal(path[:count], walk.path):
+            return replace(walk, crossings=crossings)
+        found = self._ended(ridge, path, strong, count, float(worth(path, strong, count)))
+        if walk.between_edges:
+            found = self.centred(found)[0]
+        return replace(found, crossings=tuple(each for each in crossings if each.first < len(found.path)))
+
+    def _ended(self, ridge: Ridge, path: np.ndarray, strong: np.ndarray, count: int, shown: float) -> Walk:
+        """Return the walk along a path up to where it shows the thread."""
+        scale, origin = ridge.scale, self._origin
+        shift = 0.5 * (scale - 1)
         points = path[:count, :2].copy()
         kept = count
         if self._picture.mask is not None:
@@ -318,7 +353,8 @@ class ThreadSearch:
         points = points[:kept]
         refine(ridge.strength, ridge.noise, points, strong[:kept], FAINT_HALF if ridge.signed else 0)
         strength = float(np.median(path[1:kept, 4])) if kept > 1 else 0.0
-        return Walk(points * scale + shift + origin, shown * scale, strength, ridge, path[:kept].copy())
+        points = points * scale + shift + origin
+        return Walk(points, shown * scale, strength, ridge, path[:kept].copy(), strong[:kept].copy())
 
     def _clear_wall(self, ridge: Ridge) -> None:
         """Take what the rim is mixed into out of a signed ridge, but for where the rim was taken out of the image."""
@@ -355,11 +391,3 @@ class ThreadSearch:
         cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
         floor = ridge.noise if ridge.signed else 0.0
         near[(zone > 0) & (near < floor + shade)] = floor
-
-
-def _cover(hidden: np.ndarray, factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
-    """Mark where the needle hides the thread."""
-    axis = needle.arc.at(np.linspace(BEHIND_TAIL_PX, needle.length_px + BEYOND_PX, 24)) - origin
-    small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
-    thickness = needle.width_px + 2.0 * COVERED_PX
-    cv2.polylines(hidden, [small], False, 255, max(1, round(thickness / factor)), cv2.LINE_8, 4)

@@ -26,7 +26,6 @@ SMOOTHING = 0.05  # weight of the newest strength in the usual one
 ASIDE_PX, ACROSS = 0.5, 9  # between samples across a ridge, and how many
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
 FORK = 0.75  # of the usual strength, at least, along the other way
-TELLING_BEND = 0.06  # 1/px; a way that bends more by this is less likely by a factor e
 FORCED = 4  # steps that a walk is held to the other way
 
 
@@ -177,32 +176,6 @@ def walk_on(
 
 
 @compiled
-def min_confidence(ridge, hidden, factor, noise, faintest, stiffness, path):
-    """Return the least confidence of all places where a path could have gone another way, and the vertex there.
-
-        1 - min(1, s_other / s_taken) exp(-(|k_other - k| - |k_taken - k|) / TELLING_BEND)
-
-    with the mean strength s of the ridge along the two arcs ahead, and by how much each changes the curvature k.
-
-    Returns:
-        The confidence, 1 if there is no such place, and the vertex, -1 then.
-    """
-    bends, scores = np.empty(BENDS), np.empty(BENDS)
-    least, vertex = 1.0, -1
-    for index in range(1, len(path) - AHEAD):
-        u, v, angle, bend, usual, _ = path[index]
-        first, second, other = best_arcs(
-            ridge, hidden, factor, noise, faintest, usual, stiffness, (u, v, angle, bend), bends, scores
-        )
-        if other <= 0.0:
-            continue
-        bend_cost = stiffness * BEND_COST * (1.0 + NOISE_COST * (faintest / usual) ** 2)
-        taken = scores.max() + bend_cost * abs(first - bend)
-        sharper = max(0.0, abs(second - bend) - abs(first - bend))
-        confidence = 1.0 - min(1.0, other / max(taken, 1e-9)) * math.exp(-sharper / TELLING_BEND)
-        if confidence < least:
-            least, vertex = confidence, index
-    return least, vertex
 
 
 @compiled
