@@ -17,6 +17,7 @@ from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.model.barriers import ObstacleAvoidance, WallAvoidance
+from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
 from magnetosuture_thread.model.program import (
     SPAN,
@@ -105,6 +106,8 @@ class StepResult:
         solves: number of programs solved.
         converged: whether the end satisfies the barriers themselves, not only their last linearisation; of
             `paper` the hard ones, those of the obstacles.
+        multipliers: of the segments, shape (n,), and of contacts as forces on the nodes, shape (n + 1, d), in the
+            program's units; None where these are of no mechanics.
     """
 
     state: ThreadState
@@ -113,6 +116,7 @@ class StepResult:
     residuals: Residuals
     solves: int
     converged: bool
+    multipliers: tuple[Vector, Points] | None = None
 
 
 class StepBuffers(NamedTuple):
@@ -137,6 +141,7 @@ class StepBuffers(NamedTuple):
         normal: shape (c, d).
         nearest: shape (c,).
         push: what contacts last pushed each node with, shape (n + 1,).
+        contact_force: the same as vectors, of all contacts of a node, shape (n + 1, d).
     """
 
     blocks: NDArray[np.float64]
@@ -157,6 +162,7 @@ class StepBuffers(NamedTuple):
     normal: Points
     nearest: NDArray[np.bool_]
     push: Vector
+    contact_force: Points
 
     @classmethod
     def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> StepBuffers:
@@ -181,6 +187,7 @@ class StepBuffers(NamedTuple):
             np.zeros((contacts, dimension)),
             np.zeros(contacts, dtype=np.bool_),
             np.zeros(nodes),
+            np.zeros((nodes, dimension)),
         )
 
     def enlarged(self) -> StepBuffers:
@@ -277,12 +284,19 @@ def contact_rows(
 
 @compiled
 def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
-    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node."""
+    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node.
+
+    Of these also their forces.
+    """
     buffers.multipliers[: len(multipliers)] = multipliers
     buffers.push[:] = 0.0
+    buffers.contact_force[:] = 0.0
     for r in range(rows, len(multipliers)):
         node = buffers.node[r - rows]
         buffers.push[node] = max(buffers.push[node], multipliers[r])
+        for k in range(SPAN):
+            for a in range(buffers.contact_force.shape[1]):
+                buffers.contact_force[buffers.first[r] + k, a] += buffers.gradient[r, k, a] * multipliers[r]
 
 
 @compiled
@@ -366,6 +380,15 @@ class Formulation(ABC):
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
         return np.full(self._thread.segments, self._thread.segment_length)
+
+    def forces(self, result: StepResult, heading: Points) -> ThreadForces | None:
+        """Return the forces at the end of a step, None where the formulation is of no mechanics.
+
+        Args:
+            result: of the step.
+            heading: of the needle at its end, shape (d,).
+        """
+        return None
 
     @abstractmethod
     def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
