@@ -16,6 +16,7 @@ from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
+from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.formulations import (
     Formulation,
     PaperOptions,
@@ -75,6 +76,7 @@ class Prediction:
         converged: whether every step ended where the barriers themselves hold, not only their linearisations;
             if not, the margins are those of a thread that is not where the equations say.
         compute_margins: of this prediction.
+        compute_forces: of this prediction.
     """
 
     stamp: float
@@ -89,11 +91,20 @@ class Prediction:
     residual: float
     converged: bool
     compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
+    compute_forces: Callable[[], ThreadForces | None] = field(default=lambda: None, repr=False, compare=False)
 
     @cached_property
     def margins(self) -> Margins:
         """The margins of every barrier by its name, in SI units; computed at first access."""
         return self.compute_margins()
+
+    @cached_property
+    def forces(self) -> ThreadForces | None:
+        """Tension, contact forces and the thread's pull on the needle; computed at first access.
+
+        None before the first step, and with a formulation that is of no mechanics.
+        """
+        return self.compute_forces()
 
 
 class ThreadPredictor:
@@ -284,7 +295,7 @@ class ThreadPredictor:
             raise InvalidInputError("thread's first node", f"{gap:.2e} m from the needle's tail", nearest)
         self.state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
         self.pose = pose
-        return self._prediction(pose, 0.0, 0, None, Residuals(0.0, 0.0, 0.0), True)
+        return self._prediction(pose, 0.0, 0, None, None, Residuals(0.0, 0.0, 0.0), True)
 
     def follow_on(self, other: ThreadPredictor) -> None:
         """Continue from the state of another predictor, if it has started."""
@@ -329,7 +340,7 @@ class ThreadPredictor:
         way = max(map(math.dist, begin.tolist(), end.tolist()))
         wanted = max(interval / self._longest_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
         substeps = min(self._most_substeps, math.ceil(wanted - 1e-9))
-        residuals, worst, converged = Residuals(0.0, 0.0, 0.0), None, True
+        residuals, done, worst, converged = Residuals(0.0, 0.0, 0.0), None, None, True
         for index in range(1, substeps + 1):
             part = index / substeps
             heading = direction_between(last.heading, pose.heading, part)
@@ -342,14 +353,15 @@ class ThreadPredictor:
             converged = converged and done.converged
             worst = done if worst is None or worst.status == SOLVED else worst
         self.pose, self.state = pose, state
-        return self._prediction(pose, interval, substeps, worst, residuals, converged)
+        return self._prediction(pose, interval, substeps, done, worst, residuals, converged)
 
     def _prediction(
         self,
         pose: NeedlePose,
         interval: float,
         substeps: int,
-        step: StepResult | None,
+        last: StepResult | None,
+        worst: StepResult | None,
         residuals: Residuals,
         converged: bool,
     ) -> Prediction:
@@ -362,6 +374,9 @@ class ThreadPredictor:
             rows = formulation.margins(positions, pose.heading)
             return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
 
+        def compute_forces() -> ThreadForces | None:
+            return None if last is None else formulation.forces(last, pose.heading)
+
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
         return Prediction(
@@ -372,11 +387,12 @@ class ThreadPredictor:
             strain=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,
             substeps=substeps,
-            solver=step.solver if step else "none",
-            status=step.status if step else STARTED,
+            solver=worst.solver if worst else "none",
+            status=worst.status if worst else STARTED,
             residual=residuals.largest,
             converged=converged,
             compute_margins=compute_margins,
+            compute_forces=compute_forces,
         )
 
 

@@ -343,7 +343,7 @@ def correct(
             buffers.lower[row] = buffers.upper[row] = end[0]
             buffers.compliance[row], buffers.multipliers[row] = scale * end[1], 0.0
             row += 1
-        contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius)
+        contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True)
         if contacts < 0:
             return NO_ROOM, solves, off, found
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)

@@ -186,7 +186,7 @@ def _assemble(
         buffers.lower[r] = -(gain if r < stiff else options.stiffness_gain) * buffers.value[r]
         buffers.upper[r] = np.inf
         buffers.compliance[r] = 1.0 / (options.connectivity_weight if r < stiff else options.stiffness_weight)
-    contacts, depth = contact_rows(buffers, rows, workspace, start, start, known, 1.0 / gain, unit, radius)
+    contacts, depth = contact_rows(buffers, rows, workspace, start, start, known, 1.0 / gain, unit, radius, False)
     for r in range(rows, rows + contacts):
         clearance = buffers.value[r]
         if clearance > 0.0 and buffers.obstacle[r - rows] != WALL:

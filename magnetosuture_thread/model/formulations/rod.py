@@ -39,6 +39,7 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity
+from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.formulations.added_rows import LinearRows
 from magnetosuture_thread.model.formulations.rod_step import (
     ENDED,
@@ -186,7 +187,39 @@ class RodFormulation(Formulation):
         end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
-        return StepResult(end, solver, status, worst, solves, converged=off <= 1.0)
+        pushes = self._buffers.multipliers[: self._rows].copy(), self._buffers.contact_force.copy()
+        return StepResult(end, solver, status, worst, solves, converged=off <= 1.0, multipliers=pushes)
+
+    def forces(self, result: StepResult, heading: Points) -> ThreadForces:
+        """Return the forces at the end of a step; see `Formulation`."""
+        assert result.multipliers is not None
+        rod, state, multipliers = self._rod, result.state, result.multipliers
+        unit, positions = rod.unit, state.positions / rod.unit
+        scale = (rod.drag_across + rod.mass_per_length / state.interval) * unit**2
+        along = positions[1:] - positions[:-1]
+        chords = np.linalg.norm(along, axis=1)
+        tension = scale * multipliers[0] * chords
+        work, gradient = np.empty((2, *positions.shape)), np.empty(positions.shape)
+        mechanics.bending_gradient(positions, heading, rod.clamped, rod.rest_angles, work, gradient)
+        tangents = along / chords[:, None]
+        # The end correction takes some of the load on the last segment from the node behind its middle.
+        last = mechanics.END_CORRECTION * unit * float(self._load(state.velocities[-1], tangents[-1]) @ tangents[-1])
+        tension[-1] += last
+        # What bending passes on through each segment, besides the force that keeps its length.
+        passed = -rod.bending_stiffness / unit**2 * np.cumsum(gradient[:-1], axis=0)
+        force = tension[0] * tangents[0] + passed[0] + 0.5 * unit * self._load(state.velocities[0], tangents[0])
+        tension += np.einsum("ij,ij->i", passed, tangents)
+        moment = 0.0
+        if rod.clamped:
+            turned = np.array([-heading[1], heading[0]]) if len(heading) == 2 else np.full(3, np.nan)
+            moment = -2.0 * rod.bending_stiffness / unit * float(work[1, 0] @ turned)
+        return ThreadForces(tension, scale * multipliers[1], force, moment)
+
+    def _load(self, velocity: Points, tangent: Points) -> Points:
+        """Return drag and weight per length [N/m]."""
+        rod = self._rod
+        along = (rod.drag_across - rod.drag_along) * float(tangent @ velocity) * tangent
+        return np.asarray(rod.mass_per_length * rod.gravity - rod.drag_across * velocity + along)
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""

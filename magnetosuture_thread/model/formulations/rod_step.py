@@ -113,7 +113,9 @@ def assemble_step(
     segments = len(about) - 1
     mechanics.chord_lengths(about, given.heading, rod.clamped, buffers.chords)
     strain = segment_rows(buffers, about, start, known, interval)
-    contacts, depth = contact_rows(buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius)
+    contacts, depth = contact_rows(
+        buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius, True
+    )
     off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
     if contacts >= 0 and (solves == 0 or off > 1.0):
         _objective(rod, buffers, motion, given)
@@ -272,6 +274,8 @@ def solve_step(
 ) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
     """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
 
+    A solve that comes out less than half as far off as the last one is followed by one that is linearised halfway.
+
     Args:
         axes: 0 to d - 1.
         rod: the thread.
@@ -300,8 +304,15 @@ def solve_step(
     if solves == 0:
         init_step(motion, given, rod.unit)
     worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
+    last_off, last_about = np.inf, motion.about.copy()
     while True:
         contacts, off = assemble_step(solves, rod, buffers, workspace, motion, given, elsewhere)
+        if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < max_solves:
+            # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
+            motion.about[:] = 0.5 * (motion.about + last_about)
+            contacts, _ = assemble_step(0, rod, buffers, workspace, motion, given, elsewhere)
+        last_off = off
+        last_about[:] = motion.about
         if contacts < 0:
             return NO_ROOM, contacts, solves, off, status, worst
         if off <= 1.0 or solves == max_solves:

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from magnetosuture_thread.barrier import Barrier, BarrierRows, CompiledBarrier
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
+from magnetosuture_thread.geometry.obstacles import WALL, Workspace, WorkspaceData
+from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
 from magnetosuture_thread.geometry.obstacles.contacts import find_contacts
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.model.barriers import ObstacleAvoidance, WallAvoidance
+from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
 from magnetosuture_thread.model.program import (
     SPAN,
@@ -105,6 +107,8 @@ class StepResult:
         solves: number of programs solved.
         converged: whether the end satisfies the barriers themselves, not only their last linearisation; of
             `paper` the hard ones, those of the obstacles.
+        multipliers: of the segments, shape (n,), and of contacts as forces on the nodes, shape (n + 1, d), in the
+            program's units; None where these are of no mechanics.
     """
 
     state: ThreadState
@@ -113,6 +117,7 @@ class StepResult:
     residuals: Residuals
     solves: int
     converged: bool
+    multipliers: tuple[Vector, Points] | None = None
 
 
 class StepBuffers(NamedTuple):
@@ -136,7 +141,9 @@ class StepBuffers(NamedTuple):
         distance: shape (c,).
         normal: shape (c, d).
         nearest: shape (c,).
-        push: what contacts last pushed each node with, shape (n + 1,).
+        place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
+        push: what contacts last pushed each node and each segment with, shape (2, n + 1).
+        contact_force: the same as vectors, of all contacts of a node, shape (n + 1, d).
     """
 
     blocks: NDArray[np.float64]
@@ -156,7 +163,9 @@ class StepBuffers(NamedTuple):
     distance: Vector
     normal: Points
     nearest: NDArray[np.bool_]
-    push: Vector
+    place: Vector
+    push: NDArray[np.float64]
+    contact_force: Points
 
     @classmethod
     def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> StepBuffers:
@@ -180,7 +189,9 @@ class StepBuffers(NamedTuple):
             np.zeros(contacts),
             np.zeros((contacts, dimension)),
             np.zeros(contacts, dtype=np.bool_),
-            np.zeros(nodes),
+            np.zeros(contacts),
+            np.zeros((2, nodes)),
+            np.zeros((nodes, dimension)),
         )
 
     def enlarged(self) -> StepBuffers:
@@ -226,10 +237,12 @@ def contact_rows(
     interval: float,
     unit: float,
     radius: float,
+    chords: bool,
 ) -> tuple[int, float]:
-    """Write the rows  n' u >= (-h(y) - n' (x - y)) / dt  of the contacts near y, with h = sd(y) - rho.
+    """Write the rows  n' u(s) >= (-h(y) - n' (x - y)(s)) / dt  of the contacts near y, with h = sd(y(s)) - rho.
 
-    In the end their nodes and obstacles, `WALL` among them, are the first of the buffers's.
+    A contact is at a node, s = 0, or at a place s between node i and the next, where u(s) = (1 - s) u_i + s u_{i+1},
+    and so x and y. In the end their nodes and obstacles, `WALL` among them, are the first of the buffers's.
 
     Args:
         buffers: written, from a row on.
@@ -241,48 +254,66 @@ def contact_rows(
         interval: dt [s].
         unit: D [m].
         radius: rho [m].
+        chords: whether there are rows of places between nodes.
 
     Returns:
-        The number of rows, -1 if there is no room for them, and the greatest depth of a node [m].
+        The number of rows, -1 if there is no room for them, and the greatest depth of a contact [m].
     """
     nodes, dimension = about.shape
+    points = about * unit
     found = find_contacts(
-        about * unit, workspace, buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.nearest
+        points, workspace, buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.nearest
     )
+    if found > 0 and chords:
+        near = np.zeros(nodes, dtype=np.bool_)
+        for c in range(found):
+            buffers.place[c] = 0.0
+            near[buffers.node[c]] = near[buffers.node[c]] or buffers.obstacle[c] != WALL
+        to = ChordContacts(buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.place)
+        found = find_chord_contacts(points, workspace, unit, radius, near, found, to)
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
     kept, depth = 0, 0.0
     for c in range(found):
-        i = buffers.node[c]
-        if known[i]:
+        i, s = buffers.node[c], buffers.place[c]
+        if known[i] and (s == 0.0 or known[i + 1]):
             continue
         clearance = buffers.distance[c] - radius
         depth = max(depth, -clearance)
         bound = -clearance / unit
         begin, here = min(i, nodes - 3), row + kept
-        for a in range(dimension):
-            normal = buffers.normal[c, a]
-            for k in range(SPAN):
-                buffers.gradient[here, k, a] = normal if begin + k == i else 0.0
-            bound -= normal * (start[i, a] - about[i, a])
+        for k in range(SPAN):
+            weight = 1.0 - s if begin + k == i else (s if begin + k == i + 1 else 0.0)
+            for a in range(dimension):
+                buffers.gradient[here, k, a] = weight * buffers.normal[c, a]
+                bound -= buffers.gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
+            if known[begin + k]:
+                buffers.gradient[here, k] = 0.0
         buffers.first[here], buffers.value[here] = begin, clearance / unit
         buffers.lower[here], buffers.upper[here] = bound / interval, np.inf
         # A node that has to be pushed out may be held in by something else: then as far as it goes.
         buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 else 0.0
-        buffers.multipliers[here] = buffers.push[i]
-        buffers.node[kept], buffers.obstacle[kept] = i, buffers.obstacle[c]
+        buffers.multipliers[here] = buffers.push[0 if s == 0.0 else 1, i]
+        buffers.node[kept], buffers.obstacle[kept], buffers.place[kept] = i, buffers.obstacle[c], s
         kept += 1
     return kept, depth
 
 
 @compiled
 def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
-    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node."""
+    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node.
+
+    Of these also their forces.
+    """
     buffers.multipliers[: len(multipliers)] = multipliers
     buffers.push[:] = 0.0
+    buffers.contact_force[:] = 0.0
     for r in range(rows, len(multipliers)):
-        node = buffers.node[r - rows]
-        buffers.push[node] = max(buffers.push[node], multipliers[r])
+        node, kind = buffers.node[r - rows], 0 if buffers.place[r - rows] == 0.0 else 1
+        buffers.push[kind, node] = max(buffers.push[kind, node], multipliers[r])
+        for k in range(SPAN):
+            for a in range(buffers.contact_force.shape[1]):
+                buffers.contact_force[buffers.first[r] + k, a] += buffers.gradient[r, k, a] * multipliers[r]
 
 
 @compiled
@@ -366,6 +397,15 @@ class Formulation(ABC):
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
         return np.full(self._thread.segments, self._thread.segment_length)
+
+    def forces(self, result: StepResult, heading: Points) -> ThreadForces | None:
+        """Return the forces at the end of a step, None where the formulation is of no mechanics.
+
+        Args:
+            result: of the step.
+            heading: of the needle at its end, shape (d,).
+        """
+        return None
 
     @abstractmethod
     def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:

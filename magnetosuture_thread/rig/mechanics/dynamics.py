@@ -144,6 +144,16 @@ class RigDynamics:
         return np.asarray(self._rod.stretching * (chords / self._rod.segment - 1.0))
 
     @property
+    def thread_pull(self) -> NDArray[np.float64]:
+        """Force of the thread on the needle, at the tail, shape (2,) [N]: of stretching, bending and the clamp."""
+        rod, edges, clamp = self._rod, np.diff(self.thread[:3], axis=0), self._needle.clamp
+        stretch = self.tension[0] * edges[0] / np.linalg.norm(edges[0])
+        c, s = math.cos(rod.rest_turn), math.sin(rod.rest_turn)
+        bend = c * (edges[1] - edges[0]) + s * np.array([edges[1, 1], -edges[1, 0]])
+        gap = edges[0] + self._turned(self._q, np.array([rod.segment, clamp[1]]))
+        return np.asarray(stretch - rod.bending / rod.segment**3 * bend + 2.0 * clamp[0] * gap)
+
+    @property
     def energy(self) -> float:
         """Elastic energy of the thread, with the clamp's [J]."""
         rod, nodes = self._rod, self.thread

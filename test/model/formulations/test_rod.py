@@ -25,6 +25,7 @@ from magnetosuture_thread.model.thread import Attachment, Thread
 from test.model.formulations.scenes import (
     DT,
     TOLERANCE,
+    box,
     east,
     followed,
     formulated,
@@ -207,16 +208,6 @@ def test_a_thread_pushed_onto_obstacles_stays_outside_and_bears_on_them(obstacle
         assert stretch(thread, done.state.positions) < 5e-3
         touched = touched or least < 1e-7
     assert touched
-
-
-def box(centre: tuple[float, float, float], half: float) -> Mesh:
-    """Return a cube."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half + centre
-    faces = [
-        (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-        (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
-    ]  # fmt: skip
-    return Mesh(corners, np.array(faces))
 
 
 @pytest.mark.parametrize("obstacle", [box((-0.009, 0.003, 0.0), 0.0015), Disc((-0.009, 0.003, 0.0002), 0.0015)])

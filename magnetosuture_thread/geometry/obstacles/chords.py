@@ -1,0 +1,233 @@
+"""Contacts of a chain's segments, between its nodes: with discs and balls, corners of polygons, edges of meshes."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles.contacts import BALL, EDGES, WorkspaceData, cell_of
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_MARKS, FACE_WIDTH
+from magnetosuture_thread.geometry.obstacles.search import Vector
+from magnetosuture_thread.geometry.polyline import Points
+
+CONE = 0.25
+"""Sine of the angle by which a segment may lie flatter than what is next to a corner: on a rounded one that is made
+of many, a segment turns from one to the next within a step, and has the rows of both."""
+
+REACH = 0.12
+"""Part of the nodes' reach within which a chord has a row; where it moves farther in a step, it has one in the next
+linearisation."""
+
+
+class Chord(NamedTuple):
+    """A segment: where it begins, its unit direction, and its length [m]."""
+
+    start: Vector
+    along: Vector
+    length: float
+
+
+class ChordContacts(NamedTuple):
+    """Arrays that contacts are written to; see `find_contacts` for the first four.
+
+    Attributes:
+        node: the first of the segment's two, shape (c,).
+        obstacle: shape (c,).
+        distance: shape (c,) [m].
+        normal: shape (c, d).
+        place: where on the segment, 0 to 1, shape (c,).
+    """
+
+    node: NDArray[np.int64]
+    obstacle: NDArray[np.int64]
+    distance: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    place: NDArray[np.float64]
+
+
+@compiled
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def _at(numbers: NDArray[np.float64], k: int) -> Vector:
+    return numbers[k], numbers[k + 1], numbers[k + 2]
+
+
+@compiled
+def _write(
+    count: int, place: float, distance: float, normal: Vector, node: int, obstacle: int, to: ChordContacts
+) -> int:
+    """Write a contact; return the new count, -1 if there is no room."""
+    if count < 0 or count >= len(to.node):
+        return -1
+    to.node[count], to.obstacle[count], to.distance[count], to.place[count] = node, obstacle, distance, place
+    for a in range(to.normal.shape[1]):
+        to.normal[count, a] = normal[a]
+    return count + 1
+
+
+@compiled
+def _corner(chord: Chord, numbers: NDArray[np.float64], k: int, reach: float) -> tuple[float, float, Vector]:
+    """Return place, distance and normal of a polygon's corner, the start of edge k; a place of -1 for none.
+
+    The corner sticks out, its projection is on the chord, and no edge beside it is nearer: the normal, across the
+    chord and outwards, lies between those of the edges. A chord on the corner's inner side has a negative distance.
+    """
+    # Most corners are beside the chord or far from it, so that is asked first.
+    x, y = numbers[k] - chord.start[0], numbers[k + 1] - chord.start[1]
+    ux, uy, _ = chord.along
+    s, aside = x * ux + y * uy, x * uy - y * ux
+    none = -1.0, 0.0, chord.along
+    if not (0.0 < s < chord.length and abs(aside) <= max(reach, 0.5 * chord.length)):
+        return none
+    turn = numbers[k + 7] * numbers[k + 5] - numbers[k + 8] * numbers[k + 4]
+    sign = 1.0 if ux * numbers[k + 10] - uy * numbers[k + 9] >= 0.0 else -1.0
+    nx, ny, distance = -sign * uy, sign * ux, sign * aside
+    if (
+        not turn > 0.0
+        or nx * numbers[k + 4] + ny * numbers[k + 5] > CONE
+        or nx * numbers[k + 7] + ny * numbers[k + 8] < -CONE
+        or not -0.5 * chord.length < distance <= reach
+    ):
+        return none
+    return s / chord.length, distance, (nx, ny, 0.0)
+
+
+@compiled
+def _edge(chord: Chord, numbers: NDArray[np.float64], k: int, side: int, reach: float) -> tuple[float, float, Vector]:
+    """Return place, distance and normal of a mesh's edge, one of face k; a place of -1 for none.
+
+    The closest points of the two lines lie on both, and the normal, across both and outwards, is between those of the
+    faces: it points from the edge into neither.
+    """
+    begin, end = _at(numbers, k + 3 * side), _at(numbers, k + 3 * ((side + 1) % 3))
+    outward, across = _at(numbers, k + 21 + 3 * side), _at(numbers, k + 12 + 3 * side)
+    face = _at(numbers, k + 9)
+    none = -1.0, 0.0, outward
+    way = end[0] - begin[0], end[1] - begin[1], end[2] - begin[2]
+    length = math.sqrt(_dot(way, way))
+    way = way[0] / length, way[1] / length, way[2] / length
+    # From the edge into its own face, where the edge runs with the solid below and the face to its left.
+    into = face[1] * way[2] - face[2] * way[1], face[2] * way[0] - face[0] * way[2], face[0] * way[1] - face[1] * way[0]
+    cosine = _dot(chord.along, way)
+    square = 1.0 - cosine * cosine
+    if not square > 1e-12 or not _dot(across, face) < 0.0:  # in line, or no edge that sticks out
+        return none
+    to = chord.start[0] - begin[0], chord.start[1] - begin[1], chord.start[2] - begin[2]
+    s = (cosine * _dot(way, to) - _dot(chord.along, to)) / square
+    t = _dot(way, to) + s * cosine
+    if not (0.0 < s < chord.length and 0.0 <= t <= length):
+        return none
+    u, v, size = chord.along, way, math.sqrt(square)
+    normal = (
+        (u[1] * v[2] - u[2] * v[1]) / size,
+        (u[2] * v[0] - u[0] * v[2]) / size,
+        (u[0] * v[1] - u[1] * v[0]) / size,
+    )
+    if _dot(normal, outward) < 0.0:
+        normal = -normal[0], -normal[1], -normal[2]
+    if _dot(normal, across) > CONE or _dot(normal, into) > CONE:
+        return none
+    distance = _dot(to, normal)
+    if not -0.5 * chord.length < distance <= reach:
+        return none
+    return s / chord.length, distance, normal
+
+
+@compiled
+def _round(chord: Chord, centre: Vector, reach: float) -> tuple[float, float, Vector]:
+    """Return place, distance from the centre and normal of a disc or ball; a place of -1 for none."""
+    to = centre[0] - chord.start[0], centre[1] - chord.start[1], centre[2] - chord.start[2]
+    s = _dot(to, chord.along)
+    x, y, z = s * chord.along[0] - to[0], s * chord.along[1] - to[1], s * chord.along[2] - to[2]
+    length = math.sqrt(x * x + y * y + z * z)
+    if not (0.0 < s < chord.length and 0.0 < length <= reach):
+        return -1.0, 0.0, chord.along
+    return s / chord.length, length, (x / length, y / length, z / length)
+
+
+@compiled
+def find_chord_contacts(
+    points: Points,
+    data: WorkspaceData,
+    segment: float,
+    radius: float,
+    near: NDArray[np.bool_],
+    count: int,
+    to: ChordContacts,
+) -> int:
+    """Write where the chords between nodes are closest to what sticks out of obstacles; what nodes touch is not in it.
+
+    The distance from a corner or an edge is that of the chord. Along a disc or ball of radius R a thread of radius
+    rho is an arc, from whose chord the centre is
+
+        (R + rho) cos(D / (2 (R + rho)))
+
+    away: what is more than that is the distance beyond rho. So nodes lie on the surface, and the arc, not its chord.
+    The wall of a dish needs no rows: inside of a circle a chord is farther from it than its ends.
+
+    Args:
+        points: nodes, shape (n + 1, d) [m].
+        data: `Workspace.data`.
+        segment: D [m].
+        radius: rho [m].
+        near: of each node, whether an obstacle is within reach, shape (n + 1,).
+        count: contacts that are in the arrays already.
+        to: written from there on.
+
+    Returns:
+        The number of contacts with those before; -1 when there are more than the arrays have room for.
+    """
+    reach = REACH * data.reach
+    for i in range(len(points) - 1):
+        if not (near[i] or near[i + 1]):
+            continue
+        start = points[i, 0], points[i, 1], points[i, 2] if points.shape[1] == 3 else 0.0
+        x, y = points[i + 1, 0] - start[0], points[i + 1, 1] - start[1]
+        z = points[i + 1, 2] - start[2] if points.shape[1] == 3 else 0.0
+        length = math.sqrt(x * x + y * y + z * z)
+        if not 0.0 < length < np.inf:
+            continue
+        chord = Chord(start, (x / length, y / length, z / length), length)
+        middle = start[0] + 0.5 * x, start[1] + 0.5 * y, start[2] + 0.5 * z
+        cell = cell_of(middle, 0, data)
+        if cell < 0:
+            continue
+        for slot in range(data.entries[cell], data.entries[cell + 2]):
+            o = int(data.entries[slot])
+            kind, frame, table = data.tables[o + 1, 0], data.frames[o + 1], data.tables[o + 1]
+            if kind == BALL:
+                place, distance, normal = _round(chord, _at(frame, 0), frame[5] + reach)
+                if place >= 0.0:
+                    outer = frame[5] + radius
+                    distance -= outer * math.cos(min(0.5 * segment / outer, 1.5)) - radius
+                    count = _write(count, place, distance, normal, i, o, to)
+                continue
+            cell = cell_of(middle, o + 1, data)
+            if cell < 0:
+                continue
+            for entry in range(data.entries[cell], data.entries[cell + 2]):
+                feature = data.entries[entry]
+                if kind == EDGES:
+                    place, distance, normal = _corner(chord, data.numbers, table[6] + EDGE_WIDTH * feature, reach)
+                    if place >= 0.0:
+                        count = _write(count, place, distance, normal, i, o, to)
+                    continue
+                for side in range(3):
+                    if data.entries[table[7] + FACE_MARKS * feature + side] == 0:
+                        continue  # the neighbour's to give
+                    k = table[6] + FACE_WIDTH * feature
+                    place, distance, normal = _edge(chord, data.numbers, k, side, reach)
+                    if place >= 0.0:
+                        count = _write(count, place, distance, normal, i, o, to)
+            if count < 0:
+                return -1
+        if count < 0:
+            return -1
+    return count

@@ -1,0 +1,47 @@
+"""The forces of a step: what its multipliers and the rod's energies say in newtons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.program import Vector
+
+
+@dataclass(frozen=True, eq=False)
+class ThreadForces:
+    """The forces in a thread and on it, at the end of a step.
+
+    A row's multiplier is the force that keeps its barrier. With the program in units of the segment's length D, and of
+    the metric's scale Z = zeta_perp + mu / dt,
+
+        T_i = Z D^2 lambda_i |x_i - x_{i-1}| / D,    N_i = Z D^2 sum_c lambda_c n_c
+
+    over the contacts c of node i. The thread pulls the needle with what is left of the balance of the node at its tail,
+
+        F = T_1 t_1 - (EI / D^2) dE / dx_0 - (D / 2) (zeta_perp (I - t_1 t_1') + zeta_par t_1 t_1') v_0 + (D / 2) mu g
+
+    and turns it, if clamped, by M = -dE_bend / d(heading angle).
+
+    Attributes:
+        tension: T_i of each segment, positive where it is pulled, shape (n,) [N]. It is what keeps the segment's
+            length; the resultant of the stresses along the tangent is greater by EI times the squared curvature.
+        contact: N_i, the force of shapes and wall upon each node, shape (n + 1, d) [N].
+        needle_force: F, of the thread upon the needle, at its tail, shape (d,) [N].
+        needle_moment: M about the tail, counter-clockwise, 0 of a pinned thread; in the plane only, else NaN [N m].
+
+    Source: Lagrange's multipliers; the paper works no force out. Deviation: inertia of the half segment at the needle
+    and the damping of bending are not in F.
+    """
+
+    tension: Vector
+    contact: Points
+    needle_force: Vector
+    needle_moment: float
+
+    @property
+    def peak_tension(self) -> float:
+        """The greatest tension of all segments [N]."""
+        return float(np.max(self.tension))

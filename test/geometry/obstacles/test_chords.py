@@ -1,0 +1,137 @@
+"""Contacts of segments between their nodes: against distances of finely sampled segments, and of threads drawn over."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
+from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
+from magnetosuture_thread.model.formulations import ThreadState
+from test.model.formulations.scenes import DT, box, east, formulated, lead, silk
+
+SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
+REACH = 0.02  # of nodes; chords have a part of it
+SEGMENT = 0.004
+
+
+def rounded(radius: float, corners: int) -> Polygon:
+    """Return a square with rounded corners, each of many vertices."""
+    around = shapely.Polygon(SQUARE.outline).buffer(-radius).buffer(radius, quad_segs=corners)
+    return Polygon(tuple(map(tuple, shapely.normalize(around).exterior.coords[:-1])))
+
+
+def contacts(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> list[tuple[float, float, np.ndarray]]:
+    """Return distance, place and normal of every contact of one segment, the nearest first."""
+    room, dimension = 50, len(start)
+    to = ChordContacts(
+        np.zeros(room, np.int64), np.zeros(room, np.int64), np.zeros(room), np.zeros((room, dimension)), np.zeros(room)
+    )
+    data = Workspace((obstacle,), REACH, dimension).data
+    points = np.ascontiguousarray([start, end])
+    near = np.ones(2, dtype=np.bool_)
+    found = find_chord_contacts(points, data, SEGMENT, 0.0, near, 0, to)
+    assert found >= 0
+    assert find_chord_contacts(points, data, SEGMENT, 0.0, ~near, 0, to) == 0
+    return sorted(((to.distance[c], to.place[c], to.normal[c].copy()) for c in range(found)), key=lambda c: c[0])
+
+
+@pytest.mark.parametrize("polygon", [SQUARE, rounded(0.003, 8), rounded(0.0005, 5)])
+def test_a_chord_past_a_corner_has_its_distance(polygon: Polygon):
+    shape = shapely.Polygon(polygon.outline)
+    rng = np.random.default_rng(3)
+    tried = 0
+    for _ in range(400):
+        middle = np.array([0.01, 0.01]) + rng.uniform(-0.0015, 0.001, 2)
+        angle = rng.uniform(0.0, math.pi)
+        along = 0.5 * SEGMENT * np.array([math.cos(angle), math.sin(angle)])
+        start, end = middle - along, middle + along
+        line = shapely.LineString([start, end])
+        ends_out = min(shape.distance(shapely.Point(p)) for p in (start, end))
+        true = shape.distance(line)
+        if line.intersects(shape) or not 0.0 < true < min(2e-3, ends_out - 1e-6):
+            continue  # crosses the shape, is far from it, or is nearest at an end
+        tried += 1
+        found = contacts(polygon, start, end)
+        assert found[0][0] == pytest.approx(true, abs=1e-12)
+        nearest = np.array(start) + found[0][1] * (end - start) - found[0][0] * found[0][2]
+        assert shape.exterior.distance(shapely.Point(nearest)) < 1e-12
+    assert tried > 20
+
+
+def test_a_chord_that_cuts_a_corner_is_as_deep_as_the_corner_sticks_out():
+    (found,) = contacts(SQUARE, np.array([0.0085, 0.0104]), np.array([0.0104, 0.0085]))
+    depth = shapely.LineString([(0.0085, 0.0104), (0.0104, 0.0085)]).distance(shapely.Point(0.01, 0.01))
+    assert found[0] == pytest.approx(-depth, abs=1e-12)
+    np.testing.assert_allclose(found[2], [math.sqrt(0.5), math.sqrt(0.5)], atol=1e-12)
+
+
+def test_a_concave_corner_is_no_contact_of_a_chord():
+    corner = Polygon(((0.0, 0.0), (0.02, 0.0), (0.02, 0.01), (0.01, 0.01), (0.01, 0.02), (0.0, 0.02)))
+    assert not contacts(corner, np.array([0.0105, 0.013]), np.array([0.013, 0.0105]))
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (0.0, 0.0, 0.0)])
+def test_on_a_disc_the_chord_of_an_arc_touches(centre: tuple[float, ...]):
+    disc, half = Disc(centre, 0.005), 0.5 * SEGMENT / 0.005
+    start, end = np.zeros(len(centre)), np.zeros(len(centre))
+    start[:2] = 0.005 * math.cos(half), -0.005 * math.sin(half)
+    end[:2] = start[0], -start[1]
+    (found,) = contacts(disc, start, end)
+    assert found[0] == pytest.approx(0.0, abs=1e-15)
+    assert found[1] == pytest.approx(0.5)
+    start[0] += 1e-4
+    end[0] += 1e-4
+    assert contacts(disc, start, end)[0][0] == pytest.approx(1e-4)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4])
+def test_a_chord_over_an_edge_of_a_mesh_has_its_distance(turn: float):
+    cube = box((0.0, 0.0, 0.0), 0.005)
+    # Above the edge x = z = 0.005, across it, and turned about the axis between.
+    along = np.array([math.cos(turn) * math.sqrt(0.5), math.sin(turn), -math.cos(turn) * math.sqrt(0.5)])
+    for height in (1e-3, 1e-5, -1e-4):
+        middle = np.array([0.005, 0.001, 0.005]) + height * np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5)])
+        (found,) = contacts(cube, middle - 0.002 * along, middle + 0.002 * along)
+        assert found[0] == pytest.approx(height, abs=1e-12)
+        assert found[1] == pytest.approx(0.5)
+        np.testing.assert_allclose(found[2], [math.sqrt(0.5), 0.0, math.sqrt(0.5)], atol=1e-12)
+    flat = np.array([0.0, 0.002, 0.0])  # along the edge: its ends are as near
+    assert not contacts(cube, middle - flat, middle + flat)
+    inside_a_face = np.array([0.001, 0.0005, 0.0055])  # over the diagonal of a flat side, which sticks out nowhere
+    assert not contacts(cube, inside_a_face - 0.001 * east(3), inside_a_face + 0.001 * east(3))
+
+
+def deepest(obstacle: Polygon, positions: np.ndarray, radius: float) -> float:
+    """Return how deep the deepest point of the chain is, of its surface, as sampled at a hundred places a segment."""
+    at = np.linspace(0.0, 1.0, 101)[:, None, None]
+    points = ((1.0 - at) * positions[:-1] + at * positions[1:]).reshape(-1, 2)
+    shape = shapely.Polygon(obstacle.outline)
+    within = shapely.contains_xy(shape, points)
+    depth = shapely.distance(shape.exterior, shapely.points(points))
+    return float(np.max(np.where(within, depth, -depth) + radius))
+
+
+@pytest.mark.parametrize("polygon", [SQUARE, rounded(0.003, 8), rounded(0.0005, 5)])
+def test_a_thread_drawn_around_corners_is_nowhere_deeper_than_its_nodes(polygon: Polygon):
+    thread = silk(segments=81)
+    formulation = formulated(thread, (polygon,))
+    start = np.array([0.03, 0.011])
+    positions = start - thread.segment_length * np.arange(82)[:, None] * np.array([1.0, 0.0])
+    state, worst, pressed = ThreadState.at_rest(positions), -1.0, 0.0
+    for k in range(1, 401):
+        # Around the upper right corner, down along the right side, and left below, at 10 mm/s.
+        angle = 0.0095 * k
+        tail = np.array([0.012, 0.008]) + 0.018 * np.array([math.cos(angle), -math.sin(angle)])
+        done = formulation.step(state, lead(start + min(1.0, k / 40) * (tail - start)), DT)
+        assert done.converged
+        assert done.multipliers is not None
+        state = done.state
+        pressed = max(pressed, float(np.linalg.norm(done.multipliers[1], axis=1).max()))
+        if k % 10 == 0:
+            worst = max(worst, deepest(polygon, state.positions, 0.5 * thread.diameter))
+    assert pressed > 1.0
+    assert worst < 1.5e-7
