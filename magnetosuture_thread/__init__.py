@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from magnetosuture_thread.jobs.replay_offline import replay_offline
     from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
     from magnetosuture_thread.model.margins import BarrierMargins, Margins
-    from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+    from magnetosuture_thread.model.prediction import NeedlePose, Prediction
+    from magnetosuture_thread.model.predictor import ThreadPredictor
     from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
     from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
     from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
@@ -29,7 +30,8 @@ _HOME = {
     "jobs.replay_offline": ("replay_offline",),
     "model.estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
     "model.margins": ("BarrierMargins", "Margins"),
-    "model.predictor": ("NeedlePose", "Prediction", "ThreadPredictor"),
+    "model.prediction": ("NeedlePose", "Prediction"),
+    "model.predictor": ("ThreadPredictor",),
     "model.thread": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
     "safety": ("FilteredCommand", "NeedleSafetyFilter"),
     "scene": ("Dish", "Scene", "SceneShape", "read_scene"),

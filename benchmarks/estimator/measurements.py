@@ -20,7 +20,8 @@ from magnetosuture_thread.evaluation.reference_scores import reference_thread
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
-from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.thread_observation import ThreadObservation
 

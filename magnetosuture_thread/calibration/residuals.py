@@ -13,7 +13,7 @@ from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.evaluation.metrics import error_figures, mean_over_nodes, node_errors
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 

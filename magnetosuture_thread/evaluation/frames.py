@@ -15,7 +15,7 @@ from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.model.margins import Margins, node_clearance
-from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 Array = NDArray[np.float64]

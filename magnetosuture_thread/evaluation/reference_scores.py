@@ -17,7 +17,8 @@ from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajecto
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations import PaperOptions
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Medium, Thread
 

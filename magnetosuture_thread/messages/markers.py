@@ -28,7 +28,7 @@ from magnetosuture_thread.messages.cdr import (
 from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.estimator.estimate import ONE_SIDED_99
 from magnetosuture_thread.model.margins import UNKNOWN, Margins, friction_colour
-from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.model.prediction import Prediction
 
 ARROW, SPHERE_LIST, TEXT_VIEW_FACING = 0, 7, 9  # as in Marker.msg
 ARROW_LENGTH = 2.5e-3  # m; of a disturbance's arrow, whose head is where it acts

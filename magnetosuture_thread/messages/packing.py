@@ -29,7 +29,7 @@ from magnetosuture_thread.messages.cdr import (
 )
 from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.margins import FrictionState, Margins
-from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 _UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg

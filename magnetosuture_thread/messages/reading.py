@@ -19,7 +19,7 @@ from magnetosuture_thread.interface import CLOCK, DISH_FRAME, MARGINS, MEASURED_
 from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
 from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 _POSE = struct.Struct("<7d")  # position and quaternion

@@ -2,7 +2,8 @@
 
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
 from magnetosuture_thread.model.formulations import make_formulation
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.solvers import make_solver
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
@@ -26,85 +23,13 @@ from magnetosuture_thread.model.formulations import (
     make_formulation,
 )
 from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
 from magnetosuture_thread.model.program import SOLVED, Residuals
 from magnetosuture_thread.model.solvers import make_solver
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread, check_scene, direction_between
 from magnetosuture_thread.scene import Scene
 
-MAX_COORDINATE = 10.0  # m; nothing that a dish could hold is farther away
-STARTED = "started"  # status of a prediction that no step led to
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
-
-
-@dataclass(frozen=True)
-class NeedlePose:
-    """The needle at one instant, in the dish frame.
-
-    Attributes:
-        stamp: [s]
-        tail: the blunt end, where the thread is attached, shape (d,) [m].
-        heading: unit vector from tail to tip, shape (d,).
-    """
-
-    stamp: float
-    tail: Points
-    heading: Points
-
-    def __post_init__(self) -> None:
-        """Take sequences of numbers as arrays."""
-        for name in ("tail", "heading"):
-            value = getattr(self, name)
-            if not isinstance(value, np.ndarray):
-                object.__setattr__(self, name, np.array(value, dtype=np.float64))
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """The thread at one instant.
-
-    Attributes:
-        stamp: [s]
-        formulation: name of the formulation.
-        scene_version: of the scene that it was predicted in; empty where the model knows none.
-        positions: of all nodes, shape (n + 1, d) [m].
-        strain: each segment's length from end to end over what it should be, less one, shape (n,).
-        interval: time since the previous prediction [s].
-        substeps: number of steps it was divided into.
-        solver: the solver's name.
-        status: the solver's own word; where one did not solve at once, what had to be tried.
-        residual: the largest scaled residual of the solves.
-        converged: whether every step ended where the barriers themselves hold, not only their linearisations;
-            if not, the margins are those of a thread that is not where the equations say.
-        compute_margins: of this prediction.
-        compute_forces: of this prediction.
-    """
-
-    stamp: float
-    formulation: str
-    scene_version: str
-    positions: Points
-    strain: NDArray[np.float64]
-    interval: float
-    substeps: int
-    solver: str
-    status: str
-    residual: float
-    converged: bool
-    compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
-    compute_forces: Callable[[], ThreadForces | None] = field(default=lambda: None, repr=False, compare=False)
-
-    @cached_property
-    def margins(self) -> Margins:
-        """The margins of every barrier by its name, in SI units; computed at first access."""
-        return self.compute_margins()
-
-    @cached_property
-    def forces(self) -> ThreadForces | None:
-        """Tension, contact forces and the thread's pull on the needle; computed at first access.
-
-        None before the first step, and with a formulation that is of no mechanics.
-        """
-        return self.compute_forces()
 
 
 class ThreadPredictor:
@@ -400,17 +325,3 @@ def _check_node(field: str, node: int, thread: Thread) -> None:
     """Raise `InvalidInputError` unless this is a node of the thread and not the needle's own."""
     if not 1 <= node <= thread.segments:
         raise InvalidInputError(field, node, f"a node from 1 to {thread.segments}; node 0 follows the needle")
-
-
-def check_pose(pose: NeedlePose) -> None:
-    """Raise `InvalidInputError` unless the pose is finite, not absurdly far, and its heading a unit vector."""
-    # In plain floats: for two or three of them numpy takes ten times as long, in every step.
-    if not math.isfinite(pose.stamp):
-        raise InvalidInputError("needle pose stamp", pose.stamp, "a finite time [s]")
-    tail, heading = np.asarray(pose.tail).tolist(), np.asarray(pose.heading).tolist()
-    if not all(abs(value) <= MAX_COORDINATE for value in tail):
-        raise InvalidInputError(
-            "needle pose position", tail, f"finite coordinates, at most {MAX_COORDINATE:g} m from 0"
-        )
-    if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
-        raise InvalidInputError("needle pose heading", heading, "a unit vector")

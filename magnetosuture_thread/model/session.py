@@ -18,7 +18,7 @@ from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
 from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.estimator.session import observation_of
 from magnetosuture_thread.model.margins import FrictionLaw, Margins
-from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction
+from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose, Prediction
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.scene import Scene

@@ -15,7 +15,8 @@ from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimat
 from magnetosuture_thread.model.estimator_settings import EstimatorSettings
 from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
-from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.solvers import SOLVERS, make_solver
 from magnetosuture_thread.model.thread import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
 from magnetosuture_thread.scene import Scene

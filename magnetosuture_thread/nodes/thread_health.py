@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from magnetosuture_thread import InvalidInputError, ThreadEstimate
-from magnetosuture_thread.model.predictor import STARTED
+from magnetosuture_thread.model.prediction import STARTED
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, PredictionResult
 from magnetosuture_thread.nodes.diagnostics import Health

@@ -15,7 +15,7 @@ from magnetosuture_thread.errors import BagError, MagnetosutureError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.interface import CAMERA, COMPRESSED_IMAGE, NEEDLE_POSE
 from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.changes import changed

@@ -264,9 +264,7 @@ def with_thread(
     """Choose the needle that a thread leaves.
 
     Args:
-        picture: the frame or a part of it.
-        view: of the dish.
-        settings: what to look for.
+        picture, view, settings: see `look_once`.
         diameter: of the dish [m].
         needles: that were found, at least one.
 

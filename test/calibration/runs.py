@@ -14,7 +14,7 @@ from magnetosuture_thread.calibration.parameters import with_stiffness_over_drag
 from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties

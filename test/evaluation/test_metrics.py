@@ -17,7 +17,7 @@ from magnetosuture_thread.evaluation.metrics import (
 )
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.model.margins import BarrierMargins, Margins
-from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.model.prediction import Prediction
 
 NODES = np.column_stack([np.linspace(0.0, 1.0, 11), np.zeros(11)])
 

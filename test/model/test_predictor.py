@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
-from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 
 THREAD = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)

@@ -14,7 +14,7 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, S
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import settings as model_settings
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
 from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
@@ -482,7 +482,7 @@ import numpy as np
 from numba.core.registry import CPUDispatcher
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Dish, Scene, SceneShape

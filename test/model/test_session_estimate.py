@@ -13,7 +13,7 @@ from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.estimator import ThreadEstimate
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation

@@ -15,7 +15,8 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model import predictor
 from magnetosuture_thread.model.formulations import PaperOptions, make_formulation
 from magnetosuture_thread.model.margins import SOLID
-from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
 from test.model.worlds import polygon, scene_with

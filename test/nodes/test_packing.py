@@ -35,7 +35,7 @@ from magnetosuture_thread.model.margins import (
     Margins,
     friction_colour,
 )
-from magnetosuture_thread.model.predictor import Prediction
+from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole

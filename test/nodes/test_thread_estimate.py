@@ -15,7 +15,7 @@ from magnetosuture_msgs.msg import SafetyMargins
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.messages.cdr import time_of
-from magnetosuture_thread.model.predictor import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode

@@ -18,7 +18,7 @@ from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameter
 from magnetosuture_thread.model.formulations import ThreadState
 from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
 from magnetosuture_thread.model.thread import Thread
 
 Vector = NDArray[np.float64]

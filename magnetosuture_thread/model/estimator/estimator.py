@@ -35,7 +35,8 @@ from magnetosuture_thread.model.estimator.pieces import (
 )
 from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameters
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]

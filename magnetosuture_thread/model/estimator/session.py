@@ -13,7 +13,8 @@ from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEst
 from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
 from magnetosuture_thread.model.estimator.pieces import LENGTH_ERROR
 from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.predictor import MAX_COORDINATE, NeedlePose, Prediction, ThreadPredictor
+from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 MAX_LATENESS = 1.0  # s; a pose older by more than this is not late: time itself was set back

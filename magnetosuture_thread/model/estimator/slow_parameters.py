@@ -44,7 +44,8 @@ from magnetosuture_thread.model.estimator.corrector import Corrector
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_95
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import Thread
 
 Vector = NDArray[np.float64]

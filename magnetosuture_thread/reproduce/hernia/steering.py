@@ -18,7 +18,7 @@ from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.predictor import NeedlePose, Prediction
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter

@@ -110,7 +110,7 @@ def centred_between_edges(
     """
     points = respaced(walk, SPACING_PX)
     reach = round(((1.0 + ASIDE) * HALF_WIDTHS_PX[-1] + FLOOR_PX) / STEP_PX)
-    aside = STEP_PX * np.arange(-reach, reach + 1)
+    aside = np.asarray(STEP_PX * np.arange(-reach, reach + 1), dtype=np.float64)
     white, on_needle = _white_edges(image, needle, points, aside)
     best: tuple[float, float, Values, NDArray[np.int64]] | None = None
     for half_width in HALF_WIDTHS_PX:

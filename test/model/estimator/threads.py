@@ -10,7 +10,8 @@ from magnetosuture_thread import Disc
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.model.estimator import EstimatorOptions, ThreadEstimator
-from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 

@@ -10,7 +10,8 @@ import pytest
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.model.formulations import StepResult
-from magnetosuture_thread.model.predictor import NeedlePose, ThreadPredictor
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
