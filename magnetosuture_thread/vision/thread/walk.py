@@ -176,7 +176,6 @@ def walk_on(
 
 
 @compiled
-@compiled
 def refine(ridge, noise, points, strong, half):
     """Centre the vertices once more, now that their neighbours on both sides are known, and even them out.
 
