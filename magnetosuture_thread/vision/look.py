@@ -261,15 +261,14 @@ def why_none(refused: list[str]) -> str:
 def with_thread(
     picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needles: list[MeasuredNeedle]
 ) -> tuple[MeasuredNeedle | None, np.ndarray, str]:
-    """Choose the needle that a thread leaves.
+    """Return the needle that a thread leaves, the thread's centreline [px], and why there is none where there is none.
 
     Args:
-        picture, view, settings: see `look_once`.
+        picture: the frame or a part of it.
+        view: of the dish.
+        settings: what to look for.
         diameter: of the dish [m].
         needles: that were found, at least one.
-
-    Returns:
-        The needle, the thread's centreline in the picture's pixels, and why there is none where there is none.
     """
     walks, passes = zip(*(centreline_of(picture, view, settings, diameter, needle) for needle in needles), strict=True)
     lengths = [float(arc_lengths(walk)[-1]) for walk in walks]

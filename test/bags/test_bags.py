@@ -77,7 +77,7 @@ def test_own_messages_are_known(tmp_path: Path):
             bag.add_topic(f"/{name}", f"magnetosuture_msgs/msg/{name}")
         types = typestore().types
         bag.write_message(
-            "/BarrierMargin", 5, types["magnetosuture_msgs/msg/BarrierMargin"]("obstacle", 7, 1, 0.5, 0.25)
+            "/BarrierMargin", 5, types["magnetosuture_msgs/msg/BarrierMargin"]("obstacle", 7, 1, 0.5, 0.25, 0.2)
         )
     record = next(Bag(tmp_path / "own").records())
     assert record.type_name == "magnetosuture_msgs/msg/BarrierMargin"

@@ -42,15 +42,13 @@ from magnetosuture_thread.model.barriers import (
     stiffness_function,
 )
 from magnetosuture_thread.model.formulations.added_rows import LinearRows
+from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows, keep_multipliers
 from magnetosuture_thread.model.formulations.step import (
-    DEPTH_TOLERANCE,
     Formulation,
     PrescribedMotion,
     StepBuffers,
     StepResult,
     ThreadState,
-    contact_rows,
-    keep_multipliers,
     move_prescribed,
 )
 from magnetosuture_thread.model.mechanics import rest_distances

@@ -12,14 +12,8 @@ from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
-from magnetosuture_thread.model.formulations.step import (
-    DEPTH_TOLERANCE,
-    StepBuffers,
-    contact_rows,
-    keep_multipliers,
-    move_prescribed,
-    program_of,
-)
+from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows, keep_multipliers
+from magnetosuture_thread.model.formulations.step import StepBuffers, move_prescribed, program_of
 from magnetosuture_thread.model.program import Vector
 from magnetosuture_thread.model.solvers import banded
 
