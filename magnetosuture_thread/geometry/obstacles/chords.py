@@ -22,6 +22,9 @@ REACH = 0.12
 """Part of the nodes' reach within which a chord has a row; where it moves farther in a step, it has one in the next
 linearisation."""
 
+MAX_STRETCH = 2.0
+"""Length of a chord over that of its segment, from which on it is only on its way to where it will be."""
+
 
 class Chord(NamedTuple):
     """A segment: where it begins, its unit direction, and its length [m]."""
@@ -192,7 +195,7 @@ def find_chord_contacts(
         x, y = points[i + 1, 0] - start[0], points[i + 1, 1] - start[1]
         z = points[i + 1, 2] - start[2] if points.shape[1] == 3 else 0.0
         length = math.sqrt(x * x + y * y + z * z)
-        if not 0.0 < length < np.inf:
+        if not 0.0 < length < MAX_STRETCH * segment:
             continue
         chord = Chord(start, (x / length, y / length, z / length), length)
         middle = start[0] + 0.5 * x, start[1] + 0.5 * y, start[2] + 0.5 * z

@@ -84,8 +84,8 @@ def sampled(image: NDArray[np.uint8] | NDArray[np.float32], points: Points) -> N
 
 def sampled_colours(image: NDArray[np.uint8] | NDArray[np.float32], points: Points) -> NDArray[np.float32]:
     """Return each colour of an image at points of shape (..., 2), shape (..., colours); see `sampled`."""
-    flat = np.ascontiguousarray(points.reshape(-1, 2), dtype=np.float32)
-    u, v = flat[:, None, 0], flat[:, None, 1]
+    at = np.asarray(points.reshape(len(points), -1, 2), dtype=np.float32)  # no side of it longer than OpenCV can count
+    u, v = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
     values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float32).reshape(*points.shape[:-1], -1)
 
