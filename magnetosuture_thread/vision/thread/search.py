@@ -68,7 +68,6 @@ class Walk:
         ridge: that was followed.
         path: the walk in the ridge's pixels; see `walk_on`.
         strong: whether the thread is visible at each vertex of the path.
-        between_edges: whether the points are centred between the thread's edges; see `ThreadSearch.centred`.
         crossings: where it could have gone on along another strand; see `ThreadSearch.resolved`.
         passes: whether a line passes the tail, and was not followed; see `joins_passing_line`.
     """
@@ -79,7 +78,6 @@ class Walk:
     ridge: Ridge
     path: np.ndarray
     strong: np.ndarray
-    between_edges: bool = False
     crossings: tuple[Crossing, ...] = ()
     passes: bool = False
 
@@ -192,7 +190,7 @@ class ThreadSearch:
         share = len(found.points) / len(whole.points)
         kept = max(1, round(share * len(walk.path)))
         path, strong, shown = walk.path[:kept], walk.strong[:kept], share * walk.shown
-        return replace(walk, points=found.points, shown=shown, path=path, strong=strong, between_edges=True), found
+        return replace(walk, points=found.points, shown=shown, path=path, strong=strong), found
 
     def without_passing_line(self, walk: Walk) -> Walk:
         """Return a walk, or its first vertex alone if it follows a line that passes the tail.
@@ -324,9 +322,12 @@ class ThreadSearch:
         return float(u), float(v), self._reach / ridge.scale
 
     def resolved(self, walk: Walk) -> Walk:
-        """Return a walk that takes the most probable way at its crossings; see `resolve_crossings`."""
+        """Return a walk that takes the most probable way at its crossings; see `resolve_crossings`.
+
+        One of a faint or pale thread stays as it is: noise beside it looks like strands that cross it.
+        """
         ridge, count = walk.ridge, len(walk.path)
-        if count < MIN_CENTRED:
+        if count < MIN_CENTRED or ridge.signed:
             return walk
         path, strong = self._buffers(ridge)
         path[:count], strong[:count] = walk.path, walk.strong
@@ -335,8 +336,6 @@ class ThreadSearch:
         if count == len(walk.path) and np.array_equal(path[:count], walk.path):
             return replace(walk, crossings=crossings)
         found = self._ended(ridge, path, strong, count, float(worth(path, strong, count)))
-        if walk.between_edges:
-            found = self.centred(found)[0]
         return replace(found, crossings=tuple(each for each in crossings if each.first < len(found.path)))
 
     def _ended(self, ridge: Ridge, path: np.ndarray, strong: np.ndarray, count: int, shown: float) -> Walk:
