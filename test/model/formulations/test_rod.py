@@ -414,7 +414,10 @@ def test_a_step_goes_on_with_the_other_solvers_where_compiled_code_leaves_it(coa
     helped = [done for done in steps if done.solver == "second"]
     assert 0 < len(helped) < len(steps)
     assert all("solved, after banded: " in done.status for done in helped)
-    assert all(done.status == "solved" for done in steps if done.solver == "banded")
+    # Where contacts change, its first guess may be worse than none.
+    alone = {done.status for done in steps if done.solver == "banded"}
+    assert "solved" in alone
+    assert alone <= {"solved", "solved, after banded: iteration limit"}
 
 
 @pytest.mark.parametrize("hides", [False, True])
