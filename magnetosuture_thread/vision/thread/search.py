@@ -309,6 +309,7 @@ class ThreadSearch:
         max_length = self._max_length / scale
         max_steps = int(max_length) + 16  # steps are longer than a pixel
         path, strong = np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
+        path[0] = 0.0  # all that there is where nothing leaves the tail
         needle, origin = self._needle, self._origin
         tail, direction = (needle.tail_px - origin - shift) / scale, needle.direction_px
         dish = (np.append(np.subtract(self._centre, origin) - shift, self._reach) / scale).tolist()
