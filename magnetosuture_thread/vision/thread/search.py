@@ -291,6 +291,7 @@ class ThreadSearch:
         scale = ridge.scale
         max_length = self._max_length / scale
         path, strong = self._buffers(ridge)
+        path[0] = 0.0  # all that there is where nothing leaves the tail
         needle, dish = self._needle, self._dish(ridge)
         tail, direction = (needle.tail_px - self._origin - 0.5 * (scale - 1)) / scale, needle.direction_px
         count, shown = follow(
