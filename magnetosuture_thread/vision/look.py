@@ -296,7 +296,7 @@ def centreline_of(
         return needle.tail_px[None], False
     wall = 0.5 * diameter / view.metres_per_pixel
     max_length = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
-    walk = walk_from(picture, needle, max_length, _local(view, picture).centre_px, wall)
+    walk = walk_from(picture, needle, max_length, _local(view, picture).centre_px, wall, doubted=True)
     return certain_points(walk), walk.passes
 
 

@@ -109,9 +109,18 @@ def _share(walk: Walk, vertex: int) -> float:
 
 
 def walk_from(
-    picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
+    picture: Picture,
+    needle: MeasuredNeedle,
+    max_length: float,
+    centre: tuple[float, float],
+    wall: float,
+    *,
+    doubted: bool = False,
 ) -> Walk:
-    """Return the walk that shows the thread best, and whether there is none as a line passes; see `find_centreline`."""
+    """Return the walk that shows the thread best; see `find_centreline`.
+
+    Where it is doubted that the needle carries the thread, a line that passes its tail is none of its own.
+    """
     reach = wall - WALL_PX
     search = ThreadSearch(picture, needle, max_length, centre, reach)
     dark = search.dark()
@@ -121,8 +130,9 @@ def walk_from(
     if not whole and len(best.points) >= MIN_CENTRED and search.is_edge(best):
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
-            best = search.centred(wide)[0]
-    return search.resolved(search.without_passing_line(best))
+            centred = search.centred(wide)[0]
+            best = centred if centred.shown > SURE_SHARE * wide.shown else wide  # a rope's edges are too far apart
+    return search.resolved(search.without_passing_line(best) if doubted else best)
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
