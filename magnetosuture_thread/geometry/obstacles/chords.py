@@ -156,6 +156,17 @@ def _round(chord: Chord, centre: Vector, reach: float) -> tuple[float, float, Ve
 
 
 @compiled
+def _bulge(points: Points, i: int, s: float, normal: Vector) -> float:
+    """Return how far a segment's arc is from its chord at a place s, along a normal: s (1 - s) / 2 of its turn."""
+    turn = 0.0
+    for j in (i, i + 1):
+        if 0 < j < len(points) - 1:
+            for a in range(points.shape[1]):
+                turn -= 0.5 * normal[a] * (points[j + 1, a] - 2.0 * points[j, a] + points[j - 1, a])
+    return 0.5 * s * (1.0 - s) * max(turn, 0.0)
+
+
+@compiled
 def find_chord_contacts(
     points: Points,
     data: WorkspaceData,
@@ -167,13 +178,14 @@ def find_chord_contacts(
 ) -> int:
     """Write where the chords between nodes are closest to what sticks out of obstacles; what nodes touch is not in it.
 
-    The distance from a corner or an edge is that of the chord. Along a disc or ball of radius R a thread of radius
-    rho is an arc, from whose chord the centre is
+    The distance from a corner or an edge is that of the chord. That from a disc or ball of radius R is of the arc: at a
+    place s it lies beyond the chord by what the thread turns there, with second differences c and the normal n, and by
+    no more than an arc on the surface, with the thread's radius rho:
 
-        (R + rho) cos(D / (2 (R + rho)))
+        min(-s (1 - s) n . (c_i + c_{i+1}) / 4, (R + rho) (1 - cos(D / (2 (R + rho)))))
 
-    away: what is more than that is the distance beyond rho. So nodes lie on the surface, and the arc, not its chord.
-    The wall of a dish needs no rows: inside of a circle a chord is farther from it than its ends.
+    So a straight thread touches with its chords, and around a disc nodes lie on the surface. The wall of a dish needs
+    no rows: inside of a circle a chord is farther from it than its ends.
 
     Args:
         points: nodes, shape (n + 1, d) [m].
@@ -209,7 +221,8 @@ def find_chord_contacts(
                 place, distance, normal = _round(chord, _at(frame, 0), frame[5] + reach)
                 if place >= 0.0:
                     outer = frame[5] + radius
-                    distance -= outer * math.cos(min(0.5 * segment / outer, 1.5)) - radius
+                    most = outer * (1.0 - math.cos(min(0.5 * segment / outer, 1.5)))
+                    distance += min(_bulge(points, i, place, normal), most) - frame[5]
                     count = _write(count, place, distance, normal, i, o, to)
                 continue
             cell = cell_of(middle, o + 1, data)

@@ -26,13 +26,17 @@ def rounded(radius: float, corners: int) -> Polygon:
 
 def contacts(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> list[tuple[float, float, np.ndarray]]:
     """Return distance, place and normal of every contact of one segment, the nearest first."""
-    room, dimension = 50, len(start)
+    return contacts_of(obstacle, np.array([start, end]))
+
+
+def contacts_of(obstacle: Obstacle, points: np.ndarray) -> list[tuple[float, float, np.ndarray]]:
+    """Return the same of a chain."""
+    room, dimension = 50, points.shape[1]
     to = ChordContacts(
         np.zeros(room, np.int64), np.zeros(room, np.int64), np.zeros(room), np.zeros((room, dimension)), np.zeros(room)
     )
     data = Workspace((obstacle,), REACH, dimension).data
-    points = np.ascontiguousarray([start, end])
-    near = np.ones(2, dtype=np.bool_)
+    near = np.ones(len(points), dtype=np.bool_)
     found = find_chord_contacts(points, data, SEGMENT, 0.0, near, 0, to)
     assert found >= 0
     assert find_chord_contacts(points, data, SEGMENT, 0.0, ~near, 0, to) == 0
@@ -75,17 +79,21 @@ def test_a_concave_corner_is_no_contact_of_a_chord():
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.0, 0.0, 0.0)])
-def test_on_a_disc_the_chord_of_an_arc_touches(centre: tuple[float, ...]):
-    disc, half = Disc(centre, 0.005), 0.5 * SEGMENT / 0.005
-    start, end = np.zeros(len(centre)), np.zeros(len(centre))
-    start[:2] = 0.005 * math.cos(half), -0.005 * math.sin(half)
-    end[:2] = start[0], -start[1]
-    (found,) = contacts(disc, start, end)
-    assert found[0] == pytest.approx(0.0, abs=1e-15)
-    assert found[1] == pytest.approx(0.5)
-    start[0] += 1e-4
-    end[0] += 1e-4
-    assert contacts(disc, start, end)[0][0] == pytest.approx(1e-4)
+def test_around_a_disc_arcs_touch_and_beside_it_chords_do(centre: tuple[float, ...]):
+    disc, half = Disc(centre, 0.02), 0.5 * SEGMENT / 0.02
+    angles = half * np.array([-3.0, -1.0, 1.0, 3.0])
+    nodes = np.zeros((4, len(centre)))
+    nodes[:, 0], nodes[:, 1] = 0.02 * np.cos(angles), 0.02 * np.sin(angles)
+    around = contacts_of(disc, nodes)
+    assert [place for _, place, _ in around] == pytest.approx([0.5] * 3)
+    # The end segments have the turn of one node only.
+    assert sorted(distance for distance, _, _ in around)[-1] == pytest.approx(0.0, abs=1e-6)
+    straight = np.zeros((4, len(centre)))
+    straight[:, 0], straight[:, 1] = 0.0201, SEGMENT * np.array([-1.4, -0.4, 0.6, 1.6])
+    ((distance, place, normal),) = contacts_of(disc, straight)
+    assert distance == pytest.approx(1e-4)
+    assert place == pytest.approx(0.4)
+    np.testing.assert_allclose(normal, east(len(centre)), atol=1e-12)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4])
