@@ -1,0 +1,133 @@
+"""Hold the thread in contact against the simulated rig: a recorded steering through the hernia, forces and depths.
+
+The thread model first steers its needle, a point, as `magnetosuture reproduce hernia` does. Then the rig's rod, of
+springs and with many more segments, is driven along the same way, and the model, with several n, is compared with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.cli.terminal import make_log
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.reproduce.hernia.replay import read_steering, start_centreline
+from magnetosuture_thread.reproduce.hernia.steering import point_filter, replay_steering
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, ThreadProperties
+from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.setups import Setup, read_setup
+
+STEERING = Path("examples/hernia_steering")
+TRUE_SEGMENTS = 240
+MAX_DEPTH = 5e-6  # m, of any point of a chord
+SAMPLES = 21  # of a chord, for its depth
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    option = parser.add_argument
+    option("--bag", type=Path, default=STEERING, metavar="BAG", help="steering to repeat (default: the example)")
+    option("--segments", type=int, nargs="+", default=[40, 80], metavar="N", help="of the model (default: 40 80)")
+
+
+def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+    """Measure; return the figures, and whether no chord is too deep and every step converged."""
+    log = make_log(console)
+    setup = read_setup("hernia_ring")
+    log("the thread model steers its needle")
+    needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
+    steered = replay_steering(setup.model, start_centreline(setup), read_steering(Bag(options.bag)), needle)
+    positions = np.array([instant.prediction.positions[:2] for instant in steered.instants])
+    poses = [
+        NeedlePose(instant.time, tail, (tail - first) / np.linalg.norm(tail - first))
+        for instant, (tail, first) in zip(steered.instants, positions, strict=True)
+    ]
+    log(f"the rig's rod of {TRUE_SEGMENTS} segments follows the same way")
+    truth, pulls = _simulate(setup, poses)
+    rows = [_compared(setup, poses, truth, pulls, segments) for segments in options.segments]
+    table = Table(title=f"hernia_ring, simulated, {poses[-1].stamp:.0f} s; errors in % of the length, mean (maximum)")
+    for name in ("n", "error", "deepest [µm]", "pull on the needle [% of its peak, RMS]", "not converged", "step [µs]"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        error = f"{row['error_mean_percent']:.3f} ({row['error_max_percent']:.2f})"
+        figures = f"{1e6 * row['deepest_m']:.1f}", f"{row['pull_error_percent']:.1f}", str(row["not_converged"])
+        table.add_row(str(row["segments"]), error, *figures, f"{row['median_step_us']:.0f}")
+    console.print(table)
+    passed = all(row["deepest_m"] <= MAX_DEPTH and row["not_converged"] == 0 for row in rows)
+    return {"cases": rows}, passed
+
+
+def _simulate(setup: Setup, poses: list[NeedlePose]) -> tuple[list[Points], Points]:
+    """Return the rod's nodes at each pose, and its pull on the needle, shape (T, 2) [N]."""
+    rig, angles = setup.rig, np.unwrap([float(np.arctan2(pose.heading[1], pose.heading[0])) for pose in poses])
+    thread = ThreadProperties(
+        length=rig.thread_length,
+        segments=TRUE_SEGMENTS,
+        bending_stiffness=rig.thread_bending_stiffness,
+        stretching_stiffness=rig.thread_stretching_stiffness,
+        drag_across=rig.thread_drag_across,
+        drag_along=rig.thread_drag_along,
+        attachment=NeedleJoint.PINNED,
+        diameter=rig.thread_diameter,
+    )
+    body, surface = NeedleBody(2e-4, 5e-5, 0.0, 0.0, 1.0), rig.surface(setup.scene)
+    start = start_centreline(setup)
+    rod = RigDynamics(body, thread, surface, None, poses[0].tail, float(angles[0]), start, largest_step=5e-3)
+    nodes, pulls = [rod.thread], [rod.thread_pull]
+    for before, pose, angle in zip(poses, poses[1:], angles[1:], strict=False):
+        rod.drive(pose.tail, float(angle), pose.stamp - before.stamp)
+        nodes.append(rod.thread)
+        pulls.append(rod.thread_pull)
+    return nodes, np.array(pulls)
+
+
+def _compared(
+    setup: Setup, poses: list[NeedlePose], truth: list[Points], pulls: Points, segments: int
+) -> dict[str, Any]:
+    """Return the figures of the model with n segments."""
+    settings, scene = setup.model, setup.scene
+    predictor = ThreadPredictor.create(
+        settings.material,
+        length=settings.thread_length,
+        segments=segments,
+        viscosity=settings.viscosity,
+        scene=scene,
+    )
+    predictor.warm_up()
+    near = Workspace(scene.obstacles, 3e-3, wall_radius=scene.dish.radius)
+    predictor.start(poses[0], truth[0])
+    errors, steps, found, deepest, unsolved = [], [], [], -np.inf, 0
+    at = np.linspace(0.0, TRUE_SEGMENTS, segments + 1)
+    before = np.minimum(at.astype(int), TRUE_SEGMENTS - 1)
+    part, along = (at - before)[:, None], np.linspace(0.0, 1.0, SAMPLES)[:, None]
+    for pose, nodes in zip(poses[1:], truth[1:], strict=True):
+        began = time.process_time()
+        prediction = predictor.step(pose)
+        steps.append(time.process_time() - began)
+        unsolved += not prediction.converged
+        x, forces = prediction.positions, prediction.forces
+        assert forces is not None
+        found.append(forces.needle_force)
+        true = (1.0 - part) * nodes[before] + part * nodes[before + 1]
+        errors.append(float(np.linalg.norm(x - true, axis=1).mean()) / settings.thread_length)
+        points = ((1.0 - along) * x[:-1, None] + along * x[1:, None]).reshape(-1, 2)
+        gap = near.near(points).distance.min(initial=np.inf) - 0.5 * predictor.thread.diameter
+        deepest = max(deepest, -float(gap))
+    off, peak = np.linalg.norm(np.array(found) - pulls[1:], axis=1), float(np.linalg.norm(pulls, axis=1).max())
+    return {
+        "segments": segments,
+        "error_mean_percent": 100.0 * float(np.mean(errors)),
+        "error_max_percent": 100.0 * float(np.max(errors)),
+        "deepest_m": deepest,
+        "pull_error_percent": 100.0 * float(np.sqrt(np.mean(off**2))) / peak,
+        "not_converged": unsolved,
+        "median_step_us": 1e6 * float(np.median(steps)),
+    }
