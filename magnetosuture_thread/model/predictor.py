@@ -297,7 +297,8 @@ class ThreadPredictor:
 
         def compute_margins() -> Margins:
             rows = formulation.margins(positions, pose.heading)
-            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
+            touching = formulation.chords_in_contact(positions, self.contact_tolerance)
+            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version, touching)
 
         def compute_forces() -> ThreadForces | None:
             return None if last is None else formulation.forces(last, pose.heading)

@@ -22,7 +22,7 @@ REACH = 0.12
 """Part of the nodes' reach within which a chord has a row; where it moves farther in a step, it has one in the next
 linearisation."""
 
-MAX_STRETCH = 2.0
+MAX_ELONGATION = 2.0
 """Length of a chord over that of its segment, from which on it is only on its way to where it will be."""
 
 
@@ -207,7 +207,7 @@ def find_chord_contacts(
         x, y = points[i + 1, 0] - start[0], points[i + 1, 1] - start[1]
         z = points[i + 1, 2] - start[2] if points.shape[1] == 3 else 0.0
         length = math.sqrt(x * x + y * y + z * z)
-        if not 0.0 < length < MAX_STRETCH * segment:
+        if not 0.0 < length < MAX_ELONGATION * segment:
             continue
         chord = Chord(start, (x / length, y / length, z / length), length)
         middle = start[0] + 0.5 * x, start[1] + 0.5 * y, start[2] + 0.5 * z
@@ -247,3 +247,17 @@ def find_chord_contacts(
         if count < 0:
             return -1
     return count
+
+
+def chord_contacts(points: Points, data: WorkspaceData, segment: float, radius: float) -> ChordContacts:
+    """Return what `find_chord_contacts` writes, as arrays of their own; see there for the arguments."""
+    room, near = 4 * len(points), np.ones(len(points), dtype=np.bool_)
+    while True:
+        integers, numbers = np.zeros((2, room), np.int64), np.zeros((2, room))
+        normal = np.zeros((room, points.shape[1]))
+        to = ChordContacts(integers[0], integers[1], numbers[0], normal, numbers[1])
+        found = find_chord_contacts(points, data, segment, radius, near, 0, to)
+        if found >= 0:
+            kept = slice(found)
+            return ChordContacts(to.node[kept], to.obstacle[kept], to.distance[kept], to.normal[kept], to.place[kept])
+        room *= 2

@@ -339,7 +339,7 @@ class ThreadEstimator:
             along = np.gradient(positions, axis=0)
             normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
             covariance = scale * self._variance[:, None, None] * normal[:, :, None] * normal[:, None, :]
-        added = formulation.added.rows(positions)
+        added, tolerance = formulation.added.rows(positions), self.predictor.contact_tolerance
 
         def compute_rows() -> list[BarrierRows]:
             return [*formulation.margins(positions, pose.heading), *added]
@@ -362,7 +362,8 @@ class ThreadEstimator:
             problems=problems,
             slow_parameters=self._slow.report(),
             compute_rows=compute_rows,
-            contact_tolerance=self.predictor.contact_tolerance,
+            contact_tolerance=tolerance,
+            compute_chords_in_contact=lambda: formulation.chords_in_contact(positions, tolerance),
         )
 
     def snapshot(self) -> FilterState | None:

@@ -199,8 +199,12 @@ def _carried_over(state: FilterState, predictor: ThreadPredictor) -> Prediction:
         positions=positions,
         strain=np.hypot(*along.T) / formulation.rest_lengths(positions, heading) - 1.0,
         compute_margins=lambda: Margins.of(
-            formulation.margins(positions, heading), predictor.contact_tolerance, version
+            formulation.margins(positions, heading),
+            predictor.contact_tolerance,
+            version,
+            formulation.chords_in_contact(positions, predictor.contact_tolerance),
         ),
+        compute_forces=lambda: None,
     )
 
 

@@ -36,6 +36,7 @@ import numpy as np
 from magnetosuture_thread.barrier import Barrier, CompiledBarrier
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.obstacles.chords import chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity
@@ -214,6 +215,12 @@ class RodFormulation(Formulation):
             turned = np.array([-heading[1], heading[0]]) if len(heading) == 2 else np.full(3, np.nan)
             moment = -2.0 * rod.bending_stiffness / unit * float(work[1, 0] @ turned)
         return ThreadForces(tension, scale * multipliers[1], force, moment)
+
+    def chords_in_contact(self, positions: Points, tolerance: float) -> tuple[int, ...]:
+        """Return both nodes of each segment that touches an obstacle between them; see `Formulation`."""
+        chords = chord_contacts(positions, self._near.data, self._thread.segment_length, self._radius)
+        first = chords.node[chords.distance - self._radius <= tolerance]
+        return tuple(np.concatenate([first, first + 1]).tolist())
 
     def _load(self, velocity: Points, tangent: Points) -> Points:
         """Return drag and weight per length [N/m]."""
