@@ -126,8 +126,7 @@ def walk_from(
     dark = search.dark()
     enough = ENOUGH * max_length
     best = dark if is_strong(dark, enough) else _best_centred(search, dark, enough)
-    whole = best is not dark and best.shown > enough
-    if not whole and len(best.points) >= MIN_CENTRED and search.is_edge(best):
+    if len(best.points) >= MIN_CENTRED and search.is_edge(best):
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
             centred = search.centred(wide)[0]
