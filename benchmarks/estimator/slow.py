@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,19 +19,35 @@ from magnetosuture_thread.model.predictor import ThreadPredictor
 
 THREADS = (("silk_6_0", "pinned"), ("polyamide_7_0", "clamped"))
 FLOW = (-6e-4, 8e-4)  # m/s
-SLOW_CASES: dict[str, tuple[tuple[str, ...], dict[str, object], dict[str, float]]] = {
-    # What is learned, what is true of the rod, and what is told wrongly: factors, or values where they may be 0.
-    "stiffness x 5": (("stiffness_over_drag",), {"stiffness": 5.0}, {}),
-    "stiffness / 5": (("stiffness_over_drag",), {"stiffness": 0.2}, {}),
-    "anisotropy x 1.5": (("drag_anisotropy",), {}, {"drag_anisotropy": 1.5}),
-    "anisotropy / 1.5": (("drag_anisotropy",), {}, {"drag_anisotropy": 1.0 / 1.5}),
-    "rest curvature": (("rest_curvature",), {}, {"rest_curvature": 50.0}),
-    "flow": (("flow",), {"flow": FLOW}, {}),
-    "stiffness x 5, flow": (("stiffness_over_drag", "flow"), {"stiffness": 5.0, "flow": FLOW}, {}),
-    "stiffness / 5, anisotropy": (
-        ("stiffness_over_drag", "drag_anisotropy"),
-        {"stiffness": 0.2},
-        {"drag_anisotropy": 1.5},
+
+
+@dataclass(frozen=True)
+class SlowCase:
+    """What is learned, and from which wrong beginning.
+
+    Attributes:
+        learned: the parameters, see `EstimatorOptions`.
+        stiffness: factor on the bending stiffness of the true thread.
+        flow: true velocity of the liquid [m/s].
+        told: what the model is told wrongly, by parameter: a factor, or the value of one that may be 0.
+    """
+
+    learned: tuple[str, ...]
+    stiffness: float = 1.0
+    flow: tuple[float, float] = (0.0, 0.0)
+    told: dict[str, float] = field(default_factory=dict)
+
+
+SLOW_CASES = {
+    "stiffness x 5": SlowCase(("stiffness_over_drag",), stiffness=5.0),
+    "stiffness / 5": SlowCase(("stiffness_over_drag",), stiffness=0.2),
+    "anisotropy x 1.5": SlowCase(("drag_anisotropy",), told={"drag_anisotropy": 1.5}),
+    "anisotropy / 1.5": SlowCase(("drag_anisotropy",), told={"drag_anisotropy": 1.0 / 1.5}),
+    "rest curvature": SlowCase(("rest_curvature",), told={"rest_curvature": 50.0}),
+    "flow": SlowCase(("flow",), flow=FLOW),
+    "stiffness x 5, flow": SlowCase(("stiffness_over_drag", "flow"), stiffness=5.0, flow=FLOW),
+    "stiffness / 5, anisotropy": SlowCase(
+        ("stiffness_over_drag", "drag_anisotropy"), stiffness=0.2, told={"drag_anisotropy": 1.5}
     ),
 }
 
@@ -39,24 +55,23 @@ SLOW_CASES: dict[str, tuple[tuple[str, ...], dict[str, object], dict[str, float]
 def measure_slow(count: int, seed: int, progress: Callable[[], None]) -> list[dict[str, Any]]:
     """Return, of each case, material and parameter, errors of x and the share of 95 % intervals that hold the truth."""
     found = []
-    for name, (learned, truth, told) in SLOW_CASES.items():
+    for name, case in SLOW_CASES.items():
         for material, attachment in THREADS:
             errors: dict[str, list[tuple[float, float, bool]]] = {}
             spent = []
             for number in range(seed, seed + count):
                 progress()
                 tails, headings = wander(number, DURATION, RATE, SPEED)
-                run = simulate(model_thread(material, 25, attachment), tails, headings, RATE, **truth)  # type: ignore[arg-type]
-                flow = tuple(float(each) for each in truth.get("flow", ()))  # type: ignore[attr-defined]
-                factor = float(truth.get("stiffness", 1.0))  # type: ignore[arg-type]
-                real = replace(run.thread, bending_stiffness=factor * run.thread.bending_stiffness)
-                real = replace(real, medium=replace(real.medium, flow=flow))
+                told = model_thread(material, 25, attachment)
+                run = simulate(told, tails, headings, RATE, stiffness=case.stiffness, flow=case.flow)
+                medium, stiffness = replace(told.medium, flow=case.flow), case.stiffness * told.bending_stiffness
+                real = replace(told, bending_stiffness=stiffness, medium=medium)
                 thread = run.thread
-                for parameter, value in told.items():
+                for parameter, value in case.told.items():
                     kind = KINDS[parameter][0]
                     thread = kind.write(thread, value * kind.read(thread) if kind.logarithmic else value)
                 predictor = ThreadPredictor(thread, Workspace((), 5e-3, wall_radius=run.wall_radius))
-                estimator = ThreadEstimator(predictor, EstimatorOptions(slow_parameters=learned))
+                estimator = ThreadEstimator(predictor, EstimatorOptions(slow_parameters=case.learned))
                 rng, camera = np.random.default_rng(number), CameraModel()
                 estimate = estimator.start_observed(run.poses[0], camera.observe(run.threads[0], 0.0, rng))
                 for pose, nodes in zip(run.poses[1:], run.threads[1:], strict=True):
@@ -64,7 +79,7 @@ def measure_slow(count: int, seed: int, progress: Callable[[], None]) -> list[di
                     began = time.perf_counter()
                     estimate = estimator.step(pose, observation)
                     spent.append(time.perf_counter() - began)
-                kinds = {kind.name: kind for each in learned for kind in KINDS[each]}
+                kinds = {kind.name: kind for each in case.learned for kind in KINDS[each]}
                 for each in estimate.slow_parameters:
                     kind, true = kinds[each.name], kinds[each.name].read(real)
                     off = abs(kind.to_x(each.value) - kind.to_x(true))

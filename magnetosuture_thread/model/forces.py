@@ -21,9 +21,9 @@ class ThreadForces:
 
     over the contacts c of node i. The thread pulls the needle with what is left of the balance of the node at its tail,
 
-        F = T_1 t_1 - (EI / D^2) dE / dx_0 - (D / 2) (zeta_perp (I - t_1 t_1') + zeta_par t_1 t_1') v_0 + (D / 2) mu g
+        F = T_1 t_1 - (EI / D^2) dE / dx_0 + (D / 2) (mu g - zeta_perp v + (zeta_perp - zeta_par) t_1 t_1' v)
 
-    and turns it, if clamped, by M = -dE_bend / d(heading angle).
+    with the tail's velocity v against the medium, and turns it, if clamped, by M = -dE_bend / d(heading angle).
 
     Attributes:
         tension: T_i of each segment, positive where it is pulled, shape (n,) [N]. It is what keeps the segment's

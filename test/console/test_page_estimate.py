@@ -55,7 +55,7 @@ def test_an_estimate_that_is_not_measured_any_more_says_so(operator: Operator) -
     expect(operator.page.locator("#margins")).not_to_contain_text("Measured")
 
 
-def test_a_force_that_was_found_is_marked_where_it_is_and_put_into_words(operator: Operator) -> None:
+def test_a_disturbance_is_marked_at_its_position_and_described(operator: Operator) -> None:
     graph = operator.served.graph
     operator.page.emulate_media(color_scheme="light")
     graph.shown = estimated_state(found=True)
@@ -79,7 +79,7 @@ def test_an_old_estimate_is_not_drawn_as_one(operator: Operator) -> None:
     assert operator.drawn("old") == "#7d8790"
 
 
-def test_everything_has_room_on_a_laptop_with_a_force_and_an_image(operator: Operator) -> None:
+def test_the_layout_fits_a_laptop_with_a_disturbance_and_an_image(operator: Operator) -> None:
     operator.served.graph.picture = (1, picture())
     operator.served.graph.shown = estimated_state(found=True, friction="sliding", count=8)
     expect(operator.page.locator("#margins")).to_contain_text("Held at")

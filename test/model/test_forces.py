@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,6 +42,19 @@ def test_a_straight_thread_pulled_along_itself(attachment: str, segments: int):
     assert not forces.contact.any()
 
 
+def test_a_thread_held_in_a_flow_is_dragged_by_it():
+    predictor = ThreadPredictor.create("silk_6_0", length=0.019, segments=25)
+    thread, flow = predictor.thread, 2e-3
+    held = ThreadPredictor(replace(thread, medium=replace(thread.medium, flow=(-flow, 0.0))))
+    held.start(pose(0.0, (0.0, 0.0), (1.0, 0.0)))
+    for k in range(1, 20):
+        forces = held.step(pose(k / RATE, (0.0, 0.0), (1.0, 0.0))).forces
+    assert forces is not None
+    middles, drag = (np.arange(25) + 0.5) * thread.segment_length, thread.medium.drag_along * flow
+    assert forces.tension == pytest.approx(drag * (thread.length - middles), rel=1e-5)
+    assert forces.needle_force == pytest.approx([-drag * thread.length, 0.0], rel=1e-5, abs=1e-12)
+
+
 def test_a_hanging_chain_has_the_tension_of_a_catenary():
     mass, gravity, length, span, segments = 1e-5, 9.81, 0.1, 0.08, 80
     medium = Medium.air(mass, (0.0, -gravity), drag=2e-4)
@@ -77,9 +91,11 @@ def test_contact_drag_and_needle_are_in_balance():
     assert pressed.max() > 1e-6
     touching = np.flatnonzero(pressed > 0.0)
     outward = prediction.positions[touching] - np.array(post.centre)
-    along = np.einsum("ij,ij->i", forces.contact[touching], outward) / np.linalg.norm(outward, axis=1)
-    # A chord that touches between two nodes pushes both along its own normal.
-    assert along == pytest.approx(pressed[touching], rel=0.03)
+    # Whether at a node or between two, it points away from the centre: outwards, and without a moment about it but for
+    # what the thread has moved since the last linearisation.
+    moments = outward[:, 0] * forces.contact[touching, 1] - outward[:, 1] * forces.contact[touching, 0]
+    assert (np.einsum("ij,ij->i", forces.contact[touching], outward) > 0.0).all()
+    assert moments.sum() == pytest.approx(0.0, abs=1e-3 * post.radius * pressed.sum())
     tangents = np.gradient(prediction.positions, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
     medium, weights = thread.medium, np.ones(thread.segments + 1)

@@ -195,7 +195,7 @@ def test_the_first_frame_after_a_long_pause_is_estimated():
     assert error_percent(estimate.positions, NODES[5]) < 0.2
 
 
-def test_time_that_is_set_back_begins_the_estimate_anew():
+def test_time_set_back_restarts_the_estimate():
     session = ThreadSession(made(), None)
     follow(session, 40, 45)
     again = follow(session, 0, 5)

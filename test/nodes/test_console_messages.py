@@ -101,7 +101,7 @@ def test_the_estimated_thread():
         messages.estimated(message)
 
 
-def test_the_page_is_told_which_thread_the_margins_are_of_and_their_least_bound():
+def test_the_page_receives_the_source_and_the_minimum_bound_of_the_margins():
     message = SafetyMargins(valid=True, source=SafetyMargins.OF_ESTIMATE)
     message.minimum = [BarrierMargin(barrier="wall", clearance_bound=b) for b in (3e-4, -math.inf, 2e-4)]
     told = plain(messages.margins(message))

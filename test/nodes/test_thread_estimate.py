@@ -38,11 +38,12 @@ class Bench:
 
     Args:
         graph: of the test.
+        taken: returns how many observations the node has been through; see `counting`.
         parameters: of the node.
     """
 
-    def __init__(self, graph: Any, **parameters: Any) -> None:
-        self.graph = graph
+    def __init__(self, graph: Any, taken: Callable[[], int] = lambda: 0, **parameters: Any) -> None:
+        self.graph, self.taken = graph, taken
         self.node = graph.add(ThreadModelNode, **{**SILK, **parameters})
         self.predicted, self.margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
         self.estimated, self.reports = graph.listen(topics.ESTIMATED_THREAD), graph.listen(topics.DIAGNOSTICS)
@@ -57,9 +58,9 @@ class Bench:
         self.graph.publish(topics.THREAD_OBSERVATION, MESSAGES.observation_message(stamp(k), observation))
         self.graph.wait(lambda: self.taken() > before, "the observation to be taken")
 
-    def taken(self) -> int:
-        """Return how many observations the node has been through; see `counting`."""
-        raise NotImplementedError
+    def wait_for_estimate(self, k: int) -> None:
+        """Wait until the last estimate is of a frame."""
+        self.graph.wait(lambda: bool(self.estimated) and self.estimated[-1].header.stamp == stamp(k), "an estimate")
 
     def show(self, k: int, observation: ThreadObservation | None = None, needle: NeedlePose | None = None) -> Any:
         """Show a frame, its observation first, and return what is estimated."""
@@ -93,9 +94,7 @@ def counting(monkeypatch: pytest.MonkeyPatch, graph: Any, **parameters: Any) -> 
         counts["observations"] += 1
 
     monkeypatch.setattr(ThreadModelNode, "on_observation_message", counted)
-    made = Bench(graph, **parameters)
-    made.taken = lambda: counts["observations"]  # type: ignore[method-assign]
-    return made
+    return Bench(graph, lambda: counts["observations"], **parameters)
 
 
 def error(message: Any, k: int) -> float:
@@ -122,7 +121,7 @@ def test_a_frame_without_an_observation_is_only_predicted_and_says_since_when(be
     bench.show(0)
     for k in (1, 2, 45):
         bench.pose(k)
-        bench.graph.wait(lambda: bench.estimated[-1].header.stamp == stamp(k), "an estimate")  # noqa: B023
+        bench.wait_for_estimate(k)
         message = bench.estimated[-1]
         assert (message.prediction_only, message.hidden, message.points) == (True, 1.0, 0)
         assert message.unmeasured_for == pytest.approx(k / 30.0, abs=1e-6)
@@ -168,7 +167,7 @@ def test_paths_that_end_early_are_estimated_where_no_observations_come(graph: An
     for k in range(COUNT):
         graph.publish(topics.MEASURED_THREAD, MESSAGES.path_message(stamp(k), NODES[k, :14]))
         bench.pose(k)
-        graph.wait(lambda: bool(bench.estimated) and bench.estimated[-1].header.stamp == stamp(k), "an estimate")  # noqa: B023
+        bench.wait_for_estimate(k)
     graph.wait(lambda: not bench.estimated[-1].prediction_only, "a measured estimate")
     assert bench.estimated[-1].hidden == pytest.approx(0.5, abs=0.1)
 
@@ -203,8 +202,8 @@ def spoiled(name: str) -> tuple[float, ThreadObservation]:
         return 0.0, ThreadObservation((replace(good, points=points),))
     if name == "another thread":
         off = good.points + np.array([0.0, 8e-3])
-        unknown = {"first_end": PieceEnd.UNKNOWN, "last_end": PieceEnd.UNKNOWN, "arc_length": (math.nan, math.nan)}
-        return 0.0, ThreadObservation((replace(good, points=off, **unknown),))  # type: ignore[arg-type]
+        loose = replace(good, points=off, first_end=PieceEnd.UNKNOWN, last_end=PieceEnd.UNKNOWN)
+        return 0.0, ThreadObservation((replace(loose, arc_length=(math.nan, math.nan)),))
     if name == "pieces doubled":
         return 0.0, ThreadObservation((good, replace(good)))
     assert name == "ten thousand points"

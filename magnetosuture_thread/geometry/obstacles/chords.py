@@ -225,10 +225,10 @@ def find_chord_contacts(
                     distance += min(_bulge(points, i, place, normal), most) - frame[5]
                     count = _write(count, place, distance, normal, i, o, to)
                 continue
-            cell = cell_of(middle, o + 1, data)
-            if cell < 0:
+            own = cell_of(middle, o + 1, data)
+            if own < 0:
                 continue
-            for entry in range(data.entries[cell], data.entries[cell + 2]):
+            for entry in range(data.entries[own], data.entries[own + 2]):
                 feature = data.entries[entry]
                 if kind == EDGES:
                     place, distance, normal = _corner(chord, data.numbers, table[6] + EDGE_WIDTH * feature, reach)

@@ -224,9 +224,9 @@ class RodFormulation(Formulation):
 
     def _load(self, velocity: Points, tangent: Points) -> Points:
         """Return drag and weight per length [N/m]."""
-        rod = self._rod
-        along = (rod.drag_across - rod.drag_along) * float(tangent @ velocity) * tangent
-        return np.asarray(rod.mass_per_length * rod.gravity - rod.drag_across * velocity + along)
+        rod, slip = self._rod, velocity - self._rod.flow
+        along = (rod.drag_across - rod.drag_along) * float(tangent @ slip) * tangent
+        return np.asarray(rod.mass_per_length * rod.gravity - rod.drag_across * slip + along)
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""

@@ -268,7 +268,7 @@ def solve_step(
 ) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
     """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
 
-    A solve that comes out less than half as far off as the last one is followed by one that is linearised halfway.
+    A solve that does not halve how far off the barriers are is followed by one that is linearised halfway back.
 
     Args:
         axes: 0 to d - 1.

@@ -23,7 +23,8 @@ EDGE_PX = 0.7  # standard deviation of the Gaussian whose derivative shows an ed
 HALF_WIDTHS_PX = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)  # tried; a thinner thread looks like one of the first
 ASIDE = 1.75  # of half a width, that a walk may be off the middle: along an edge, or along the shadow beside it
 FLOOR_PX = 3.0  # beyond a thread's edge, up to which the floor beside it is sampled
-NEAR, FAR = 3, 20  # vertices to both sides, over which an edge and the thread's colour are averaged
+EDGE_VERTICES = 3  # to both sides, over which an edge is averaged
+COLOUR_VERTICES = 20  # the same of the thread's colour
 BEND_PRICE = 1.0  # of a change of the shift by one step from vertex to vertex, in units of the log-likelihood
 MAX_CHANGE = 3  # steps, by which the shift may change from vertex to vertex
 WINDOW = 4  # vertices to both sides of a stretch, in which floor has to be the better explanation for a thread to end
@@ -115,20 +116,20 @@ def centred_between_edges(
     best: tuple[float, float, Values, NDArray[np.int64]] | None = None
     for half_width in HALF_WIDTHS_PX:
         difference = _differences(white, half_width)
-        power = (_mean(difference, NEAR) ** 2).sum(axis=2)
+        power = (_mean(difference, EDGE_VERTICES) ** 2).sum(axis=2)
         shifts = smoothest(power, BEND_PRICE, MAX_CHANGE)
         total = float(np.sqrt(_at(power, shifts)).sum())
         if best is None or total > best[0]:
             best = total, half_width, difference, shifts
     assert best is not None
     _, half_width, difference, shifts = best
-    near = _mean(difference, NEAR)
+    near = _mean(difference, EDGE_VERTICES)
     for _ in range(ROUNDS):
-        own = _mean(_at(difference, shifts), FAR)
+        own = _mean(_at(difference, shifts), COLOUR_VERTICES)
         likeness = np.einsum("isc,ic->is", near, own)
         shifts = smoothest(2.0 * likeness, BEND_PRICE, MAX_CHANGE)
     found = _at(difference, shifts)
-    own = _mean(found, FAR)
+    own = _mean(found, COLOUR_VERTICES)
     visible = ~(hidden(points) | on_needle[:, np.abs(aside) <= half_width].any(axis=1))
     evidence = np.where(visible, (found * own).sum(axis=1) - 0.5 * (own**2).sum(axis=1), 0.0)
     exact = shifts + _vertex(likeness, shifts) - difference.shape[1] // 2
