@@ -37,6 +37,9 @@ CHANGES = {
 }
 KEEP = 1.15  # of the way that the keys make which are held
 LOOK = 25  # ms between two looks at the needle
+RESTS = 1.5  # s at one place, with keys held, after which somebody backs off
+BACKS_OFF = 0.7  # s
+SAME_PLACE = 1e-4  # m
 PATH = ((0.0, -7.5e-3), (0.0, -2.6e-3))  # m; to the penetration path, and through
 AROUND = ((-2.4e-3, -1.6e-3), (-5.3e-3, 0.6e-3))  # m; along the ring
 NAMES = {(-1, 0): "ArrowLeft", (1, 0): "ArrowRight", (0, -1): "ArrowDown", (0, 1): "ArrowUp"}
@@ -94,16 +97,28 @@ class Pilot:
         self._pressed = set(keys)
 
     def follow(self, points: Sequence[tuple[float, float]], enough: Callable[[], bool] = lambda: False) -> None:
-        """Steer along points [m] until the last is reached or it is enough; the last keys stay held."""
+        """Steer along points [m] until the last is reached or it is enough; the last keys stay held.
+
+        Between needle, tissue and friction the safety filter can answer a command by rest. Then somebody backs off for a
+        moment and tries again, as a person does.
+        """
         left = list(points)
+        place, since, back_until = self.tip(), time.monotonic(), 0.0
 
         def arrived() -> bool:
-            tip = self.tip()
+            nonlocal place, since, back_until
+            tip, now = self.tip(), time.monotonic()
+            if np.linalg.norm(tip - place) > SAME_PLACE:
+                place, since = tip, now
             while left and np.linalg.norm(left[0] - tip) < REACHED:
                 left.pop(0)
             if not left or enough():
                 return True
+            if now - since > RESTS:
+                since, back_until = now + BACKS_OFF, now + BACKS_OFF
             aim = left[0] - tip
+            if now < back_until:
+                aim = -aim
             x, y = self._way = max(WAYS, key=lambda way: self._worth(way, aim))
             self.press(*(NAMES[one] for one in ((x, 0), (0, y)) if one in NAMES))
             return False
