@@ -99,8 +99,8 @@ class Pilot:
     def follow(self, points: Sequence[tuple[float, float]], enough: Callable[[], bool] = lambda: False) -> None:
         """Steer along points [m] until the last is reached or it is enough; the last keys stay held.
 
-        Between needle, tissue and friction the safety filter can answer a command by rest. Then somebody backs off for a
-        moment and tries again, as a person does.
+        Between needle, tissue and friction the safety filter can answer a command by rest. Then somebody backs off
+        for a moment and tries again, as a person does.
         """
         left = list(points)
         place, since, back_until = self.tip(), time.monotonic(), 0.0

@@ -97,6 +97,8 @@ class FrameResult:
         strain: greatest absolute strain of a segment.
         residual: of the solves.
         step_time: of the model [s].
+        tension: greatest tension of a segment [N]; nan where no force is known.
+        pull: of the thread upon the needle, magnitude [N]; nan where no force is known.
         margins: None if they prove nothing.
         in_contact: whether the thread touches an obstacle or the wall.
         measured: the thread's centreline, shape (m, 2) [m].
@@ -115,6 +117,8 @@ class FrameResult:
     strain: float = math.nan
     residual: float = math.nan
     step_time: float = math.nan
+    tension: float = math.nan
+    pull: float = math.nan
     margins: Margins | None = None
     in_contact: bool = False
     measured: Points = field(default_factory=_no_points)
@@ -157,12 +161,15 @@ class FrameResult:
             kept = EstimatedThread.of(estimate)
         elif estimated:
             kept = EstimatedThread(prediction.positions)
+        forces = prediction.forces
         return cls(
             observation.stamp,
             prediction.positions,
             float(np.maximum.reduce(np.abs(prediction.strain), initial=0.0)),
             prediction.residual,
             step_time,
+            math.nan if forces is None else forces.peak_tension,
+            math.nan if forces is None else math.hypot(*forces.needle_force),
             margins,
             margins is not None and bool(margins.in_contact),
             observation.measured,
@@ -182,6 +189,7 @@ class FrameResult:
     def columns(self) -> dict[str, float]:
         """Return the figures of the frame that need no other curve, by their columns' names."""
         row = {"strain": self.strain, "residual": self.residual, "step_time": self.step_time}
+        row |= {"tension": self.tension, "pull": self.pull}
         if self.margins is not None:
             row |= {f"{MARGIN}{least.barrier}": float(least.clearance[0]) for least in self.margins.minima}
         if self.estimate is not None:

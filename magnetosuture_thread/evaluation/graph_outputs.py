@@ -85,6 +85,9 @@ class GraphCollector:
             frame.vertices = _points(message.positions)
             frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
             frame.residual, frame.step_time = message.residual, message.step_time
+            if len(tension := getattr(message, "tension", ())):  # older bags have none
+                frame.tension, pull = float(np.max(tension)), message.needle_force
+                frame.pull = float(np.hypot(pull.x, pull.y))
         elif message.valid:
             frame.margins = margins_of(message)
             frame.in_contact = bool(frame.margins.in_contact)
@@ -165,6 +168,8 @@ class ReplaySummary:
         contact_frames: predicted frames in which the thread touches an obstacle.
         stretch: greatest absolute stretch.
         residual: greatest scaled residual of a solve.
+        peak_tension: greatest tension of a segment [N]; None where no force is known.
+        needle_pull: greatest force of the thread upon the needle [N]; None where no force is known.
         seen_share: part of the thread's length that the camera saw, mean over the predicted frames.
         error_seen: prediction error against the seen centreline [% of length], over `count` frames.
         error_truth: the same against the truth, where the bag holds it.
@@ -209,6 +214,8 @@ class ReplaySummary:
     prediction: dict[str, float | None] = field(default_factory=dict)
     estimate: dict[str, float | None] = field(default_factory=dict)
     estimation: EstimationFigures = field(default_factory=EstimationFigures)
+    peak_tension: float | None = None
+    needle_pull: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above. Those of `estimation` stand beside the others."""

@@ -237,7 +237,7 @@ class RunMetrics:
         errors = [f"error_{target}" for target in self.targets]
         of_bag = [f"recorded_{name}" for name in errors] if recorded else []
         margins = [f"{MARGIN}{barrier}" for barrier in BUILT_IN]
-        others = ["strain", "residual", "step_time", "seen_share", *ESTIMATE_COLUMNS]
+        others = ["strain", "residual", "step_time", "tension", "pull", "seen_share", *ESTIMATE_COLUMNS]
         of_estimate = [f"{kind}_{name}" for kind in ("estimate", "max_node", "max_node_estimate") for name in errors]
         self._series = TimeSeries([*errors, *of_estimate, *of_bag, *margins, *others])
         self.observed = TimeSeries(["processing"])

@@ -26,6 +26,7 @@ from magnetosuture_thread.evaluation.report.figures import (
     BagFigures,
     format_number,
     micrometres,
+    micronewtons,
     milliseconds,
 )
 from magnetosuture_thread.texts import printable
@@ -69,6 +70,8 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
         "seen_share": figures.measured_share,
         "stretch_max": figures.strain,
         "residual_max": figures.residual,
+        "tension_max_n": figures.tension,
+        "needle_pull_max_n": figures.pull,
         "contact_frames": figures.contact_frames,
     }
     for barrier in BUILT_IN:
@@ -262,6 +265,9 @@ def summary_table(summary: ReplaySummary) -> Table:
         table.add_row(f"  {margin.kind}", f"{_micrometres(margin.clearance)} µm", f"{where}, at {margin.time:.2f} s")
     table.add_row("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted))
     table.add_row("maximum stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment")
+    if summary.peak_tension is not None and summary.needle_pull is not None:
+        pull = f"on the needle at most {micronewtons(summary.needle_pull)}"
+        table.add_row("peak tension", micronewtons(summary.peak_tension), pull)
     table.add_row("maximum residual", f"{summary.residual:.1e}", "scaled; checked apart from the solver")
     table.add_section()
     _add_errors(table, summary, missing="no frame could be scored")

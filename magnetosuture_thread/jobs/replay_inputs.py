@@ -20,7 +20,7 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.evaluation.metrics import RunMetrics, finite_or_none
 from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import DISH_FRAME, GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_COMMAND, SCENE
@@ -220,6 +220,8 @@ def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> Repla
         contact_frames=metrics.contact_frames,
         stretch=metrics.maximum("strain"),
         residual=metrics.maximum("residual"),
+        peak_tension=finite_or_none(metrics.maximum("tension")),
+        needle_pull=finite_or_none(metrics.maximum("pull")),
         seen_share=metrics.mean("seen_share"),
         error_seen=errors["seen"],
         error_truth=errors["truth"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from functools import lru_cache
 
@@ -115,11 +116,16 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
         material: its name.
         step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
     """
-    vertices = prediction.positions
+    vertices, forces = prediction.positions, prediction.forces
+    tension, contact, pull, moment = np.empty(0), np.empty((0, 2)), (math.nan, math.nan), math.nan
+    if forces is not None:
+        tension, contact = forces.tension, forces.contact
+        pull, moment = forces.needle_force.tolist(), forces.needle_moment
+    nodes = np.flatnonzero(contact.any(axis=1))
     words = (prediction.formulation, prediction.scene_version, material, prediction.solver, prediction.status)
     formulation, scene, thread, solver, status = map(text, words)
     sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.strain), solver[0], status[0])
-    return BEGIN + _prediction_form(*sizes).pack(
+    return BEGIN + _prediction_form(*sizes, len(tension), len(nodes)).pack(
         *time,
         *DISH,
         *formulation,
@@ -129,6 +135,15 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
         points_of(vertices),
         len(prediction.strain),
         numbers(prediction.strain, REAL),
+        len(tension),
+        numbers(tension, REAL),
+        len(nodes),
+        numbers(nodes, _NODE),
+        len(nodes),
+        points_of(contact[nodes]),
+        *pull,
+        0.0,
+        moment,
         *solver,
         *status,
         prediction.residual,
@@ -246,12 +261,21 @@ def packed_margins(
 
 @lru_cache(KEPT)
 def _prediction_form(
-    formulation: int, scene: int, material: int, vertices: int, stretch: int, solver: int, status: int
+    formulation: int,
+    scene: int,
+    material: int,
+    vertices: int,
+    segments: int,
+    solver: int,
+    status: int,
+    tensions: int,
+    contacts: int,
 ) -> struct.Struct:
-    """Return the format of a PredictedThread with texts of these lengths, and so many vertices and segments."""
+    """Return the format of a PredictedThread with texts of these lengths, and so many vertices, segments and forces."""
     begin = (*HEADER, *text_codes(formulation), *text_codes(scene), *text_codes(material))
-    arrays = (*array_codes(vertices, "d", 3), *array_codes(stretch, "d"))
-    return form(*begin, *arrays, *text_codes(solver), *text_codes(status), "d", "d", "I", "d")
+    arrays = (*array_codes(vertices, "d", 3), *array_codes(segments, "d"), *array_codes(tensions, "d"))
+    pushes = (*array_codes(contacts, "I"), *array_codes(contacts, "d", 3), *"dddd")
+    return form(*begin, *arrays, *pushes, *text_codes(solver), *text_codes(status), "d", "d", "I", "d")
 
 
 @lru_cache(KEPT)

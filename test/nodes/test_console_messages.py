@@ -68,11 +68,23 @@ def test_the_threads():
     assert plain(messages.measured_thread(path)) == [[0.0, 0.001], [0.002, 0.003]]
     message = PredictedThread(positions=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
     assert plain(messages.predicted(message)) == {
+        "tension": [],
+        "needle_force": None,
         "vertices": [[0.1, 0.2]],
         "residual": 1e-9,
         "step_time": 1e-4,
         "status": "solved",
     }
+
+
+def test_the_forces_of_the_predicted_thread():
+    message = PredictedThread(positions=[Point(x=0.1), Point(x=0.2)], tension=[3e-6])
+    message.needle_force = Vector3(x=-1e-6, y=2e-6)
+    shown = plain(messages.predicted(message))
+    assert (shown["tension"], shown["needle_force"]) == ([3e-6], [-1e-6, 2e-6])
+    message.tension = [3e-6, 4e-6]
+    with pytest.raises(InvalidInputError, match="a tension for each segment"):
+        messages.predicted(message)
 
 
 def test_the_estimated_thread():

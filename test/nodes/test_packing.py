@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped, Vector3
-from magnetosuture_msgs.msg import EstimatedThread, SafetyMargins, ThreadDisturbance
+from magnetosuture_msgs.msg import EstimatedThread, PredictedThread, SafetyMargins, ThreadDisturbance
 from rclpy.serialization import deserialize_message, serialize_message
-from std_msgs.msg import ColorRGBA
+from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.errors import InvalidInputError
@@ -25,8 +25,10 @@ from magnetosuture_thread.messages.packing import (
     packed_observation,
     packed_path,
     packed_pose,
+    packed_prediction,
 )
 from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimate
+from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.margins import (
     UNKNOWN,
     BarrierMargins,
@@ -66,6 +68,59 @@ def test_a_path_is_packed_as_rclpy_makes_it(count: int):
     expected = MESSAGES.path_message(STAMP, points)
     data = packed_path(WHEN, points)
     same(data, expected)
+
+
+@pytest.mark.parametrize("touching", [None, (), (1,), (0, 2, 3)])
+@pytest.mark.parametrize("segments", [0, 3, 4])
+def test_a_prediction_is_packed_as_rclpy_makes_it(touching: tuple[int, ...] | None, segments: int):
+    random = np.random.default_rng(segments)
+    positions, strain = random.normal(size=(segments + 1, 2)), random.normal(size=segments)
+    tension = np.arange(float(segments))
+    forces = None
+    expected = PredictedThread(
+        header=Header(stamp=STAMP, frame_id="dish"),
+        formulation="rod",
+        scene_version="a1",
+        material="silk",
+        positions=[Point(x=x, y=y) for x, y in positions.tolist()],
+        strain=strain.tolist(),
+        needle_force=Vector3(x=math.nan, y=math.nan),
+        needle_moment=math.nan,
+        solver="banded",
+        solver_status="solved",
+        residual=1e-9,
+        interval=0.015,
+        substeps=2,
+        step_time=1e-4,
+    )
+    if touching is not None:
+        contact = np.zeros((segments + 1, 2))
+        nodes = [node for node in touching if node <= segments]
+        contact[nodes] = random.normal(size=(len(nodes), 2))
+        forces = ThreadForces(1e-6 * tension, contact, np.array([1e-6, -2e-6]), 3e-9)
+        expected.tension, expected.contact_nodes = (1e-6 * tension).tolist(), nodes
+        expected.contact_forces = [Vector3(x=x, y=y) for x, y in contact[nodes].tolist()]
+        expected.needle_force, expected.needle_moment = Vector3(x=1e-6, y=-2e-6), 3e-9
+    prediction = Prediction(
+        0.0,
+        formulation="rod",
+        scene_version="a1",
+        solver="banded",
+        status="solved",
+        positions=positions,
+        strain=strain,
+        interval=0.015,
+        substeps=2,
+        residual=1e-9,
+        converged=True,
+        compute_margins=lambda: Margins(()),
+        compute_forces=lambda: forces,
+    )
+    data = packed_prediction(WHEN, prediction, "silk", step_time=1e-4)
+    read = deserialize_message(data, PredictedThread)
+    assert np.isnan(read.needle_moment) == (forces is None)
+    # As text: nan is not equal to nan.
+    assert str(read) == str(deserialize_message(serialize_message(expected), PredictedThread))
 
 
 def observation(*counts: int, outlines: int = 2) -> ThreadObservation:

@@ -51,6 +51,15 @@ export function threadLook(thread, margins, since) {
   return colour ? { state, colour } : { state: "unknown", colour: GREY };
 }
 
+// Tension of a segment [N] against the peak of the thread: from pale to deep violet; blue where it is compressed.
+const SLACK = [206, 196, 232];
+const TAUT = [94, 8, 150];
+export function tensionColour(tension, peak) {
+  if (tension < 0) return STUCK;
+  const share = peak > 0 ? Math.min(1, tension / peak) : 0;
+  return `rgb(${SLACK.map((entry, at) => Math.round(entry + share * (TAUT[at] - entry))).join(",")})`;
+}
+
 // A node by its clearance [m]: red below 0.3 mm, orange below 1 mm, green beyond; larger the nearer.
 export function nodeLook(clearance, valid) {
   if (!valid) return { colour: GREY, radius: 2 };

@@ -1,9 +1,9 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
 // data-friction (free, sliding, stuck, unknown, invalid, old, none) and data-colour of the thread that the margins are of,
-// data-estimate (none, measured, prediction), data-disturbances (how many), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
+// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import {
-  ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, nodeLook, onGround, threadLook, threadOf,
+  ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, nodeLook, onGround, tensionColour, threadLook, threadOf,
 } from "./colours.js";
 import { Placement, needleArc } from "./geometry.js";
 import { drawShapes } from "./shapes.js";
@@ -32,7 +32,7 @@ export class Dish {
     return needleArc(graph.needle, graph.needle_length, graph.needle_curvature).map((point) => this.placement.at(point));
   }
 
-  draw(graph, { since, drag, maxSpeed }) {
+  draw(graph, { since, drag, maxSpeed, showTension }) {
     const { canvas, context } = this;
     const ratio = devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -56,11 +56,12 @@ export class Dish {
     const look = threadLook(thread, graph?.margins, since);
     const estimate = graph ? estimateState(graph, since) : "none";
     const tip = graph?.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop().join(",") : "";
+    const tension = showTension && look.colour !== GREY && graph.predicted?.tension?.length ? graph.predicted.tension : null;
     if (graph) {
       this.#line(graph.measured ?? [], 12, MEASURED);
       if (estimate !== "none") this.#drawBand(graph.estimated);
       if (thread !== graph.predicted) this.#drawModel(graph, since);
-      this.#drawThread(thread, graph.margins, look, thread === graph.estimated ? estimate : "none");
+      this.#drawThread(thread, graph.margins, look, thread === graph.estimated ? estimate : "none", tension);
       if (estimate !== "none") graph.estimated.disturbances.forEach((found) => this.#drawDisturbance(found, width));
       this.#drawNeedle(graph, since);
       this.#drawVelocities(graph, since, maxSpeed);
@@ -68,7 +69,7 @@ export class Dish {
     if (drag) this.#drawDrag(drag);
     this.#drawScaleBar(width, height);
     Object.assign(canvas.dataset, {
-      friction: look.state, colour: look.colour, estimate,
+      friction: look.state, colour: look.colour, estimate, tension: tension ? "shown" : "not",
       disturbances: String(estimate === "none" ? 0 : graph.estimated.disturbances.length), image: shown ? "yes" : "no", tip,
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
@@ -185,8 +186,8 @@ export class Dish {
   }
 
   // The thread that the margins are of, in the colour of its friction; an estimated one with an edge of its own colour,
-  // which is broken where nothing is measured any more.
-  #drawThread(thread, margins, look, estimate) {
+  // which is broken where nothing is measured any more. On request, in that of each segment's tension.
+  #drawThread(thread, margins, look, estimate, tension) {
     const vertices = thread?.vertices ?? [];
     const { context } = this;
     const valid = look.colour !== GREY;
@@ -199,6 +200,10 @@ export class Dish {
     if (!valid) context.setLineDash([7, 6]);
     this.#line(vertices, 2.6, look.colour);
     context.setLineDash([]);
+    if (tension) {
+      const peak = Math.max(...tension);
+      tension.forEach((value, at) => this.#line(vertices.slice(at, at + 2), 4.6, tensionColour(value, peak)));
+    }
     const friction = new Set(valid ? margins?.friction.nodes : []);
     vertices.forEach((vertex, node) => {
       const { colour, radius } = nodeLook(margins?.clearance?.[node], valid);

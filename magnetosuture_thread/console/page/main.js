@@ -25,7 +25,7 @@ const clock = () => performance.now() / 1000;
 
 const state = {
   link: "connecting", problem: "", graph: null, host: null, lease: null, received: 0, client: null, canCommand: false,
-  speed: 0.003, maxSpeed: 0.01, adjusted: false, jogging: false, stopped: false,
+  speed: 0.003, maxSpeed: 0.01, adjusted: false, jogging: false, stopped: false, showTension: false,
   late: { delay: 0, at: 0 },
 };
 const dish = new Dish(find("dish"));
@@ -135,6 +135,13 @@ const setups = new SetupPicker({
   running: () => (state.host?.recording ? `the run and its recording to ${state.host.recording}` : "the run"),
 });
 find("again").addEventListener("click", () => setups.ask(state.host.setup));
+find("tension").addEventListener("click", ({ currentTarget }) => {
+  state.showTension = !state.showTension;
+  currentTarget.setAttribute("aria-pressed", String(state.showTension));
+  find("tension-legend").hidden = !state.showTension;
+  find("dish").focus({ preventScroll: true });
+  drawSoon();
+});
 find("speed").addEventListener("input", ({ target }) => {
   state.adjusted = true;
   state.speed = Number(target.value) / 1e3;
@@ -156,7 +163,7 @@ function drawSoon() {
 function draw() {
   scheduled = false;
   stats.drawn += 1;
-  dish.draw(state.graph, { since: since(), drag: hasControl() ? input.drag() : null, maxSpeed: state.maxSpeed });
+  dish.draw(state.graph, { since: since(), drag: hasControl() ? input.drag() : null, maxSpeed: state.maxSpeed, showTension: state.showTension });
 }
 
 let counted = { at: clock(), drawn: 0 };

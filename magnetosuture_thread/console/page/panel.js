@@ -1,6 +1,6 @@
 // Text beside the dish: states, figures, control. Text is written only where it changed.
 
-import { capital, isNumber, leastClearance, millimetres, plural, seconds } from "./format.js";
+import { capital, isNumber, leastClearance, micronewtons, millimetres, plural, seconds } from "./format.js";
 import { estimateState, threadOf } from "./colours.js";
 import { SILENCE_TIMEOUT, motionStatus } from "./status.js";
 
@@ -164,6 +164,10 @@ function showThread({ graph, since }) {
     rows.push([KINDS[kind] ?? capital(kind.replaceAll("_", " ")), millimetres(value, 3)]);
   }
   if (margins?.valid) rows.push(["In contact", plural(margins.contact.length, "node")]);
+  if (predicted?.tension?.length) {
+    rows.push(["Peak tension", micronewtons(Math.max(...predicted.tension))]);
+    rows.push(["Pull on the needle", micronewtons(Math.hypot(...predicted.needle_force))]);
+  }
   if (predicted) rows.push(["Step", isNumber(predicted.step_time) ? `${(predicted.step_time * 1e3).toFixed(2)} ms` : "–"]);
   const list = find("margins");
   list.classList.toggle("stale", Boolean(old));

@@ -50,6 +50,8 @@ class BagFigures:
         measured_share: part of the thread's length that is measured, mean over the predicted frames.
         strain: greatest absolute strain of a segment.
         residual: greatest scaled residual of a solve.
+        tension: greatest tension of a segment [N]; nan where no force is known.
+        pull: greatest force of the thread upon the needle [N]; nan where no force is known.
         minimum: minimum margin of each kind.
         contact_frames: predicted frames in which the thread touches an obstacle.
         step_time: of the model's step [s].
@@ -80,6 +82,8 @@ class BagFigures:
     live: LiveFigures = field(default_factory=LiveFigures)
     silence: SensorSilence = field(default_factory=SensorSilence)
     span: float = math.nan
+    tension: float = math.nan
+    pull: float = math.nan
     estimate_error: Mapping[str, Mapping[str, float] | None] = field(default_factory=dict)
     compared: Mapping[str, Mapping[str, float | None]] = field(default_factory=lambda: compare_errors(TimeSeries([])))
     estimation: EstimationFigures = field(default_factory=EstimationFigures)
@@ -113,6 +117,8 @@ class BagFigures:
             measured_share=metrics.mean("seen_share"),
             strain=metrics.maximum("strain"),
             residual=metrics.maximum("residual"),
+            tension=metrics.maximum("tension"),
+            pull=metrics.maximum("pull"),
             minimum=metrics.minimum_margins,
             contact_frames=metrics.contact_frames,
             step_time=metrics.percentiles("step_time"),
@@ -206,6 +212,7 @@ def headlines(about: BagDetails, figures: BagFigures) -> list[Headline]:
         _frames(figures),
         _margin(about, figures),
         _strain(figures),
+        _tension(figures),
         _duration("model step", figures.step_time, figures.interval, "one step of the thread model"),
         *(
             [_duration("tracker", figures.processing, figures.interval, "one camera frame")]
@@ -314,6 +321,14 @@ def _strain(figures: BagFigures) -> Headline:
     return Headline(name, f"{format_number(100.0 * figures.strain)} %", detail, *_grade(figures.strain, *grades))
 
 
+def _tension(figures: BagFigures) -> Headline:
+    name = "peak tension"
+    if not math.isfinite(figures.tension):
+        return Headline(name, "none", "of a segment, by the model", NONE, "no force is known")
+    detail = f"of a segment, by the model; the thread pulls the needle with at most {micronewtons(figures.pull)}"
+    return Headline(name, micronewtons(figures.tension), detail, NONE, "by the model's multipliers")
+
+
 def _duration(name: str, found: Percentiles | None, interval: float, detail: str) -> Headline:
     if found is None:
         return Headline(f"{name}, median", "none", detail, NONE, "not known")
@@ -355,6 +370,11 @@ def format_number(value: float) -> str:
 def milliseconds(seconds: float) -> str:
     """Return a time in ms."""
     return f"{format_number(1e3 * seconds)} ms"
+
+
+def micronewtons(newtons: float) -> str:
+    """Return a force as text."""
+    return f"{format_number(1e6 * newtons)} µN"
 
 
 def micrometres(metres: float) -> str:

@@ -41,6 +41,8 @@ ERROR_LINES = (
     ("recorded_", "recorded prediction", "kind5"),
 )
 
+FORCE_LINES = (("tension", "peak tension", "predicted", ""), ("pull", "pull upon the needle", "ink", ""))
+
 Line = tuple[str, str, str, str]  # column, name, colour, dash
 
 
@@ -82,7 +84,10 @@ def _template() -> Template:
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, finalize=_shown
     )
     environment.filters.update(
-        number=report.format_number, milliseconds=report.milliseconds, micrometres=report.micrometres
+        number=report.format_number,
+        milliseconds=report.milliseconds,
+        micrometres=report.micrometres,
+        micronewtons=report.micronewtons,
     )
     environment.globals["margin_state"] = report.margin_state
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
@@ -131,7 +136,14 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
     solid = [f"{MARGIN}{name}" for name in SOLID]
     others = [name for name in table.names if name.startswith(MARGIN) and name not in solid]
     # In the units of the plots: %, mm, µm, ms.
-    scales = {"strain": 100.0, "step_time": 1e3, **dict.fromkeys(solid, 1e3), **dict.fromkeys(others, 1e6)}
+    scales = {
+        "strain": 100.0,
+        "step_time": 1e3,
+        "tension": 1e6,
+        "pull": 1e6,
+        **dict.fromkeys(solid, 1e3),
+        **dict.fromkeys(others, 1e6),
+    }
     columns = {name: scales.get(name, 1.0) * table.column(name) for name in table.names}
     columns["strain"] = np.maximum(columns["strain"], MIN_STRAIN)
     predicted_times, predicted = with_gaps(*thinned(table.times, columns, limit))
@@ -159,6 +171,7 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
         ),
         *_estimation_plots(metrics, predicted),
         ("stretch", "stretch [%]", _lines(predicted, [("strain", "maximum", "ink", "")]), {"log": True}),
+        ("tension", "force [µN]", _lines(predicted, FORCE_LINES), {"floor": 0.0}),
         ("obstacle", "distance [mm]", _lines(predicted, distances), {"zero": True}),
         ("lengths", "margin [µm]", _lines(predicted, margins), {"zero": True}),
         ("pace", "time [ms]", durations, {"log": True}),

@@ -42,6 +42,7 @@ from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity
 from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.formulations.added_rows import LinearRows
+from magnetosuture_thread.model.formulations.rod_forces import write_forces
 from magnetosuture_thread.model.formulations.rod_step import (
     ENDED,
     NO_ROOM,
@@ -194,27 +195,12 @@ class RodFormulation(Formulation):
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
         assert result.multipliers is not None
-        rod, state, multipliers = self._rod, result.state, result.multipliers
-        unit, positions = rod.unit, state.positions / rod.unit
-        scale = (rod.drag_across + rod.mass_per_length / state.interval) * unit**2
-        along = positions[1:] - positions[:-1]
-        chords = np.linalg.norm(along, axis=1)
-        tension = scale * multipliers[0] * chords
-        work, gradient = np.empty((2, *positions.shape)), np.empty(positions.shape)
-        mechanics.bending_gradient(positions, heading, rod.clamped, rod.rest_angles, work, gradient)
-        tangents = along / chords[:, None]
-        # The end correction takes some of the load on the last segment from the node behind its middle.
-        last = mechanics.END_CORRECTION * unit * float(self._load(state.velocities[-1], tangents[-1]) @ tangents[-1])
-        tension[-1] += last
-        # What bending passes on through each segment, besides the force that keeps its length.
-        passed = -rod.bending_stiffness / unit**2 * np.cumsum(gradient[:-1], axis=0)
-        force = tension[0] * tangents[0] + passed[0] + 0.5 * unit * self._load(state.velocities[0], tangents[0])
-        tension += np.einsum("ij,ij->i", passed, tangents)
-        moment = 0.0
-        if rod.clamped:
-            turned = np.array([-heading[1], heading[0]]) if len(heading) == 2 else np.full(3, np.nan)
-            moment = -2.0 * rod.bending_stiffness / unit * float(work[1, 0] @ turned)
-        return ThreadForces(tension, scale * multipliers[1], force, moment)
+        rod, state, (lengths, contact) = self._rod, result.state, result.multipliers
+        scale = (rod.drag_across + rod.mass_per_length / state.interval) * rod.unit**2
+        tension, force = np.empty(len(lengths)), np.empty(self.dimension)
+        positions, velocities = state.positions / rod.unit, state.velocities
+        moment = write_forces(rod, positions, velocities, heading, lengths, scale, tension, force)
+        return ThreadForces(tension, scale * contact, force, moment)
 
     def chords_in_contact(self, positions: Points, tolerance: float) -> tuple[int, ...]:
         """Return both nodes of each segment that touches an obstacle between them; see `Formulation`."""
@@ -222,16 +208,14 @@ class RodFormulation(Formulation):
         first = chords.node[chords.distance - self._radius <= tolerance]
         return tuple(np.concatenate([first, first + 1]).tolist())
 
-    def _load(self, velocity: Points, tangent: Points) -> Points:
-        """Return drag and weight per length [N/m]."""
-        rod, slip = self._rod, velocity - self._rod.flow
-        along = (rod.drag_across - rod.drag_along) * float(tangent @ slip) * tangent
-        return np.asarray(rod.mass_per_length * rod.gravity - rod.drag_across * slip + along)
-
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
         super().warm_up()
         accept_step(self._buffers, self._motion, self._motion.velocities.copy(), np.zeros(self._rows), 1.0)
+        buffers, heading = self._motion, np.eye(self.dimension)[0]
+        chain = np.outer(np.arange(self._thread.segments + 1.0), heading)
+        lengths = np.zeros(self._thread.segments)
+        write_forces(self._rod, chain, buffers.velocities, heading, lengths, 1.0, lengths.copy(), heading.copy())
 
     def _use(self, buffers: StepBuffers) -> None:
         """Use buffers for the step, and as much for the structured solver."""

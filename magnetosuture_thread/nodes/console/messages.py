@@ -88,8 +88,18 @@ def measured_thread(message: Path) -> list[list[float]]:
 
 
 def predicted(message: PredictedThread) -> dict[str, Any]:
-    """Return the predicted vertices [m], and how they were found."""
+    """Return the predicted vertices [m], how they were found, and the forces [N]: tensions, pull on the needle.
+
+    Raises:
+        InvalidInputError: the tensions are not those of the segments between the vertices.
+    """
+    tension, pull = list(message.tension), message.needle_force
+    if tension and len(tension) + 1 != len(message.positions):
+        found = f"{len(message.positions)} positions and {len(tension)} tensions"
+        raise InvalidInputError("thread/predicted", found, "a tension for each segment, or none")
     return {
+        "tension": tension,
+        "needle_force": [pull.x, pull.y] if tension else None,
         "vertices": [[vertex.x, vertex.y] for vertex in message.positions],
         "residual": message.residual,
         "step_time": message.step_time,
