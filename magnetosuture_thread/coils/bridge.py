@@ -108,6 +108,7 @@ class CoilBridge:
         watchdogs: command watchdogs by input, "operator" and "needle".
         extrapolator: extrapolates the needle's pose.
         prediction_monitor: monitors the thread model's margins.
+        feedforward: compensates the thread's pull on the needle; None if nothing shall.
 
     Raises:
         ConfigurationError: the needle has no room in the scene.
@@ -128,6 +129,7 @@ class CoilBridge:
             max_hold=settings.hold_time,
         )
         self.prediction_monitor = PredictionMonitor(settings.prediction_timeout)
+        self.feedforward = settings.feedforward()
         self._settings = settings
         self._coils = settings.allocation()
         self._filter: NeedleSafetyFilter | None = None
@@ -257,9 +259,10 @@ class CoilBridge:
         active += filtered.active
         if filtered.reason:
             return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
-        allocation, limiting = self._allocate(
-            filtered.filtered, pose, self._settings.max_current_slew * elapsed, self._filter
-        )
+        max_change, pull = self._settings.max_current_slew * elapsed, np.zeros(2)
+        if self.feedforward is not None and not no_prediction:
+            pull = self.feedforward.velocity(filtered.filtered, pose.heading, now, arrival)
+        allocation, limiting = self._allocate(filtered.filtered, pull, pose, max_change, self._filter)
         active += tuple(
             name for name in (limiting, CURRENT_LIMIT if allocation.saturated else "") if name and name not in active
         )
@@ -353,13 +356,19 @@ class CoilBridge:
         self._previous, self._velocity = self._coils.zero(), np.zeros(2)
 
     def _allocate(
-        self, velocity: Vector, pose: Pose, max_change: float, safety: NeedleSafetyFilter
+        self, velocity: Vector, pull: Vector, pose: Pose, max_change: float, safety: NeedleSafetyFilter
     ) -> tuple[Allocation, str]:
-        """Return currents whose velocity, drift included, is certified for the hold time, and the limiting one."""
+        """Return currents whose velocity, drift included, is certified for the hold time, and the limiting one.
+
+        With a velocity that the thread's pull adds, both are certified: that of the currents with it and without.
+        """
+        velocity = self._within_limit(velocity - pull)
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
         for _ in range(1 + MAX_CORRECTIONS):
             found = self._coils.allocate(target, pose.tail, pose.heading, self._previous.currents, max_change)
             share, name = safety.safe_share(found.velocity, pose.tail, pose.heading)
+            if pull.any():
+                share, name = min((share, name), safety.safe_share(found.velocity + pull, pose.tail, pose.heading))
             kept = found.scaled(share)
             error = float(np.linalg.norm(kept.velocity - velocity))
             if error < min_error:
@@ -369,3 +378,8 @@ class CoilBridge:
             clear, _ = safety.nearest_clear(found.velocity, pose.tail, pose.heading)
             target = target - (found.velocity - clear)
         return best, limiting
+
+    def _within_limit(self, velocity: Vector) -> Vector:
+        """Return a velocity reduced to the maximum speed of the tip."""
+        speed = math.hypot(*velocity)
+        return velocity if speed <= self._settings.max_speed else velocity * (self._settings.max_speed / speed)

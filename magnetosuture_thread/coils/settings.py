@@ -12,6 +12,7 @@ from typing import ClassVar
 from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
+from magnetosuture_thread.coils.feedforward import ThreadFeedforward
 from magnetosuture_thread.coils.field import CoilProperties, coils_around, make_coils
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
@@ -136,6 +137,16 @@ class CoilBridgeSettings(Configuration):
     needle_drag_across: float = quantity(
         0.033, "drag across the needle at 1 m/s", unit="N s/m", minimum=1e-5, maximum=10.0
     )
+    thread_feedforward: bool = quantity(
+        False, "whether the coils compensate the predicted pull of the thread on the needle, by thread/predicted"
+    )
+    thread_drag: float = quantity(
+        0.0,
+        "part of needle_drag that a straight thread behind the needle adds, for thread_feedforward",
+        unit="N s/m",
+        minimum=0.0,
+        maximum=10.0,
+    )
     needle_turning_drag: float = quantity(
         1.6e-7, "drag torque of the needle at 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2
     )
@@ -215,6 +226,12 @@ class CoilBridgeSettings(Configuration):
         """Maximum time for which a velocity may last without a step: driver timeout and one period [s]."""
         return self.driver_timeout + 1.0 / self.rate
 
+    def feedforward(self) -> ThreadFeedforward | None:
+        """Return what compensates the thread's pull; None if nothing shall."""
+        if not self.thread_feedforward:
+            return None
+        return ThreadFeedforward(self.needle(), self.thread_drag, self.prediction_timeout)
+
     def safety_filter(self, scene: Scene) -> NeedleSafetyFilter:
         """Return the safety filter for the wall and the shapes of a scene.
 
@@ -255,6 +272,8 @@ class CoilBridgeSettings(Configuration):
             limit = MAX_BLIND_DISTANCE / self.hold_time
             rule = f"max_speed x (driver_timeout + 1 / rate) may be at most {MAX_BLIND_DISTANCE:g} m"
             raise self.refused("max_speed", f"at most {limit:.3g} m/s: {rule}")
+        if self.thread_drag > self.needle_drag:
+            raise self.refused("thread_drag", f"at most {self.GROUP}.needle_drag, {self.needle_drag:g} N s/m")
         # One step may not use more than the whole clearance.
         if self.approach_rate > self.rate:
             raise self.refused("approach_rate", f"at most {self.GROUP}.rate, {self.rate:g} 1/s")

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
-from magnetosuture_msgs.msg import SafetyMargins
+from magnetosuture_msgs.msg import PredictedThread, SafetyMargins
 from rclpy.clock import Clock, ClockType
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from magnetosuture_thread import InvalidInputError, Scene
@@ -44,6 +46,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog: Timer | None = None
+        self._pull: Subscription | None = None
         self._report = CoilReport(self, self.system, self._steady)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
         self._scene = SceneFollower(self, self.health, None, self.on_scene)
@@ -64,6 +67,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         driver = make_driver(settings, len(bridge.coils), self._report.send_to_rig, self._report.count_rigs)
         self.system.open(settings, bridge, driver)
         self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
+        if settings.thread_feedforward:
+            self._pull = topics.PREDICTED_THREAD.subscribe(self, self.on_prediction)
 
     def resume(self) -> None:
         """Activate, so that the bridge can be armed."""
@@ -77,7 +82,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         """Set the coils to zero, close the driver, and publish that."""
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
-        self._watchdog, self._reactivate = None, False
+        if self._pull is not None:
+            self.destroy_subscription(self._pull)
+        self._watchdog, self._pull, self._reactivate = None, None, False
         self._stamps.clear()
         ends = self.stage in ("shuttingdown", FINALIZED)
         final = self.system.close(FINALIZED if ends else UNCONFIGURED)
@@ -134,6 +141,18 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             self.system.bridge.on_margins(
                 stamp, message.valid, message.slowdown, message.scene_version, self._times()[1]
             )
+        except INPUT_ERRORS as error:
+            self.refuse(error)
+
+    def on_prediction(self, message: PredictedThread) -> None:
+        """Register the thread's pull on the needle, for the next currents."""
+        if self.system.bridge is None or self.system.bridge.feedforward is None:
+            return
+        try:
+            reading.require_dish_frame(message.header.frame_id, topics.PREDICTED_THREAD.name)
+            stamp = reading.checked_nanoseconds(message.header.stamp, "thread/predicted.header.stamp") * 1e-9
+            force = np.array([message.needle_force.x, message.needle_force.y])
+            self.system.bridge.feedforward.update(force, stamp, self._times()[1])
         except INPUT_ERRORS as error:
             self.refuse(error)
 

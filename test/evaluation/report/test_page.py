@@ -6,6 +6,7 @@ import base64
 import hashlib
 import io
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -27,6 +28,7 @@ from magnetosuture_thread.evaluation.report.page import page_data, write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, draw_worst_frame
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.estimator import Disturbance
+from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.margins import BarrierMargins, Margins
 
 LENGTH = 0.019
@@ -59,7 +61,8 @@ def made_metrics(
             metrics.observe(Observation(stamp, reason=f"hidden by {EVIL}"))
             continue
         metrics.observe(sight)
-        prediction: Any = SimpleNamespace(positions=NODES, strain=np.array([0.0, -1e-5]), residual=1e-9)
+        forces = ThreadForces(np.array([1e-6 * index, 5e-6]), np.zeros((26, 2)), np.array([-3e-6, 4e-6]), 0.0)
+        prediction: Any = SimpleNamespace(positions=NODES, strain=np.array([0.0, -1e-5]), residual=1e-9, forces=forces)
         frame = FrameResult.of(sight, prediction, margins(1e-3 - 1e-5 * index), 1e-4, recorded=seen)
         if estimated:
             found = Disturbance(8e-3, 2e-3, NODES[10], np.array([0.0, 1.0]), 3e-6, 9.0, 1.0 + 200 / 30)
@@ -358,12 +361,27 @@ def test_a_rendered_frame_is_said_to_be_one(view):
     assert drawn_as[0].source != drawn_as[1].source
 
 
+def test_the_forces_are_drawn_and_their_greatest_stated():
+    metrics = made_metrics()
+    figures = BagFigures.of(metrics)
+    peak = 1e-6 * (len(metrics.observed) - 1)
+    assert [figures.tension, figures.pull] == pytest.approx([peak, 5e-6])
+    plot = next(plot for plot in page_data(metrics, [])["plots"] if plot["id"] == "tension")
+    peaks, pulls = (max(value for value in line["values"] if value is not None) for line in plot["series"])
+    assert [peaks, pulls] == pytest.approx([1e6 * peak, 5.0], rel=1e-3)  # in uN
+    (headline,) = [each for each in headlines(ABOUT, figures) if each.name == "peak tension"]
+    assert headline.value == f"{1e6 * peak:.0f} µN"
+    assert "Forces in the thread" in made_page()
+    nothing = replace(figures, tension=math.nan, pull=math.nan)
+    assert "none" in {each.value for each in headlines(ABOUT, nothing) if each.name == "peak tension"}
+
+
 def test_the_figures_are_the_worst_and_the_counts_of_all_frames():
     metrics = RunMetrics(LENGTH, 0, ("truth",))
     for index, (clearance, residual) in enumerate([(1e-4, 1e-9), (-1e-5, 1e-7), (2e-4, 1e-8)]):
         sight = Observation(index * 10**8, NODES[0], np.array([1.0, 0.0]), NODES, NODES)
         metrics.observe(sight)
-        prediction: Any = SimpleNamespace(positions=NODES, strain=np.zeros(25), residual=residual)
+        prediction: Any = SimpleNamespace(positions=NODES, strain=np.zeros(25), residual=residual, forces=None)
         metrics.add(FrameResult.of(sight, prediction, margins(clearance), 1e-4))
     for index in range(3, 40):
         metrics.observe(Observation(index * 10**8, reason=f"{index % 20}"))
