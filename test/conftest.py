@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import fcntl
 import os
 import shutil
 import signal
 import tempfile
 import uuid
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +43,28 @@ def arc(tail: np.ndarray, angle: float, curvature: float, length: float = 0.019,
     turned = angle + curvature * s
     steps = np.diff(s)[:, None] * np.column_stack([np.cos(turned), np.sin(turned)])[:-1]
     return np.vstack([tail, tail + np.cumsum(steps, axis=0)])
+
+
+@contextmanager
+def turn(alone: bool) -> Iterator[None]:
+    """Wait until a whole graph may run, beside others or alone; who waits to be alone lets no other begin.
+
+    The locks are on two files that are there: nothing is left behind, and all processes of pytest-xdist share them.
+    """
+    with Path(__file__).open() as door, (Path(__file__).parents[1] / "pyproject.toml").open() as room:
+        fcntl.flock(door, fcntl.LOCK_EX)
+        fcntl.flock(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+        fcntl.flock(door, fcntl.LOCK_UN)
+        yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Run a test that starts a whole graph, with its fixtures, when it is its turn."""
+    if item.get_closest_marker("whole_graph") is None:
+        return (yield)
+    with turn(alone=item.get_closest_marker("undisturbed") is not None):
+        return (yield)
 
 
 @pytest.fixture(autouse=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,21 +23,27 @@ from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation,
 from test.calibration.runs import LENGTH, SETTINGS, path, rig_run, stiff
 
 TRUE = 1.3e-9
-SIGHTS = rig_run(TRUE)
+Sights = Sequence[Observation]
 
 
-def still(sight: Observation, shift: float) -> Observation:
+@pytest.fixture
+def sights() -> tuple[Observation, ...]:
+    """Return a run whose parameters are known."""
+    return rig_run(TRUE)
+
+
+def still(first: Observation, sight: Observation, shift: float) -> Observation:
     """Return the first sight at another time, the needle moved on by so much [m]."""
-    first, by = SIGHTS[0], np.array([shift, 0.0])
+    by = np.array([shift, 0.0])
     return replace(sight, tail=first.tail + by, heading=first.heading, measured=first.measured + by)
 
 
-def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on():
-    hidden = [replace(sight, measured=np.empty((0, 2))) if k < 5 else sight for k, sight in enumerate(SIGHTS)]
+def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on(sights: Sights):
+    hidden = [replace(sight, measured=np.empty((0, 2))) if k < 5 else sight for k, sight in enumerate(sights)]
     lost = [Observation(sight.stamp, reason="glare") if k == 50 else sight for k, sight in enumerate(hidden)]
     passage = read_run("bag", lost, SETTINGS)
-    assert passage.stamps[0] == SIGHTS[5].stamp
-    assert SIGHTS[50].stamp not in passage.stamps
+    assert passage.stamps[0] == sights[5].stamp
+    assert sights[50].stamp not in passage.stamps
     assert passage.times[0] == pytest.approx(SETTLING, abs=0.1)
     assert len(passage.frames) <= MAX_FRAMES
     assert passage.targets.shape == (len(passage.frames), SETTINGS.segments, 2)
@@ -46,15 +52,15 @@ def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on(
     assert passage.speed == pytest.approx(np.percentile(steps, 75.0), rel=0.15)
 
 
-def test_after_a_gap_it_begins_anew_from_the_thread_as_seen():
-    gap = [sight for k, sight in enumerate(SIGHTS) if not 40 <= k < 50]
+def test_after_a_gap_it_begins_anew_from_the_thread_as_seen(sights: Sights):
+    gap = [sight for k, sight in enumerate(sights) if not 40 <= k < 50]
     passage = read_run("bag", gap, SETTINGS)
     assert passage.legs == (0, 40)
-    assert np.array_equal(passage.initials[1], SIGHTS[50].measured)
-    times = (passage.stamps[passage.frames] - SIGHTS[50].stamp) * 1e-9
+    assert np.array_equal(passage.initials[1], sights[50].measured)
+    times = (passage.stamps[passage.frames] - sights[50].stamp) * 1e-9
     assert not ((times >= 0.0) & (times < SETTLING)).any()
     model = stiff(TRUE)
-    whole, parts = (read_run("bag", sights, SETTINGS) for sights in (SIGHTS, gap))
+    whole, parts = (read_run("bag", each, SETTINGS) for each in (sights, gap))
     last = [
         frame_errors(replay_with_parameters(passage, model), passage.targets, LENGTH)[-1] for passage in (whole, parts)
     ]
@@ -70,30 +76,30 @@ def observed(sight: Observation, shown: int) -> Observation:
     return replace(sight, measured=points, observation=ThreadObservation((piece,), complete=whole))
 
 
-def test_a_leg_starts_from_a_complete_observation():
-    covered = [observed(sight, 40 if k < 8 else 64) for k, sight in enumerate(SIGHTS)]
+def test_a_leg_starts_from_a_complete_observation(sights: Sights):
+    covered = [observed(sight, 40 if k < 8 else 64) for k, sight in enumerate(sights)]
     passage = read_run("bag", covered, SETTINGS)
-    assert passage.stamps[0] == SIGHTS[8].stamp
-    assert np.array_equal(passage.initials[0], SIGHTS[8].measured)
+    assert passage.stamps[0] == sights[8].stamp
+    assert np.array_equal(passage.initials[0], sights[8].measured)
 
 
-def test_a_leg_starts_from_a_part_where_no_more_was_seen_for_a_second():
-    part = [observed(sight, 40) for sight in SIGHTS]
+def test_a_leg_starts_from_a_part_where_no_more_was_seen_for_a_second(sights: Sights):
+    part = [observed(sight, 40) for sight in sights]
     passage = read_run("bag", part, SETTINGS)
-    assert (passage.stamps[0] - SIGHTS[0].stamp) * 1e-9 == pytest.approx(PARTIAL_WAIT * 1e-9, abs=0.1)
+    assert (passage.stamps[0] - sights[0].stamp) * 1e-9 == pytest.approx(PARTIAL_WAIT * 1e-9, abs=0.1)
     assert len(passage.initials[0]) == 40
 
 
-def test_a_frame_that_does_not_show_the_tail_starts_no_leg():
+def test_a_frame_that_does_not_show_the_tail_starts_no_leg(sights: Sights):
     away = [
         replace(observed(sight, 64), observation=ThreadObservation()) if k < 5 else sight
-        for k, sight in enumerate(SIGHTS)
+        for k, sight in enumerate(sights)
     ]
-    assert read_run("bag", away, SETTINGS).stamps[0] == SIGHTS[5].stamp
+    assert read_run("bag", away, SETTINGS).stamps[0] == sights[5].stamp
 
 
-def test_what_is_not_seen_is_not_known():
-    part = [replace(sight, measured=sight.measured[:40]) for sight in SIGHTS]
+def test_what_is_not_seen_is_not_known(sights: Sights):
+    part = [replace(sight, measured=sight.measured[:40]) for sight in sights]
     passage = read_run("bag", part, SETTINGS)
     seen = 39.0 / 63.0 * SETTINGS.segments
     assert (passage.known.sum(axis=1) == int(seen)).all()
@@ -101,20 +107,20 @@ def test_what_is_not_seen_is_not_known():
     assert not across_residuals(vertices, passage, LENGTH)[~passage.known].any()
 
 
-def test_errors_are_those_of_the_score():
-    passage = read_run("bag", SIGHTS, SETTINGS)
+def test_errors_are_those_of_the_score(sights: Sights):
+    passage = read_run("bag", sights, SETTINGS)
     vertices = replay_with_parameters(passage, SETTINGS)
     found = frame_errors(vertices, passage.targets, LENGTH)
     for slot in (0, 30, -1):
-        curve = SIGHTS[int(passage.frames[slot])].measured
+        curve = sights[int(passage.frames[slot])].measured
         assert found[slot] == pytest.approx(prediction_error_percent(vertices[slot], curve, LENGTH), rel=1e-6)
     both = offset_residuals(vertices, passage, LENGTH).reshape(len(found), 2, -1)
     assert 100.0 * np.hypot(both[:, 0], both[:, 1])[passage.known].mean() == pytest.approx(found.mean())
     assert (np.abs(across_residuals(vertices, passage, LENGTH)) <= np.hypot(both[:, 0], both[:, 1]) + 1e-12).all()
 
 
-def test_a_thread_that_cannot_start_is_as_wrong_as_can_be():
-    passage = read_run("bag", SIGHTS, SETTINGS)
+def test_a_thread_that_cannot_start_is_as_wrong_as_can_be(sights: Sights):
+    passage = read_run("bag", sights, SETTINGS)
     passage = replace(passage, initials=(passage.initials[0] + 0.01,))
     vertices = replay_with_parameters(passage, SETTINGS)
     assert np.isnan(vertices).all()
@@ -123,29 +129,35 @@ def test_a_thread_that_cannot_start_is_as_wrong_as_can_be():
 
 
 @pytest.mark.parametrize(
-    ("sights", "against", "words"),
+    ("changed", "against", "words"),
     [
-        ([Observation(sight.stamp, reason="dark") for sight in SIGHTS], "seen", "no needle"),
-        ([replace(sight, measured=np.empty((0, 2))) for sight in SIGHTS], "seen", "no thread"),
-        ([replace(sight, ground_truth=np.empty((0, 2))) for sight in SIGHTS], "truth", "no ground truth"),
-        (SIGHTS[:40], "seen", "too short"),
+        (lambda sights: [Observation(sight.stamp, reason="dark") for sight in sights], "seen", "no needle"),
+        (lambda sights: [replace(sight, measured=np.empty((0, 2))) for sight in sights], "seen", "no thread"),
         (
-            [replace(s, measured=s.measured[:20]) if k else s for k, s in enumerate(SIGHTS)],
+            lambda sights: [replace(sight, ground_truth=np.empty((0, 2))) for sight in sights],
+            "truth",
+            "no ground truth",
+        ),
+        (lambda sights: sights[:40], "seen", "too short"),
+        (
+            lambda sights: [sights[0], *(replace(sight, measured=sight.measured[:20]) for sight in sights[1:])],
             "seen",
             "half of the thread",
         ),
-        ([replace(sight, measured=sight.measured[:20]) for sight in SIGHTS], "seen", "never shows half"),
-        ([still(sight, 0.0) for sight in SIGHTS], "seen", "nothing moves"),
-        ([still(sight, 1e-5 * k) for k, sight in enumerate(SIGHTS)], "seen", "too slow"),
-        ([], "seen", "no needle"),
+        (lambda sights: [replace(sight, measured=sight.measured[:20]) for sight in sights], "seen", "never shows half"),
+        (lambda sights: [still(sights[0], sight, 0.0) for sight in sights], "seen", "nothing moves"),
+        (lambda sights: [still(sights[0], sight, 1e-5 * k) for k, sight in enumerate(sights)], "seen", "too slow"),
+        (lambda sights: [], "seen", "no needle"),
     ],
 )
-def test_bags_of_no_use_are_refused_in_words(sights: Sequence[Observation], against: str, words: str):
+def test_bags_of_no_use_are_refused_in_words(
+    sights: Sights, changed: Callable[[Sights], Sights], against: str, words: str
+):
     with pytest.raises(BagError, match=words) as refused:
-        read_run("a bag", sights, SETTINGS, against)
+        read_run("a bag", changed(sights), SETTINGS, against)
     assert str(refused.value).startswith("a bag: ")
 
 
-def test_two_runs_in_one_bag_are_refused():
+def test_two_runs_in_one_bag_are_refused(sights: Sights):
     with pytest.raises(InvalidInputError, match="before the last"):
-        read_run("a bag", [*SIGHTS, *SIGHTS], SETTINGS)
+        read_run("a bag", [*sights, *sights], SETTINGS)

@@ -88,6 +88,7 @@ def test_a_run_whose_bridge_is_stopped_ends_and_says_so(scenario: Path, tmp_path
     assert not any(states[-1].current)
 
 
+@pytest.mark.undisturbed
 def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: Path, tmp_path: Path):
     summary = simulate(str(scenario), tmp_path / "bag", boards=True)
     assert summary.path_error < 2e-3
@@ -154,6 +155,7 @@ def test_under_faults_the_tracker_is_right_or_silent_and_the_needle_goes_on(tmp_
     assert summary.tracked > 15
 
 
+@pytest.mark.undisturbed
 def test_with_a_simulated_clock_it_runs_faster_than_real_time(tmp_path: Path):
     # Few frames: how many a second can be tracked is for a benchmark.
     path = tmp_path / "short.yaml"
