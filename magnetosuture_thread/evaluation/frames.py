@@ -45,6 +45,7 @@ class Observation:
         reason: why the needle was not found.
         processing: time that the tracker took for the frame [s]; nan where the poses were recorded.
         observation: what is seen of the thread; None where a bag holds the centreline alone.
+        deviation: standard deviations of tail [m] and heading [rad]; zeros if not known.
     """
 
     stamp: int
@@ -55,6 +56,7 @@ class Observation:
     reason: str = ""
     processing: float = math.nan
     observation: ThreadObservation | None = None
+    deviation: tuple[float, float] = (0.0, 0.0)
 
     @property
     def found(self) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,6 +24,8 @@ from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 _POSE = struct.Struct("<7d")  # position and quaternion
+_COVARIANT_POSE = struct.Struct("<43d")  # and covariance
+_VARIANCES = [7 * k for k in IN_PLANE]  # among its 36 numbers
 _COUNT = struct.Struct("<I")
 _MAX_NAME = 256  # bytes of the names of frames that are passed over in a path
 _POSE_AT, _COUNT_AT = aligned(DISH_END, 8), aligned(DISH_END, 4)
@@ -79,10 +82,16 @@ def needle_pose(message: Any) -> NeedlePose:
     if variance > MAX_HEADING_DEVIATION**2:
         expected = f"a standard deviation of at most {MAX_HEADING_DEVIATION:g} rad: the heading is unknown"
         raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected)
-    return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading)
+    deviation = pose_deviation([message.pose.covariance[k] for k in _VARIANCES])
+    return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading, deviation)
 
 
-def tracked_pose(stamp: Any, tail: NDArray[np.float64], heading: NDArray[np.float64]) -> NeedlePose:
+def tracked_pose(
+    stamp: Any,
+    tail: NDArray[np.float64],
+    heading: NDArray[np.float64],
+    covariance: NDArray[np.float64] | None = None,
+) -> NeedlePose:
     """Return a needle's pose as `needle_pose` returns it of its message, to the last bit.
 
     Raises:
@@ -90,7 +99,20 @@ def tracked_pose(stamp: Any, tail: NDArray[np.float64], heading: NDArray[np.floa
     """
     checked_nanoseconds(stamp, _STAMP)
     along = round_trip_heading(heading, _ORIENTATION)
-    return NeedlePose(seconds(stamp), np.array([float(tail[0]), float(tail[1])]), along)
+    deviation = (0.0, 0.0) if covariance is None else pose_deviation(np.diag(covariance))
+    return NeedlePose(seconds(stamp), np.array([float(tail[0]), float(tail[1])]), along, deviation)
+
+
+def pose_deviation(variances: Sequence[float] | NDArray[np.float64]) -> tuple[float, float]:
+    """Return the standard deviations of a needle's tail in each direction [m] and of its heading [rad].
+
+    Args:
+        variances: of x, y [m^2] and the heading's angle [rad^2]; what is none gives zeros, as for unknown.
+    """
+    x, y, turn = (float(variance) for variance in variances)
+    if not (math.isfinite(x + y + turn) and min(x, y, turn) >= 0.0):
+        return 0.0, 0.0
+    return math.sqrt(0.5 * (x + y)), math.sqrt(turn)
 
 
 def pose_covariance(message: Any) -> NDArray[np.float64] | None:
@@ -253,21 +275,26 @@ def stamp_of(record: SerializedMessage) -> int:
     return record.time if stamp is None else stamp
 
 
-def read_pose(record: SerializedMessage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return tail and heading of a recorded needle pose, each of shape (2,), as `thread_model` gets them.
+def read_pose(
+    record: SerializedMessage,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
+    """Return tail, heading and their standard deviations of a recorded needle pose, as `thread_model` gets them.
 
     Raises:
         BagError: it cannot be decoded.
         InvalidInputError: it is of another frame, or its orientation is none.
     """
     data = record.data
-    if _is_plain(data) and len(data) >= _POSE_AT + _POSE.size:
-        x, y, _, qx, qy, qz, qw = _POSE.unpack_from(data, _POSE_AT)
-        return np.array([x, y]), heading_from_quaternion(qx, qy, qz, qw, _ORIENTATION)
+    if _is_plain(data) and len(data) >= _POSE_AT + _COVARIANT_POSE.size:
+        x, y, _, qx, qy, qz, qw, *covariance = _COVARIANT_POSE.unpack_from(data, _POSE_AT)
+        heading = heading_from_quaternion(qx, qy, qz, qw, _ORIENTATION)
+        return np.array([x, y]), heading, pose_deviation([covariance[k] for k in _VARIANCES])
     message = record.decode()
     require_dish_frame(message.header.frame_id, record.topic)
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    return np.array([position.x, position.y]), heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
+    heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
+    deviation = pose_deviation([message.pose.covariance[k] for k in _VARIANCES])
+    return np.array([position.x, position.y]), heading, deviation
 
 
 def read_path(record: SerializedMessage) -> Points:

@@ -27,11 +27,13 @@ class NeedlePose:
         stamp: [s]
         tail: the blunt end, where the thread is attached, shape (d,) [m].
         heading: unit vector from tail to tip, shape (d,).
+        deviation: standard deviations of the tail in each direction [m] and of the heading [rad]; zeros if not known.
     """
 
     stamp: float
     tail: Points
     heading: Points
+    deviation: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Take sequences of numbers as arrays."""

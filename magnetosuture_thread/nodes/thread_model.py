@@ -76,9 +76,9 @@ class ThreadModelNode(PackageNode):
         """Step the thread to a needle pose, or report why that is impossible."""
         self._step(message.header.stamp, lambda: reading.needle_pose(message))
 
-    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
+    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray, covariance: np.ndarray) -> None:
         """Handle a pose handed over by a tracker in the same process, as its message would be."""
-        self._step(stamp, lambda: reading.tracked_pose(stamp, tail, heading))
+        self._step(stamp, lambda: reading.tracked_pose(stamp, tail, heading, covariance))
 
     def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
         began = time.perf_counter()

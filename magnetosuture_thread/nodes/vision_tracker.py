@@ -38,7 +38,7 @@ SILENCE = 0.5  # s without a frame, after which the tracker says that it sees no
 class Follower(Protocol):
     """Receiver of poses and observations of the thread in the same process."""
 
-    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray) -> None:
+    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray, covariance: np.ndarray) -> None:
         """Receive what is published as needle pose."""
 
     def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
@@ -154,7 +154,7 @@ class VisionTrackerNode(PackageNode):
             self._poses.publish(packed_pose(when, track.tail, track.heading, track.covariance))
         if seen.tracked:
             for follower in self._followers:
-                follower.on_tracked(stamp, track.tail, track.heading)
+                follower.on_tracked(stamp, track.tail, track.heading, track.covariance)
             if len(seen.centreline):
                 self._threads.publish(packed_path(when, seen.centreline))
         self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))

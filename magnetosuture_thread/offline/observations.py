@@ -26,7 +26,7 @@ from magnetosuture_thread.interface import (
     THREAD_OBSERVATION,
     Channel,
 )
-from magnetosuture_thread.messages.reading import read_observation, read_path, read_pose, stamp_of
+from magnetosuture_thread.messages.reading import pose_deviation, read_observation, read_path, read_pose, stamp_of
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.session import MAX_WAITING_POSES
 from magnetosuture_thread.offline.changes import CHANGING
@@ -233,13 +233,13 @@ class ObservationReader(Iterator[Observation]):
         stamp = stamp_of(record)
         self.on_record(stamp, record)
         try:
-            tail, heading = read_pose(record)
+            tail, heading, deviation = read_pose(record)
         except InvalidInputError as error:
             self.refused[NO_POSE] += 1
             return Observation(stamp, reason=str(error))
         self._check_place(record.topic, tail)
         self.found += 1
-        return Observation(stamp, tail, heading, _NOTHING, _NOTHING)
+        return Observation(stamp, tail, heading, _NOTHING, _NOTHING, deviation=deviation)
 
     def _frame(self, record: RecordedMessage) -> Observation:
         """Return what a camera frame says, as `thread_model` would get it."""
@@ -271,6 +271,7 @@ class ObservationReader(Iterator[Observation]):
             seen.centreline,
             processing=taken,
             observation=seen.track.observation,
+            deviation=pose_deviation(np.diag(seen.track.covariance)),
         )
 
     def _check_place(self, topic: str, points: Points) -> None:

@@ -137,7 +137,7 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
             yield step(waiting.get(result.stamp, observation), result, time.perf_counter() - began)
             began = time.perf_counter()
         began = time.perf_counter()
-        pose = NeedlePose(observation.stamp * 1e-9, observation.tail, observation.heading)
+        pose = NeedlePose(observation.stamp * 1e-9, observation.tail, observation.heading, observation.deviation)
         predicted = session.predict(observation.stamp, pose)
         taken = time.perf_counter() - began
         yield step(observation, session.estimate(predicted, pose), taken)

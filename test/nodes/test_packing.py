@@ -359,8 +359,12 @@ def test_the_minimum_of_every_barrier_is_written_beside_its_node():
 def test_a_pose_that_is_handed_over_is_that_of_its_message():
     for angle in np.random.default_rng(1).uniform(-np.pi, np.pi, 1000):
         tail, heading = np.array([angle * 1e-3, -angle]), np.array([np.cos(angle), np.sin(angle)])
-        told = reading.needle_pose(deserialize_message(packed_pose(WHEN, tail, heading), PoseWithCovarianceStamped))
-        handed = reading.tracked_pose(STAMP, tail, heading)
+        covariance = np.diag([2e-10, 3e-10, 1e-5]) * (1.0 + angle**2)
+        message = packed_pose(WHEN, tail, heading, covariance)
+        told = reading.needle_pose(deserialize_message(message, PoseWithCovarianceStamped))
+        handed = reading.tracked_pose(STAMP, tail, heading, covariance)
         assert told.stamp == handed.stamp
         assert told.tail.tobytes() == handed.tail.tobytes()
         assert told.heading.tobytes() == handed.heading.tobytes()
+        assert told.deviation == handed.deviation
+        assert min(told.deviation) > 0.0

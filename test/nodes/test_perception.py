@@ -154,7 +154,7 @@ def test_a_stamp_that_is_none_is_refused_by_the_tracker_and_by_the_model(graph, 
     graph.wait(lambda: is_refused("camera/image_raw/compressed"), "the tracker's refusal")
     assert poses == []
     with graph.between_callbacks():
-        model.on_tracked(stamp, np.zeros(2), np.array([1.0, 0.0]))
+        model.on_tracked(stamp, np.zeros(2), np.array([1.0, 0.0]), np.zeros((3, 3)))
     graph.wait(lambda: is_refused("needle/measured_cp"), "the model's refusal")
 
 

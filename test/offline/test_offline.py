@@ -274,11 +274,13 @@ def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
 
 def test_poses_are_read_as_a_node_gets_them():
     heading = np.array([np.cos(2.5), np.sin(2.5)])
-    message = MESSAGES.pose_message(10**9, np.array([1e-3, -2e-3]), heading, None)
+    covariance = np.diag([4e-10, 4e-10, 9e-6])
+    message = MESSAGES.pose_message(10**9, np.array([1e-3, -2e-3]), heading, covariance)
     data = bytes(typestore().serialize_cdr(message, NEEDLE_POSE.type_name))
     given = RecordedMessage(NEEDLE_POSE.recorded, NEEDLE_POSE.type_name, 3, data)
-    tail, along = read_pose(given)
+    tail, along, deviation = read_pose(given)
     assert tail.tolist() == [1e-3, -2e-3]
+    assert deviation == pytest.approx((2e-5, 3e-3))
     assert along == pytest.approx(heading, abs=1e-15)
     with pytest.raises(BagError):
         read_pose(replace(given, data=data[:40]))

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator.innovations import moved_apart
-from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.model.estimator.relaxation import relax, significances
+from magnetosuture_thread.model.thread import Attachment, Thread
 
 Vector = NDArray[np.float64]
 
@@ -139,41 +139,57 @@ def strongest(force: Vector, positions: Points, unit: float, significance: float
 
 
 class DisturbanceTest:
-    """Tests whether what the camera moves the thread by goes on in one direction.
+    """Tests whether the camera moves the thread farther than model, camera and needle can be wrong.
 
-    Corrections of a right model are a difference of two errors of the estimate; those that go on in one direction
-    are of something that the model does not know.
+    What corrections move the thread by is added up, and relaxes by bending meanwhile, as a thread does that is
+    displaced:
+
+        (1 + a C' C) e_k = exp(-dt / T) e_{k-1} + d_k        see `relax`
+
+    so e is by how much a model that was left alone over the time T would have gone another way. Of a pose of the
+    needle, a shape or a camera that is a little off, that stays about as much: a sum of the corrections alone would
+    count the same error anew with every frame.
 
     Args:
         thread: the thread.
-        time: over which corrections are averaged [s].
+        time: T, over which corrections are added up [s].
     """
 
     def __init__(self, thread: Thread, time: float) -> None:
+        self._use(thread, time)
+        self._displacement = np.zeros((thread.segments + 1, 2))  # e [m]
+        self._since, self._significance = math.nan, 0.0
+
+    def _use(self, thread: Thread, time: float) -> None:
         self._thread, self._time = thread, time
-        self._rate = np.zeros((thread.segments + 1, 2))  # m/s
-        self._since, self._significance, self._interval = math.nan, 0.0, 0.0
+        self._clamped = thread.attachment is Attachment.CLAMPED
+        self._stiffness = thread.bending_stiffness / (thread.medium.drag_across * thread.segment_length**4)  # 1/s
+        # Displacement of the nodes over that of the tail, and over an error of the heading [m/rad].
+        self._response = np.zeros((thread.segments + 1, 2))
+        self._response[0, 0] = 1.0
+        relax(time * self._stiffness, self._clamped, np.array([0.0, thread.segment_length]), self._response)
 
     def copied(self) -> DisturbanceTest:
         """Return a copy."""
         other = copy.copy(self)
-        other._rate = self._rate.copy()
+        other._displacement = self._displacement.copy()
         return other
 
     def resampled(self, thread: Thread, time: float) -> DisturbanceTest:
         """Return the same test of another thread, or with another averaging time [s]."""
         other = copy.copy(self)
-        other._thread, other._time = thread, time
+        other._use(thread, time)
         nodes = self._thread.segment_length * np.arange(self._thread.segments + 1)
         at = thread.segment_length * np.arange(thread.segments + 1)
-        other._rate = np.column_stack([np.interp(at, nodes, along) for along in self._rate.T])
+        other._displacement = np.column_stack([np.interp(at, nodes, along) for along in self._displacement.T])
         return other
 
     def decay(self, interval: float) -> None:
         """Let time pass [s]."""
-        self._rate *= math.exp(-interval / self._time)
+        self._displacement *= math.exp(-interval / self._time)
+        relax(interval * self._stiffness, self._clamped, np.zeros(2), self._displacement)
 
-    def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, interval: float) -> None:
+    def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, deviations: Vector) -> None:
         """Add a correction.
 
         Args:
@@ -181,12 +197,12 @@ class DisturbanceTest:
             normals: of the nodes, shape (n + 1, 2).
             variance: of the mean of each window's points, inf where nothing is measured, shape (w,) [m^2].
             stamp: [s]
-            interval: since the last one [s].
+            deviations: standard deviations of the needle's tail [m] and heading [rad].
         """
-        self._rate += moved / self._time
-        significance = np.empty(len(variance))
-        moved_apart(self._rate, normals, self._time, variance, significance)
-        self._significance, self._interval = float(significance.max()), interval
+        self._displacement += moved
+        found = np.empty(len(variance))
+        significances(self._displacement, normals, variance, self._response, deviations, found)
+        self._significance = float(found.max())
         if self._significance > FOUND:
             self._since = stamp if math.isnan(self._since) else self._since
         elif self._significance < LOST:
@@ -197,6 +213,7 @@ class DisturbanceTest:
         if not stamp - self._since >= CONFIRMED * self._time:
             return ()
         thread = self._thread
-        drag, bending = thread.medium, thread.bending_stiffness * self._interval
-        force = force_density(self._rate, positions, drag.drag_across, drag.drag_along, bending)
+        drag, bending = thread.medium, thread.bending_stiffness * self._time
+        rate = self._displacement / self._time
+        force = force_density(rate, positions, drag.drag_across, drag.drag_along, bending)
         return (strongest(force, positions, thread.segment_length, self._significance, self._since),)

@@ -278,9 +278,8 @@ class ThreadEstimator:
         hidden = take_over(points, weights, work, density, self._variance, self._applied)
         self._slow.correct(self._corrector, self._variance)
         shift_errors(self._noise.bank, self._applied * unit)
-        elapsed = elapsed if math.isfinite(elapsed) else 0.0
         own = self._sums.own * unit**2
-        self._test.add(work.moved * unit, work.normals, own, pose.stamp, elapsed)
+        self._test.add(work.moved * unit, work.normals, own, pose.stamp, np.asarray(pose.deviation))
         corrected = ThreadState(work.about * unit, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True

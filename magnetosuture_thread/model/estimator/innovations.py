@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.correction import CorrectionBuffers, MeasuredPoints, robust_weights
 
 Vector = NDArray[np.float64]
@@ -142,31 +141,3 @@ def take_over(
     for i in range(segments):
         hidden += 0 if seen[i] else 1
     return hidden / segments
-
-
-@compiled
-def moved_apart(rate: Points, normals: Points, time: float, variance: Vector, significance: Vector) -> None:
-    """Write how significant what the camera moved each window by is, over the last moments.
-
-        z = |sum of corrections| / (2 r)^(1/2)
-
-    Corrections of a right model are a difference of two errors of the estimate, and neither is larger than that of the
-    points alone.
-
-    Args:
-        rate: of the corrections, averaged over `time`, shape (n + 1, 2).
-        normals: shape (n + 1, 2).
-        time: [s]
-        variance: r of the mean of a window's points, inf where nothing is measured, shape (w,).
-        significance: z, written, shape (w,).
-    """
-    windows, nodes = len(variance), len(rate)
-    for w in range(windows):
-        total, count = 0.0, 0
-        for i in range(1, nodes):
-            if min(i * windows // nodes, windows - 1) == w:
-                total += normals[i, 0] * rate[i, 0] + normals[i, 1] * rate[i, 1]
-                count += 1
-        significance[w] = 0.0
-        if count > 0 and np.isfinite(variance[w]):
-            significance[w] = time * abs(total) / count / np.sqrt(2.0 * variance[w])

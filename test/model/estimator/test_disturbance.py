@@ -1,0 +1,59 @@
+"""The test for disturbances: relaxation by bending, and errors of the needle's pose, which are no disturbance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.model.estimator import ThreadEstimator
+from magnetosuture_thread.model.estimator.relaxation import relax
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
+from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.thread_observation import ThreadObservation
+from test.model.estimator.threads import RATE, piece_of, true_shapes
+
+TAIL_ERROR, HEADING_ERROR = 3e-5, 5e-3
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_relaxation_solves_its_equation(clamped: bool) -> None:
+    rng, amount = np.random.default_rng(2), 3.7
+    displacement, slope = rng.normal(size=(12, 2)), rng.normal(size=2)
+    curvature = np.zeros((12, 12))
+    for node in range(1, 11):
+        curvature[node, node - 1 : node + 2] = 1.0, -2.0, 1.0
+    curvature[0, :2] = (-np.sqrt(2.0), np.sqrt(2.0)) if clamped else 0.0
+    relaxed = displacement.copy()
+    relax(amount, clamped, slope, relaxed)
+    moment = curvature @ relaxed
+    moment[0] -= np.sqrt(2.0) * slope if clamped else 0.0
+    residual = relaxed - displacement + amount * curvature.T @ moment
+    assert np.abs(residual[1:]).max() < 1e-12
+    assert np.array_equal(relaxed[0], displacement[0])
+
+
+@pytest.mark.parametrize(("material", "attachment"), [("silk_6_0", "pinned"), ("polyamide_7_0", "clamped")])
+def test_a_pose_that_is_a_little_off_is_no_disturbance(material: str, attachment: str) -> None:
+    thread = Thread.of(MATERIALS[material], length=0.019, segments=25, attachment=Attachment(attachment))
+    angles = 0.4 * np.sin(np.arange(120) / RATE)
+    headings = np.column_stack([np.cos(angles), np.sin(angles)])
+    tails = np.array([-5e-3, 0.0]) + 2e-3 * np.cumsum(headings, axis=0) / RATE
+    way = [NeedlePose(k / RATE, tails[k], headings[k]) for k in range(len(tails))]
+    truth = true_shapes(thread, way)
+    estimator = ThreadEstimator(ThreadPredictor(thread))
+    found = []
+    for k, pose in enumerate(way):
+        turned = angles[k] + HEADING_ERROR
+        measured = replace(
+            pose,
+            tail=pose.tail + TAIL_ERROR * np.array([-np.sin(angles[k]), np.cos(angles[k])]),
+            heading=np.array([np.cos(turned), np.sin(turned)]),
+            deviation=(TAIL_ERROR, HEADING_ERROR),
+        )
+        seen = ThreadObservation((piece_of(truth[k], k, deviation=5e-6),), complete=True)
+        estimate = estimator.start(measured, truth[0]) if k == 0 else estimator.step(measured, seen)
+        found += estimate.disturbances
+    assert not found
