@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TwistStamped
-from magnetosuture_msgs.msg import CoilBridgeState
+from geometry_msgs.msg import TwistStamped, Vector3
+from magnetosuture_msgs.msg import CoilBridgeState, PredictedThread
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -55,6 +55,35 @@ def test_a_pose_that_cannot_be_does_not_end_the_bridge(graph, tail):
     assert not driven(node)
     # Only several poses in a row that agree are believed after one that was not.
     drive_until(graph, lambda: driven(node), "good poses to be believed")
+
+
+def test_the_threads_pull_is_compensated_by_the_coils(graph):
+    node = armed(graph, **LONG, thread_feedforward=True)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    without = CoilBridgeSettings().allocation().allocate(np.array([0.005, 0.0]), TAIL, EAST).currents
+    drive_until(graph, lambda: any(np.allclose(told, without, atol=0.05) for told in applied(node)), "the currents")
+
+    def pull(force: float, frame: str = "dish") -> None:
+        header = MESSAGES.header(graph.now())
+        header.frame_id = frame
+        graph.publish(topics.PREDICTED_THREAD, PredictedThread(header=header, needle_force=Vector3(x=force)))
+
+    added = 0.004  # m/s, of 0.005: reduced to half of the command
+    force = -added * CoilBridgeSettings().needle_drag
+    expected = CoilBridgeSettings().allocation().allocate(np.array([0.0075, 0.0]), TAIL, EAST).currents
+
+    def compensated() -> bool:
+        pull(force)
+        drive(graph)
+        return any(np.allclose(told, expected, atol=0.05) for told in applied(node))
+
+    graph.wait(compensated, "more current")
+    for value, frame, words in (
+        (math.inf, "dish", "at most 1 N"),
+        (force, "camera", "thread/predicted.header.frame_id"),
+    ):
+        pull(value, frame)
+        graph.wait(lambda words=words: any(words in str(d.status[0].values) for d in diagnostics), "a refusal")
 
 
 def test_between_commands_the_currents_follow_the_needle(graph):

@@ -7,27 +7,24 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
-from magnetosuture_msgs.msg import PredictedThread, SafetyMargins
+from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.clock import Clock, ClockType
-from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from magnetosuture_thread import InvalidInputError, Scene
+from magnetosuture_thread import Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, CoilBridge
 from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
 from magnetosuture_thread.coils.drivers import make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.coil_bridge.pull import INPUT_ERRORS, PullSubscription
 from magnetosuture_thread.nodes.coil_bridge.report import BridgeServices, CoilReport
 from magnetosuture_thread.nodes.coil_bridge.stop_file import stop_record
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import raise_priority, run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
-
-INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
 
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
@@ -46,8 +43,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog: Timer | None = None
-        self._pull: Subscription | None = None
         self._report = CoilReport(self, self.system, self._steady)
+        self._pull = PullSubscription(self, self.refuse)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
         self._scene = SceneFollower(self, self.health, None, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
@@ -67,8 +64,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         driver = make_driver(settings, len(bridge.coils), self._report.send_to_rig, self._report.count_rigs)
         self.system.open(settings, bridge, driver)
         self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
-        if settings.thread_feedforward:
-            self._pull = topics.PREDICTED_THREAD.subscribe(self, self.on_prediction)
+        self._pull.follow(bridge)
 
     def resume(self) -> None:
         """Activate, so that the bridge can be armed."""
@@ -82,9 +78,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         """Set the coils to zero, close the driver, and publish that."""
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
-        if self._pull is not None:
-            self.destroy_subscription(self._pull)
-        self._watchdog, self._pull, self._reactivate = None, None, False
+        self._watchdog, self._reactivate = None, False
+        self._pull.follow(None)
         self._stamps.clear()
         ends = self.stage in ("shuttingdown", FINALIZED)
         final = self.system.close(FINALIZED if ends else UNCONFIGURED)
@@ -134,25 +129,11 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def on_margins(self, message: SafetyMargins) -> None:
         """Register the thread's margins: slowdown by friction, and the scene of the prediction."""
-        if self.system.bridge is None:
+        if (bridge := self.system.bridge) is None:
             return
         try:
             stamp = reading.checked_nanoseconds(message.header.stamp, "thread/margins.header.stamp") * 1e-9
-            self.system.bridge.on_margins(
-                stamp, message.valid, message.slowdown, message.scene_version, self._times()[1]
-            )
-        except INPUT_ERRORS as error:
-            self.refuse(error)
-
-    def on_prediction(self, message: PredictedThread) -> None:
-        """Register the thread's pull on the needle, for the next currents."""
-        if self.system.bridge is None or self.system.bridge.feedforward is None:
-            return
-        try:
-            reading.require_dish_frame(message.header.frame_id, topics.PREDICTED_THREAD.name)
-            stamp = reading.checked_nanoseconds(message.header.stamp, "thread/predicted.header.stamp") * 1e-9
-            force = np.array([message.needle_force.x, message.needle_force.y])
-            self.system.bridge.feedforward.update(force, stamp, self._times()[1])
+            bridge.on_margins(stamp, message.valid, message.slowdown, message.scene_version, self._times()[1])
         except INPUT_ERRORS as error:
             self.refuse(error)
 
