@@ -45,6 +45,11 @@ def arc(tail: np.ndarray, angle: float, curvature: float, length: float = 0.019,
     return np.vstack([tail, tail + np.cumsum(steps, axis=0)])
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests last that run alone, so that others wait for them once."""
+    items.sort(key=lambda item: item.get_closest_marker("undisturbed") is not None)
+
+
 @contextmanager
 def turn(alone: bool) -> Iterator[None]:
     """Wait until a whole graph may run, beside others or alone; who waits to be alone lets no other begin.

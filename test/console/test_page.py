@@ -599,7 +599,7 @@ CAUSES: list[tuple[str, dict[str, Any], str]] = [  # why nothing moves, in the o
     ("bridge", {"saturated": True}, "At rest: the coils are at their limit"),
 ]
 # As one text, and what all graphs share but once: value by value, thousands of views take the browser minutes.
-FIND_HEADLINES = """async (text) => {
+MOTION_HEADLINES = """async (text) => {
     const { motionStatus } = await import("/status.js");
     const [shared, views] = JSON.parse(text);
     return views.map((view) => motionStatus({ ...view, graph: { ...shared, ...view.graph } }).headline);
@@ -628,7 +628,7 @@ def test_a_held_key_without_motion_always_has_a_reason_the_most_helpful_first(op
     shared = state()
     for view, _ in looks:
         view["graph"] = {name: part for name, part in view["graph"].items() if part != shared.get(name)}
-    headlines = operator.page.evaluate(FIND_HEADLINES, json.dumps([shared, [view for view, _ in looks]]))
+    headlines = operator.page.evaluate(MOTION_HEADLINES, json.dumps([shared, [view for view, _ in looks]]))
     for (_, expected), found in zip(looks, headlines, strict=True):
         assert found.startswith(expected)
 
