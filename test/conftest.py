@@ -10,7 +10,7 @@ import signal
 import tempfile
 import uuid
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +47,7 @@ def arc(tail: np.ndarray, angle: float, curvature: float, length: float = 0.019,
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the tests last that run alone, so that others wait for them once."""
-    items.sort(key=lambda item: item.get_closest_marker("undisturbed") is not None)
+    items.sort(key=runs_alone)
 
 
 @contextmanager
@@ -63,13 +63,29 @@ def turn(alone: bool) -> Iterator[None]:
         yield
 
 
+def runs_alone(item: pytest.Item) -> bool:
+    """Return whether a test needs the machine for itself."""
+    return item.get_closest_marker("undisturbed") is not None
+
+
+turns: list[ExitStack] = []  # the one that this process has
+
+
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
     """Run a test that starts a whole graph, with its fixtures, when it is its turn."""
     if item.get_closest_marker("whole_graph") is None:
         return (yield)
-    with turn(alone=item.get_closest_marker("undisturbed") is not None):
+    if not turns:
+        turns.append(ExitStack())
+        turns[0].enter_context(turn(runs_alone(item)))
+    try:
         return (yield)
+    finally:
+        # A graph that a module's tests share runs on between them.
+        goes_on = runs_alone(item) and nextitem is not None and runs_alone(nextitem) and nextitem.path == item.path
+        if not goes_on:
+            turns.pop().close()
 
 
 @pytest.fixture(autouse=True)

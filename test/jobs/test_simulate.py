@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -26,11 +25,6 @@ from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.scene import read_scene
 
 pytestmark = pytest.mark.whole_graph
-
-
-def of_one_run(test: Callable[..., None]) -> Callable[..., None]:
-    """Have one process of pytest-xdist take these tests, so that their run is made once, while no other graph runs."""
-    return pytest.mark.xdist_group("run")(pytest.mark.undisturbed(test))
 
 
 SHORT = """
@@ -65,7 +59,7 @@ def run(scenario: Path, tmp_path_factory: pytest.TempPathFactory):
     return bag, summary, said, shares
 
 
-@of_one_run
+@pytest.mark.undisturbed
 def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     _, summary, said, shares = run
     assert summary.setup == "short"
@@ -107,7 +101,7 @@ def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: 
     assert max(abs(current) for state in following for current in state.measured_current) > 0.5
 
 
-@of_one_run
+@pytest.mark.undisturbed
 def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     bag = Bag(run[0])
     assert bag.damage is None
@@ -141,7 +135,7 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     assert all(0.0 < covariance[0] < 1e-8 for covariance in covariances)
 
 
-@of_one_run
+@pytest.mark.undisturbed
 def test_replay_takes_the_bag(run, scenario: Path, tmp_path: Path):
     scenario.rename(scenario.with_suffix(".gone"))  # the bag must know it by itself
     try:
@@ -232,7 +226,11 @@ def test_raw_frames_are_refused_as_the_bag_would_not_hold_them(tmp_path: Path):
         simulate(str(path), tmp_path / "bag")
 
 
-def test_a_run_in_which_nothing_is_seen_fails_but_its_bag_and_logs_stay(tmp_path: Path):
+def test_a_run_in_which_nothing_is_seen_fails_but_its_bag_and_logs_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(simulate_module, "PREDICTION_TIMEOUT", 2.0)  # s; in vain
+    monkeypatch.setattr(simulate_module, "EXTRA_TIME", 5.0)
     path = tmp_path / "dark.yaml"
     path.write_text(SHORT.replace("FAULTS", "    light_gain: 0.06"))
     with pytest.raises(GraphError, match=r"tracked in no frame; .*vision_tracker: searching"):
