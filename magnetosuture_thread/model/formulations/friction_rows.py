@@ -1,4 +1,4 @@
-"""The rows of Coulomb's friction of a step's program, one for each node and each chord that a shape pushes; in the plane.
+"""The rows of Coulomb friction of a step, one for each node and each chord that a shape pushes; in the plane.
 
 A place of the thread, a node or a place s between two, that a shape pushes with the force N n dissipates mu N |t' u(s)|
 as it slides with the velocity u(s) along the tangent t of the shape. That is convex in u, and its multiplier is the
