@@ -2,12 +2,15 @@
 
 The thread model first steers its needle, a point, as `magnetosuture reproduce hernia` does. Then the rig's rod, of
 springs and with many more segments, is driven along the same way, and the model, with several n, is compared with it.
+The same with friction, of the rig's own code and the model's; then friction alone: capstans, a thread that is held, and
+the time of a step.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.friction import friction_table, measure_friction
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli.terminal import make_log
@@ -29,6 +33,7 @@ STEERING = Path("examples/hernia_steering")
 TRUE_SEGMENTS = 240
 MAX_DEPTH = 5e-6  # m, of any point of a chord
 SAMPLES = 21  # of a chord, for its depth
+FRICTION = 0.2  # of the rig's thread on everything, and of the model's scene
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -53,16 +58,38 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     log(f"the rig's rod of {TRUE_SEGMENTS} segments follows the same way")
     truth, pulls = _simulate(setup, poses)
     rows = [_compared(setup, poses, truth, pulls, segments) for segments in options.segments]
+    log(f"the same with friction, {FRICTION:g}")
+    rough = _with_friction(setup, FRICTION)
+    truth, pulls = _simulate(rough, poses)
+    rows += [_compared(rough, poses, truth, pulls, segments) for segments in options.segments]
     table = Table(title=f"hernia_ring, simulated, {poses[-1].stamp:.0f} s; errors in % of the length, mean (maximum)")
-    for name in ("n", "error", "deepest [µm]", "pull on the needle [% of its peak, RMS]", "not converged", "step [µs]"):
+    for name in (
+        "n",
+        "friction",
+        "error",
+        "deepest [µm]",
+        "pull on the needle [% of its peak, RMS]",
+        "not converged",
+        "step [µs]",
+    ):
         table.add_column(name, justify="right")
     for row in rows:
         error = f"{row['error_mean_percent']:.3f} ({row['error_max_percent']:.2f})"
         figures = f"{1e6 * row['deepest_m']:.1f}", f"{row['pull_error_percent']:.1f}", str(row["not_converged"])
-        table.add_row(str(row["segments"]), error, *figures, f"{row['median_step_us']:.0f}")
+        table.add_row(str(row["segments"]), f"{row['friction']:g}", error, *figures, f"{row['median_step_us']:.0f}")
     console.print(table)
+    log("friction by itself")
+    friction = measure_friction()
+    console.print(friction_table(friction))
     passed = all(row["deepest_m"] <= MAX_DEPTH and row["not_converged"] == 0 for row in rows)
-    return {"cases": rows}, passed
+    return {"cases": rows, "friction": friction}, passed
+
+
+def _with_friction(setup: Setup, friction: float) -> Setup:
+    """Return a setup whose rig and scene have friction."""
+    shapes = tuple(replace(shape, friction=friction) for shape in setup.scene.shapes)
+    scene = replace(setup.scene, dish=replace(setup.scene.dish, wall_friction=friction), shapes=shapes)
+    return replace(setup, scene=scene, rig=replace(setup.rig, thread_friction=friction))
 
 
 def _simulate(setup: Setup, poses: list[NeedlePose]) -> tuple[list[Points], Points]:
@@ -124,6 +151,7 @@ def _compared(
     off, peak = np.linalg.norm(np.array(found) - pulls[1:], axis=1), float(np.linalg.norm(pulls, axis=1).max())
     return {
         "segments": segments,
+        "friction": scene.dish.wall_friction,
         "error_mean_percent": 100.0 * float(np.mean(errors)),
         "error_max_percent": 100.0 * float(np.max(errors)),
         "deepest_m": deepest,

@@ -26,12 +26,14 @@ def scene_fields(scene: Scene) -> dict[str, Any]:
     A shape has `disc`, a list of none or one of x, y, radius, and `polygon`, a list of none or one of `outline` and
     `holes`. An outline is a dictionary whose `corners` are dictionaries of x, y and z.
     """
-    return {
+    fields: dict[str, Any] = {
         "version": scene.version,
         "dish_diameter": scene.dish.diameter,
         "dish_depth": scene.dish.depth,
         "shapes": [_shape_fields(shape) for shape in scene.shapes],
     }
+    # Messages of before there was friction have no field for it; only a scene that has some needs one.
+    return {**fields, "wall_friction": scene.dish.wall_friction} if scene.dish.wall_friction else fields
 
 
 def parse_scene_message(message: Any) -> Scene:
@@ -49,7 +51,8 @@ def parse_scene_message(message: Any) -> Scene:
         raise InvalidInputError(f"{SCENE.name}.header.frame_id", repr(frame[:MAX_NAME_CHARS]), repr(DISH_FRAME))
     _require_bounds(message)
     try:
-        dish = Dish(float(message.dish_diameter), float(message.dish_depth))
+        wall_friction = float(getattr(message, "wall_friction", 0.0))  # not in messages of before
+        dish = Dish(float(message.dish_diameter), float(message.dish_depth), wall_friction)
         scene = Scene(dish, tuple(_shape_of(shape) for shape in message.shapes))
     except ConfigurationError as error:
         raise InvalidInputError(f"{SCENE.name}.{error.name}", repr(error.value), error.expectation) from None
@@ -62,6 +65,8 @@ def parse_scene_message(message: Any) -> Scene:
 def _shape_fields(shape: SceneShape) -> dict[str, Any]:
     geometry = shape.geometry
     fields: dict[str, Any] = {"name": shape.name, "kind": shape.kind, "disc": [], "polygon": []}
+    if shape.friction:
+        fields["friction"] = shape.friction
     if isinstance(geometry, Disc):
         fields["disc"] = [{"x": geometry.centre[0], "y": geometry.centre[1], "radius": geometry.radius}]
     else:
@@ -108,7 +113,7 @@ def _shape_of(shape: Any) -> SceneShape:
             triangulate(geometry)
         except ConfigurationError as error:
             raise ConfigurationError(f"{shape.name}.{error.name}", error.value, error.expectation) from None
-    return SceneShape(shape.name, shape.kind, geometry)
+    return SceneShape(shape.name, shape.kind, geometry, friction=float(getattr(shape, "friction", 0.0)))
 
 
 def _ring(outline: Any) -> Ring:

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.margins import FrictionState
 from magnetosuture_thread.model.program import Vector
+
+SLIDING_TOLERANCE = 1e-6  # of a friction's limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +22,8 @@ class ThreadForces:
 
         T_i = Z D^2 lambda_i |x_i - x_{i-1}| / D,    N_i = Z D^2 sum_c lambda_c n_c
 
-    over the contacts c of node i. The thread pulls the needle with what is left of the balance of the node at its tail,
+    over the contacts c of node i, those of friction included. The thread pulls the needle with what is left of the
+    balance of the node at its tail,
 
         F = T_1 t_1 - (EI / D^2) dE / dx_0 + (D / 2) (mu g - zeta_perp v + (zeta_perp - zeta_par) t_1 t_1' v)
 
@@ -31,6 +35,9 @@ class ThreadForces:
         contact: N_i, the force of shapes and wall upon each node, shape (n + 1, d) [N].
         needle_force: F, of the thread upon the needle, at its tail, shape (d,) [N].
         needle_moment: M about the tail, counter-clockwise, 0 of a pinned thread; in the plane only, else NaN [N m].
+        friction: the part of N_i along the shapes, shape (n + 1,) [N].
+        friction_use: the same over its limit mu N of the shape where it is nearest to it: 1 where the node slides, 0
+            where it has no friction, shape (n + 1,).
 
     Source: Lagrange's multipliers; the paper works no force out. Deviation: inertia of the half segment at the needle
     and the damping of bending are not in F.
@@ -40,6 +47,17 @@ class ThreadForces:
     contact: Points
     needle_force: Vector
     needle_moment: float
+    friction: Vector
+    friction_use: Vector
+
+    @property
+    def friction_states(self) -> tuple[FrictionState, ...]:
+        """Of each node: free of friction, stuck, or sliding."""
+        slides, sticks = self.friction_use >= 1.0 - SLIDING_TOLERANCE, self.friction_use > 0.0
+        return tuple(
+            FrictionState.SLIDING if slide else FrictionState.STUCK if stick else FrictionState.FREE
+            for slide, stick in zip(slides.tolist(), sticks.tolist(), strict=True)
+        )
 
     @property
     def peak_tension(self) -> float:

@@ -90,7 +90,13 @@ class ThreadPredictor:
         elif scene is not None:
             check_scene(thread, scene)
             reach = margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
-            workspace = Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius)
+            workspace = Workspace(
+                scene.obstacles,
+                reach,
+                wall_radius=scene.dish.radius,
+                friction=scene.friction,
+                wall_friction=scene.dish.wall_friction,
+            )
             self.scene_version = scene.version
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)

@@ -3,6 +3,9 @@
     minimise over u, s   1/2 u' P u + q' u + 1/2 sum_r s_r^2 / c_r
     subject to           lower_r <= a_r' u + s_r <= upper_r,    u_i = 0 for the known nodes
 
+A row of friction has a limit F_r on its multiplier, |lambda_r| <= F_r: its bounds may be missed by e_r at a price of
+F_r |e_r|, the dissipation of Coulomb's friction.
+
 The unknowns are the velocities u_i of a chain's nodes. A slack s_r with weight W_r is what its
 multiplier makes of it, s_r = lambda_r / W_r: so it is no variable but the row's compliance c_r = 1 / W_r,
 and 0 makes the row hard. Every row touches at most three nodes in a row, and P couples nodes at most
@@ -42,6 +45,7 @@ class ChainProgram(NamedTuple):
         lower: shape (r,), -inf where there is none.
         upper: shape (r,), inf where there is none.
         compliance: c_r >= 0, shape (r,).
+        limit: F_r >= 0 of |lambda_r|, inf of all rows but those of friction, shape (r,).
     """
 
     blocks: NDArray[np.float64]
@@ -53,6 +57,7 @@ class ChainProgram(NamedTuple):
     lower: Vector
     upper: Vector
     compliance: Vector
+    limit: Vector
 
 
 class WideRows(NamedTuple):
@@ -84,8 +89,9 @@ class Residuals(NamedTuple):
 
     Attributes:
         primal: of the bounds, with y = a' u + c lambda:  max(lower - y, y - upper, 0).
-        dual: of the balance of forces:  |P u + q - sum a lambda|.
-        complementarity: |lambda| times the distance of y from the bound that its sign names.
+        dual: of the balance of forces:  |P u + q - sum a lambda|; and of friction's cone:  max(|lambda| - F, 0).
+        complementarity: |lambda| times the distance of y from the bound that its sign names; where a row with a limit
+            misses that bound, which is no violation, F - |lambda| times the distance.
     """
 
     primal: float
@@ -191,7 +197,7 @@ def compiled_residuals(
             largest = max(largest, abs(value), abs(program.linear[i, k]))
             force[i, k] = value + program.linear[i, k]
     pulled = np.zeros((nodes, dimension))
-    primal, complementarity, pushed = 0.0, 0.0, 1.0
+    primal, complementarity, pushed, outside = 0.0, 0.0, 1.0, 0.0
     finite = True
     for r in range(len(program.lower)):
         first, multiplier = program.first[r], multipliers[r]
@@ -208,13 +214,20 @@ def compiled_residuals(
             scale = max(scale, abs(lower))
         if np.isfinite(upper):
             scale = max(scale, abs(upper))
-        primal = max(primal, (lower - image) / scale, (image - upper) / scale)
-        # A push on a bound that does not exist counts as one from a whole scale away.
         gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
+        if program.limit[r] < np.inf:
+            outside = max(outside, abs(multiplier) - program.limit[r])
+            for miss, push in ((lower - image, multiplier), (image - upper, -multiplier)):
+                weight = program.limit[r] - push if miss > 0.0 else max(push, 0.0)
+                complementarity = max(complementarity, weight * min(abs(miss) / scale, 1.0))
+            gap = 0.0
+        else:
+            primal = max(primal, (lower - image) / scale, (image - upper) / scale)
+        # A push on a bound that does not exist counts as one from a whole scale away.
         complementarity = max(complementarity, abs(multiplier) * (min(gap / scale, 1.0)))
         pushed = max(pushed, abs(multiplier))
         finite = finite and np.isfinite(image) and np.isfinite(multiplier)
-        finite = finite and not (np.isnan(lower) or np.isnan(upper))
+        finite = finite and not (np.isnan(lower) or np.isnan(upper) or np.isnan(program.limit[r]))
     dual = 0.0
     for i in range(nodes):
         for k in range(dimension):
@@ -224,7 +237,7 @@ def compiled_residuals(
                 dual = max(dual, abs(force[i, k] - pulled[i, k]))
     if not finite:
         return np.inf, np.inf, np.inf
-    return primal, dual / largest, complementarity / pushed
+    return primal, max(dual / largest, outside / pushed), complementarity / pushed
 
 
 @dataclass(frozen=True)
@@ -237,7 +250,8 @@ class QuadraticProgram:
         A: shape (r, v).
         lower: shape (r,), -inf where there is none.
         upper: shape (r,), inf where there is none.
-        unknown: which of the chain's m d coordinates the first variables are; slacks follow them.
+        unknown: which of the chain's m d coordinates the first variables are; slacks follow them, then for each row
+            with a limit the parts e+ and e- of e; their bounds e+, e- >= 0 are the last rows.
     """
 
     P: sp.csc_matrix
@@ -282,13 +296,32 @@ def as_quadratic_program(program: ChainProgram, wide: WideRows | None = None) ->
     unknown = np.flatnonzero(np.repeat(~program.known, dimension))
     soft = np.flatnonzero(compliance > 0.0)
     slack = sp.csc_matrix((np.sqrt(compliance[soft]), (soft, np.arange(len(soft)))), shape=(count, len(soft)))
-    return QuadraticProgram(
+    full = QuadraticProgram(
         P=sp.csc_matrix(sp.block_diag([hessian[unknown][:, unknown], sp.eye(len(soft))])),
         q=np.concatenate([program.linear.ravel()[unknown], np.zeros(len(soft))]),
         A=sp.csc_matrix(sp.hstack([image[:, unknown], slack])),
         lower=lower,
         upper=upper,
         unknown=unknown,
+    )
+    limited = np.flatnonzero(program.limit < np.inf)
+    return _with_limits(full, limited, program.limit[limited]) if len(limited) else full
+
+
+def _with_limits(full: QuadraticProgram, rows: NDArray[np.intp], limits: Vector) -> QuadraticProgram:
+    """Return a program in which some rows may miss their bounds by e = e+ - e-, at a price of F (e+ + e-)."""
+    count = len(rows)
+    miss = sp.csc_matrix((np.ones(count), (rows, np.arange(count))), shape=(len(full.lower), count))
+    variables, bounds = full.A.shape[1], sp.eye(2 * count)
+    return QuadraticProgram(
+        P=sp.csc_matrix(sp.block_diag([full.P, sp.csc_matrix((2 * count, 2 * count))])),
+        q=np.concatenate([full.q, limits, limits]),
+        A=sp.csc_matrix(
+            sp.vstack([sp.hstack([full.A, miss, -miss]), sp.hstack([sp.csc_matrix((2 * count, variables)), bounds])])
+        ),
+        lower=np.concatenate([full.lower, np.zeros(2 * count)]),
+        upper=np.concatenate([full.upper, np.full(2 * count, np.inf)]),
+        unknown=full.unknown,
     )
 
 

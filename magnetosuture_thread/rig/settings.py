@@ -107,6 +107,12 @@ class RigSettings(Configuration):
         0.974, "force across a length of thread for each speed", unit="Pa s", minimum=1e-6, maximum=1e3
     )
     thread_drag_along: float = quantity(0.487, "the same along it", unit="Pa s", minimum=1e-6, maximum=1e3)
+    thread_friction: float = quantity(
+        0.0,
+        "coefficient of friction of the thread on shapes and wall, whatever the scene says",
+        minimum=0.0,
+        maximum=2.0,
+    )
     thread_start_curvature: float = quantity(
         0.0, "of the arc in which the thread lies behind the needle at the start", unit="1/m", minimum=-1e4, maximum=1e4
     )
@@ -219,6 +225,7 @@ class RigSettings(Configuration):
             discs=tuple(o for o in scene.obstacles if isinstance(o, Disc)),
             polygons=tuple(o.rings[0] for o in scene.obstacles if isinstance(o, Polygon)),
             wall_radius=scene.dish.radius,
+            friction=self.thread_friction,
         )
 
     def dynamics(self, scene: Scene) -> RigDynamics:

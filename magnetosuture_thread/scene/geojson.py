@@ -17,19 +17,29 @@ import shapely.geometry
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.mapping import dish_from_mapping, make_scene, shape_from_mapping
+from magnetosuture_thread.scene.mapping import dish_from_mapping, dish_to_mapping, make_scene, shape_from_mapping
 from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, scene_error
 
 DISH = "dish"  # kind of the feature that is the dish
 GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less
-PROPERTIES = ("name", "kind", "corner_radius", "radius", "diameter", "depth", "definition")
+PROPERTIES = (
+    "name",
+    "kind",
+    "corner_radius",
+    "friction",
+    "radius",
+    "diameter",
+    "depth",
+    "wall_friction",
+    "definition",
+)
 
 
 def scene_to_geojson(scene: Scene) -> dict[str, Any]:
     """Return a scene as a FeatureCollection."""
     return {
         "type": "FeatureCollection",
-        "dish": {"diameter": scene.dish.diameter, "depth": scene.dish.depth},
+        "dish": dish_to_mapping(scene.dish),
         "features": [_feature(shape) for shape in scene.shapes],
     }
 
@@ -72,6 +82,8 @@ def scene_from_geojson(content: Any, source: str = "") -> Scene:
 
 def _feature(shape: SceneShape) -> dict[str, Any]:
     properties: dict[str, Any] = {"name": shape.name, "kind": shape.kind}
+    if shape.friction:
+        properties["friction"] = shape.friction
     if "corner_radius" in shape.definition:
         properties["corner_radius"] = shape.definition["corner_radius"]
     geometry = shape.geometry
@@ -124,7 +136,7 @@ class _FeatureReader:
         if self._type != "Point" or _planar(self._coordinates) != [0.0, 0.0]:
             raise self._error("geometry", [self._type, self._coordinates], "a Point at 0, 0, the dish's centre")
         given = self.properties
-        fields = {name: given[name] for name in ("diameter", "depth") if given.get(name) is not None}
+        fields = {name: given[name] for name in ("diameter", "depth", "wall_friction") if given.get(name) is not None}
         if "diameter" not in fields and "radius" in given:
             raise self._error("properties.radius", given["radius"], "diameter, for a dish")
         return dish_from_mapping(fields, self._source)
@@ -132,6 +144,8 @@ class _FeatureReader:
     def shapes(self) -> Iterator[SceneShape]:
         """Yield the shapes of the feature: one, or one for each part of a MultiPolygon."""
         common = {"kind": self.properties.get("kind") or "tissue"}
+        if self.properties.get("friction") is not None:
+            common["friction"] = self.properties["friction"]
         if self._type == "Point":
             fields = {"center": _planar(self._coordinates), "radius": self.properties.get("radius")}
             yield self._from_definition(self._shape(self._where, {**common, "disc": fields}))
@@ -166,7 +180,7 @@ class _FeatureReader:
             return shape
         if not isinstance(definition, Mapping):
             raise self._error("properties.definition", definition, "a shape as in a scene file")
-        defined = self._shape(shape.name, {**definition, "kind": shape.kind})
+        defined = self._shape(shape.name, {**definition, "kind": shape.kind, "friction": shape.friction})
         return defined if _same(defined.geometry, shape.geometry) else shape
 
 

@@ -24,7 +24,7 @@ MAX_CORNER_RADIUS = 0.1  # m
 
 
 def shape_from_mapping(name: str, description: Any, source: str = "") -> SceneShape:
-    """Return a shape from its description: its fields under the name of a shape, its kind and corner radius.
+    """Return a shape from its description: its fields under the name of a shape, its kind, corner radius and friction.
 
     Args:
         name: of the shape.
@@ -40,10 +40,10 @@ def shape_from_mapping(name: str, description: Any, source: str = "") -> SceneSh
     if not isinstance(description, Mapping):
         raise scene_error(name, description, f"a shape, one of {', '.join(SHAPES)}", source)
     types = [key for key in description if key in SHAPES]
-    unknown = [key for key in description if key not in (*SHAPES, "kind", "corner_radius")]
+    unknown = [key for key in description if key not in (*SHAPES, "kind", "corner_radius", "friction")]
     if unknown or len(types) != 1:
         value = unknown[0] if unknown else types or "no shape"
-        raise scene_error(name, value, f"kind, corner_radius and one of {', '.join(SHAPES)}", source)
+        raise scene_error(name, value, f"kind, corner_radius, friction and one of {', '.join(SHAPES)}", source)
     type_name = types[0]
     radius = description.get("corner_radius", 0.0)
     if not is_number(radius) or not 0.0 <= radius <= MAX_CORNER_RADIUS:
@@ -59,12 +59,18 @@ def shape_from_mapping(name: str, description: Any, source: str = "") -> SceneSh
         fields.require_all_used()
         if isinstance(geometry, Polygon):
             triangulate(geometry)
-        definition = {field: value for field, value in _to_builtin(description).items() if field != "kind"}
-        return SceneShape(name, kind, geometry, definition)
+        apart = ("kind", "friction")
+        definition = {field: value for field, value in _to_builtin(description).items() if field not in apart}
+        return SceneShape(name, kind, geometry, definition, _number_or_given(description.get("friction", 0.0)))
     except ConfigurationError as error:
         if error.source or error.name.startswith(f"{name}."):
             raise
         raise scene_error(f"{name}.{error.name}", error.value, error.expectation, source) from None
+
+
+def _number_or_given(value: Any) -> Any:
+    """Return a number as a float; anything else unchanged, to be refused."""
+    return float(value) if is_number(value) else value
 
 
 def _to_builtin(value: Any) -> Any:
@@ -79,7 +85,7 @@ def _to_builtin(value: Any) -> Any:
 
 
 def dish_from_mapping(values: Any, source: str = "") -> Dish:
-    """Return a dish from its fields, diameter and depth [m]; the depth may be left out.
+    """Return a dish from its fields, diameter and depth [m] and the wall's friction; all but the first may be left out.
 
     Raises:
         ConfigurationError: a field is missing, unknown or out of its bounds.
@@ -87,15 +93,22 @@ def dish_from_mapping(values: Any, source: str = "") -> Dish:
     if not isinstance(values, Mapping) or "diameter" not in values:
         raise scene_error("dish", values, "diameter and depth [m]", source)
     for field in values:
-        if field not in ("diameter", "depth"):
-            raise scene_error(f"dish.{field}", values[field], "one of diameter, depth", source)
+        if field not in ("diameter", "depth", "wall_friction"):
+            raise scene_error(f"dish.{field}", values[field], "one of diameter, depth, wall_friction", source)
     for field, value in values.items():
         if not is_number(value):
-            raise scene_error(f"dish.{field}", value, "a number [m]", source)
+            unit = "" if field == "wall_friction" else " [m]"
+            raise scene_error(f"dish.{field}", value, f"a number{unit}", source)
     try:
         return Dish(**{field: float(value) for field, value in values.items()})
     except ConfigurationError as error:
         raise ConfigurationError(error.name, error.value, error.expectation, source) from None
+
+
+def dish_to_mapping(dish: Dish) -> dict[str, float]:
+    """Return a dish as a scene file describes it."""
+    fields = {"diameter": dish.diameter, "depth": dish.depth}
+    return {**fields, "wall_friction": dish.wall_friction} if dish.wall_friction else fields
 
 
 def make_scene(dish: Dish, shapes: tuple[SceneShape, ...], source: str = "") -> Scene:
@@ -112,15 +125,16 @@ def make_scene(dish: Dish, shapes: tuple[SceneShape, ...], source: str = "") -> 
 
 def shape_to_mapping(shape: SceneShape) -> dict[str, Any]:
     """Return a shape as a scene file describes it; one without a definition as disc or polygon."""
+    common: dict[str, Any] = {"kind": shape.kind, **({"friction": shape.friction} if shape.friction else {})}
     if shape.definition:
-        return {**_to_builtin(shape.definition), "kind": shape.kind}
+        return {**_to_builtin(shape.definition), **common}
     geometry = shape.geometry
     if isinstance(geometry, Disc):
-        return {"disc": {"center": list(geometry.centre), "radius": geometry.radius}, "kind": shape.kind}
+        return {"disc": {"center": list(geometry.centre), "radius": geometry.radius}, **common}
     fields: dict[str, Any] = {"outline": [list(point) for point in geometry.outline]}
     if geometry.holes:
         fields["holes"] = [[list(point) for point in hole] for hole in geometry.holes]
-    return {"polygon": fields, "kind": shape.kind}
+    return {"polygon": fields, **common}
 
 
 def scene_from_mapping(content: Any, source: str = "") -> Scene:
@@ -152,6 +166,6 @@ def scene_from_mapping(content: Any, source: str = "") -> Scene:
 def scene_to_mapping(scene: Scene) -> dict[str, Any]:
     """Return what a scene file holds for a scene; a shape without a definition as disc or polygon."""
     return {
-        "dish": {"diameter": scene.dish.diameter, "depth": scene.dish.depth},
+        "dish": dish_to_mapping(scene.dish),
         "shapes": {shape.name: shape_to_mapping(shape) for shape in scene.shapes},
     }

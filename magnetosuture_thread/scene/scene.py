@@ -16,7 +16,7 @@ import numpy as np
 import shapely
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc, Polygon
 
 MAX_VALUE_CHARS = 80  # of a value in an error
 MAX_ERROR_NAME_CHARS = 120
@@ -77,6 +77,11 @@ def is_number(value: Any) -> bool:
         return False
 
 
+def _check_friction(name: str, value: Any) -> None:
+    if not (is_number(value) and 0.0 <= value <= MAX_FRICTION):
+        raise scene_error(name, value, f"a coefficient of friction from 0 to {MAX_FRICTION:g}")
+
+
 @dataclass(frozen=True)
 class Dish:
     """The round petri dish; its centre is the origin of the dish frame.
@@ -84,6 +89,7 @@ class Dish:
     Attributes:
         diameter: inner diameter [m].
         depth: of the liquid in it [m].
+        wall_friction: Coulomb's coefficient of the thread on the wall.
 
     Raises:
         ConfigurationError: a value is not finite or not within its bounds.
@@ -91,6 +97,7 @@ class Dish:
 
     diameter: float = 0.035
     depth: float = 0.003
+    wall_friction: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the bounds."""
@@ -98,6 +105,7 @@ class Dish:
             value = getattr(self, name)
             if not (is_number(value) and low <= value <= high):
                 raise scene_error(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
+        _check_friction("dish.wall_friction", self.wall_friction)
 
     @property
     def radius(self) -> float:
@@ -115,6 +123,7 @@ class SceneShape:
         geometry: the shape itself, corners rounded already [m].
         definition: how a scene file describes it, for example `{"disc": {"center": [0.0, 0.0], "radius": 0.001}}`;
             empty where only the geometry is known, as of a message.
+        friction: Coulomb's coefficient of the thread on it.
 
     Raises:
         ConfigurationError: the name or the kind cannot be used, or the geometry is out of bounds.
@@ -124,6 +133,7 @@ class SceneShape:
     kind: str
     geometry: Disc | Polygon
     definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    friction: float = 0.0
 
     def __post_init__(self) -> None:
         """Check name, kind and bounds."""
@@ -131,6 +141,7 @@ class SceneShape:
             raise scene_error("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
         if self.kind not in KINDS:
             raise scene_error(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
+        _check_friction(f"{self.name}.friction", self.friction)
         if isinstance(self.geometry, Disc):
             object.__setattr__(self, "geometry", _checked_disc(self.name, self.geometry))
             return
@@ -234,7 +245,10 @@ class Scene:
 
     @cached_property
     def version(self) -> str:
-        """Hash of the content: equal for scenes with the same dish, names, kinds and geometry, bit for bit."""
+        """Hash of the content: equal for scenes with the same dish, names, kinds, geometry and friction, bit for bit.
+
+        A scene without friction has the version that it had before there was any.
+        """
         digest = hashlib.sha256(struct.pack("<2d", self.dish.diameter, self.dish.depth))
         for shape in self.shapes:
             for text in (shape.name, shape.kind):
@@ -245,6 +259,9 @@ class Scene:
                 continue
             for ring in shape.geometry.rings:
                 digest.update(struct.pack("<BI", 1, len(ring)) + np.asarray(ring, dtype="<f8").tobytes())
+        coefficients = (self.dish.wall_friction, *self.friction)
+        if any(coefficients):
+            digest.update(struct.pack(f"<B{len(coefficients)}d", 2, *coefficients))
         return digest.hexdigest()[:VERSION_CHARS]
 
     @property
@@ -256,6 +273,11 @@ class Scene:
     def obstacles(self) -> tuple[Disc | Polygon, ...]:
         """Geometry of the shapes, in their order."""
         return tuple(shape.geometry for shape in self.shapes)
+
+    @property
+    def friction(self) -> tuple[float, ...]:
+        """Coulomb's coefficient of each shape, in their order."""
+        return tuple(shape.friction for shape in self.shapes)
 
     def add(self, shape: SceneShape) -> Scene:
         """Return the scene with one more shape, at the end."""

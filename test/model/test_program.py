@@ -27,7 +27,8 @@ def random_program(seed: int, nodes: int = 9, dimension: int = 2, soft: bool = F
     upper[3:6] = image[3:6] + 0.1
     compliance = np.where(np.arange(rows) % 2 == 0, 1e-3, 0.0) if soft else np.zeros(rows)
     linear = 10.0 * random.normal(size=(nodes, dimension))
-    return ChainProgram(blocks, couplings, linear, known, first, gradient, lower, upper, compliance)
+    limit = np.full(rows, np.inf)
+    return ChainProgram(blocks, couplings, linear, known, first, gradient, lower, upper, compliance, limit)
 
 
 def one_node(compliance: float = 0.0) -> ChainProgram:
@@ -44,6 +45,7 @@ def one_node(compliance: float = 0.0) -> ChainProgram:
         lower=np.array([-np.inf, 0.0]),
         upper=np.array([1.0, np.inf]),
         compliance=np.full(2, compliance),
+        limit=np.full(2, np.inf),
     )
 
 

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from magnetosuture_thread.geometry.obstacles.contacts import WALL, WorkspaceData, find_contacts, wall_contact
+from magnetosuture_thread.geometry.obstacles.contacts import (
+    FRICTION,
+    WALL,
+    WorkspaceData,
+    find_contacts,
+    wall_contact,
+)
 from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
 from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
-from magnetosuture_thread.geometry.obstacles.workspace import Contacts, Workspace
+from magnetosuture_thread.geometry.obstacles.workspace import MAX_FRICTION, Contacts, Workspace
 
 __all__ = [
+    "FRICTION",
+    "MAX_FRICTION",
     "WALL",
     "Contacts",
     "Disc",

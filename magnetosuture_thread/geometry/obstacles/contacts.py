@@ -19,6 +19,8 @@ from magnetosuture_thread.geometry.obstacles.search import (
 )
 from magnetosuture_thread.geometry.polyline import Points
 
+FRICTION = 6
+"""Column of `WorkspaceData.frames` with the coefficient of friction."""
 BALL, EDGES, FACES = range(3)
 """Kinds of obstacles."""
 WALL = -1
@@ -33,8 +35,8 @@ class WorkspaceData(NamedTuple):
     Attributes:
         reach: greatest distance of a contact [m].
         wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
-        frames: shape (o + 1, 6): low corner of the grid (3) [m], 1 / cell size [1/m], growth [m], 0; of a
-            ball its centre (3) [m], 0, 0, its radius [m].
+        frames: shape (o + 1, 7): low corner of the grid (3) [m], 1 / cell size [1/m], growth [m], 0; of a
+            ball its centre (3) [m], 0, 0, its radius [m]; then the coefficient of friction, in row 0 the wall's.
         tables: shape (o + 1, 9): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
             features, where they begin in `numbers`, where their marks begin in `entries`, where the spokes of a mesh
             begin in `numbers`.

@@ -16,6 +16,7 @@ from magnetosuture_thread.geometry.obstacles.contacts import (
     BALL,
     EDGES,
     FACES,
+    FRICTION,
     WorkspaceData,
     find_contacts,
     nearest_of,
@@ -33,6 +34,7 @@ from magnetosuture_thread.geometry.polyline import Points
 _MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
 _MIN_CELLS = 200
 _MAX_OVERVIEW_CELLS = 20_000  # of the grid that tells which obstacles are near
+MAX_FRICTION = 2.0  # a coefficient
 _INITIAL_ROWS = 256  # contacts that `near` has room for at first
 
 
@@ -196,7 +198,7 @@ def pack_obstacles(
     """
     # A point on the boundary is found at reach 0 too, whichever way its distance is rounded.
     reach = max(reach, MIN_DISTANCE)
-    frames, tables = np.zeros((len(shapes) + 1, 6)), np.zeros((len(shapes) + 1, 9), dtype=np.int64)
+    frames, tables = np.zeros((len(shapes) + 1, FRICTION + 1)), np.zeros((len(shapes) + 1, 9), dtype=np.int64)
     index, numbers = _FlatArray(), _FlatArray()
     low, high = np.empty((len(shapes), dimension)), np.empty((len(shapes), dimension))
     features: dict[int, Features] = {}
@@ -212,7 +214,7 @@ def pack_obstacles(
     for o, found in features.items():
         least, most = found.corners.min(axis=1), found.corners.max(axis=1)
         grid = plan_grid(least, most, reach, max(_MAX_CELLS * len(least) // total, _MIN_CELLS))
-        frames[o + 1] = _frame(grid)
+        frames[o + 1, :FRICTION] = _frame(grid)
         kind = EDGES if isinstance(shapes[o], Polygon) else FACES
         cells = _add_cells(index, *fill_grid(grid, least, most, found.corners))
         starts = numbers.add(found.numbers), index.add(found.marks), numbers.add(found.spokes)
@@ -222,7 +224,7 @@ def pack_obstacles(
         over = plan_grid(low, high, 0.0, _MAX_OVERVIEW_CELLS)
         # The boxes are grown already: only rounding is left to allow for.
         over = dataclasses.replace(over, growth=1e-6 * over.size)
-        frames[0] = _frame(over)
+        frames[0, :FRICTION] = _frame(over)
         cells = _add_cells(index, *fill_grid(over, low, high, np.empty((len(low), 0, dimension))))
         tables[0, :5] = [-1, *over.counts, cells]
     flat = np.asarray(numbers.array(np.float64)), np.asarray(index.array(np.int32))
@@ -296,12 +298,16 @@ class Workspace:
         reach: greatest distance at which a boundary is near, not negative [m].
         dimension: 2 or 3.
         wall_radius: inner radius of the wall, in space a cylinder along z; inf without a wall [m].
+        friction: Coulomb's coefficient of each shape, none for no friction; in the plane only.
+        wall_friction: the same of the wall.
 
     Attributes:
         shapes: the obstacles.
         reach: greatest distance at which a boundary is near [m].
         dimension: 2 or 3.
         wall_radius: inner radius of the wall [m].
+        friction: of each shape.
+        wall_friction: of the wall.
         data: the same for compiled code, see `find_contacts`.
 
     Raises:
@@ -309,7 +315,13 @@ class Workspace:
     """
 
     def __init__(
-        self, shapes: Sequence[Obstacle], reach: float, dimension: int = 2, wall_radius: float = math.inf
+        self,
+        shapes: Sequence[Obstacle],
+        reach: float,
+        dimension: int = 2,
+        wall_radius: float = math.inf,
+        friction: Sequence[float] = (),
+        wall_friction: float = 0.0,
     ) -> None:
         if dimension not in (2, 3):
             raise ConfigurationError("workspace.dimension", dimension, "2 or 3")
@@ -323,7 +335,10 @@ class Workspace:
         self.wall_radius = float(wall_radius)
         for i, shape in enumerate(self.shapes):
             _check(f"workspace.shapes[{i}]", shape, dimension)
+        self.friction, self.wall_friction = tuple(friction) or (0.0,) * len(self.shapes), wall_friction
+        _check_friction(self.friction, wall_friction, len(self.shapes), dimension)
         self.data = pack_obstacles(self.shapes, self.reach, dimension, self.wall_radius)
+        self.data.frames[:, FRICTION] = wall_friction, *self.friction
         self._max_rows = _INITIAL_ROWS
 
     def near(self, points: Points) -> Contacts:
@@ -361,6 +376,16 @@ class Workspace:
         for array in found:
             array.setflags(write=False)
         return Contacts(*found)
+
+
+def _check_friction(friction: tuple[float, ...], wall_friction: float, shapes: int, dimension: int) -> None:
+    if len(friction) != shapes:
+        raise ConfigurationError("workspace.friction", f"{len(friction)} values", f"one for each of {shapes} shapes")
+    for name, value in (("wall_friction", wall_friction), *((f"friction[{i}]", mu) for i, mu in enumerate(friction))):
+        if not 0.0 <= value <= MAX_FRICTION:
+            raise ConfigurationError(f"workspace.{name}", value, f"a coefficient from 0 to {MAX_FRICTION:g}")
+        if value > 0.0 and dimension != 2:
+            raise ConfigurationError(f"workspace.{name}", value, "0 in space: friction is of the plane")
 
 
 def _check(name: str, shape: Obstacle, dimension: int) -> None:

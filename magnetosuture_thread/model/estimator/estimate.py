@@ -17,6 +17,7 @@ from magnetosuture_thread.model.estimator.noise import NoiseModel
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameter
 from magnetosuture_thread.model.formulations import ThreadState
+from magnetosuture_thread.model.formulations.step import WarmStart
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.prediction import NeedlePose, Prediction
 from magnetosuture_thread.model.thread import Thread
@@ -123,7 +124,7 @@ class FilterState:
     converged: bool
     pose: NeedlePose
     thread: ThreadState
-    warm_start: tuple[Vector, Vector]
+    warm_start: WarmStart
     density: Vector
     variance: Vector
     noise: NoiseModel

@@ -50,6 +50,7 @@ class LinearRows:
             lower=np.concatenate([program.lower, self.lower[narrow]]),
             upper=np.concatenate([program.upper, np.full(len(first), np.inf)]),
             compliance=np.concatenate([program.compliance, self.compliance[narrow]]),
+            limit=np.concatenate([program.limit, np.full(len(first), np.inf)]),
         )
         if len(first) == count:
             return program, None

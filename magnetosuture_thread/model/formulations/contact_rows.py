@@ -84,8 +84,10 @@ def contact_rows(
         # A node that has to be pushed out may be held in by something else, as a chord may by its ends, that lie on
         # both sides of a shape: then as far as it goes.
         buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
+        buffers.limit[here] = np.inf
         buffers.multipliers[here] = buffers.push[0 if s == 0.0 else 1, i]
         buffers.node[kept], buffers.obstacle[kept], buffers.place[kept] = i, buffers.obstacle[c], s
+        buffers.normal[kept] = buffers.normal[c]
         kept += 1
     return kept, depth
 
@@ -94,14 +96,15 @@ def contact_rows(
 def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
     """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node.
 
-    Of these also their forces.
+    Of these also their forces, with those of friction.
     """
     buffers.multipliers[: len(multipliers)] = multipliers
     buffers.push[:] = 0.0
     buffers.contact_force[:] = 0.0
     for r in range(rows, len(multipliers)):
-        node, kind = buffers.node[r - rows], 0 if buffers.place[r - rows] == 0.0 else 1
-        buffers.push[kind, node] = max(buffers.push[kind, node], multipliers[r])
+        if buffers.limit[r] == np.inf:
+            node, kind = buffers.node[r - rows], 0 if buffers.place[r - rows] == 0.0 else 1
+            buffers.push[kind, node] = max(buffers.push[kind, node], multipliers[r])
         for k in range(SPAN):
             for a in range(buffers.contact_force.shape[1]):
                 buffers.contact_force[buffers.first[r] + k, a] += buffers.gradient[r, k, a] * multipliers[r]

@@ -42,6 +42,7 @@ from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity
 from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.formulations.added_rows import LinearRows
+from magnetosuture_thread.model.formulations.friction_rows import friction_of, knows_friction
 from magnetosuture_thread.model.formulations.rod_forces import write_forces
 from magnetosuture_thread.model.formulations.rod_step import (
     ENDED,
@@ -73,6 +74,7 @@ class RodFormulation(Formulation):
     """
 
     name = "rod"
+    has_friction = True
 
     def __init__(
         self,
@@ -107,6 +109,7 @@ class RodFormulation(Formulation):
         self._axes, (self._banded, self._accepted) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
         if self.added:  # compiled code knows nothing of their rows, and leaves every solve to `step`
             self._banded = BandedSolver(iterations=0)
+        self._rubs = knows_friction(self._near.data)
         self._motion = MotionBuffers.of(thread.segments + 1, dimension)
         self._use(self._buffers)
 
@@ -180,7 +183,7 @@ class RodFormulation(Formulation):
                 added = added or self.added.linearised(motion.about, motion.start, motion.known, interval)
             solution = self._solve(contacts, motion.known, motion.velocities, added)
             multipliers = solution.multipliers[: self._rows + contacts]
-            accept_step(self._buffers, motion, solution.velocities, multipliers, interval)
+            accept_step(self._buffers, self._near.data, motion, solution.velocities, multipliers, interval)
             if self.added:
                 added = self.added.linearised(motion.about, motion.start, motion.known, interval)
             worst, solves = worst.or_worse(solution.residuals), solves + 1
@@ -190,7 +193,8 @@ class RodFormulation(Formulation):
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
         pushes = self._buffers.multipliers[: self._rows].copy(), self._buffers.contact_force.copy()
-        return StepResult(end, solver, status, worst, solves, converged=off <= 1.0, multipliers=pushes)
+        grip = self._buffers.grip.copy() if self._rubs else None
+        return StepResult(end, solver, status, worst, solves, converged=off <= 1.0, multipliers=pushes, grip=grip)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
@@ -200,7 +204,11 @@ class RodFormulation(Formulation):
         tension, force = np.empty(len(lengths)), np.empty(self.dimension)
         positions, velocities = state.positions / rod.unit, state.velocities
         moment = write_forces(rod, positions, velocities, heading, lengths, scale, tension, force)
-        return ThreadForces(tension, scale * contact, force, moment)
+        friction, use = np.zeros(len(positions)), np.zeros(len(positions))
+        if result.grip is not None:
+            friction, use = friction_of(result.grip)
+            friction *= scale
+        return ThreadForces(tension, scale * contact, force, moment, friction, use)
 
     def chords_in_contact(self, positions: Points, tolerance: float) -> tuple[int, ...]:
         """Return both nodes of each segment that touches an obstacle between them; see `Formulation`."""
@@ -211,7 +219,8 @@ class RodFormulation(Formulation):
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
         super().warm_up()
-        accept_step(self._buffers, self._motion, self._motion.velocities.copy(), np.zeros(self._rows), 1.0)
+        velocities, multipliers = self._motion.velocities.copy(), np.zeros(self._rows)
+        accept_step(self._buffers, self._near.data, self._motion, velocities, multipliers, 1.0)
         buffers, heading = self._motion, np.eye(self.dimension)[0]
         chain = np.outer(np.arange(self._thread.segments + 1.0), heading)
         lengths = np.zeros(self._thread.segments)

@@ -13,12 +13,15 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
 from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows, keep_multipliers
+from magnetosuture_thread.model.formulations.friction_rows import friction_rows, keep_grips, knows_friction
 from magnetosuture_thread.model.formulations.step import StepBuffers, move_prescribed, program_of
 from magnetosuture_thread.model.program import Vector
 from magnetosuture_thread.model.solvers import banded
 
 STRAIN_TOLERANCE = 1e-3  # of the segments; beyond it the barriers are linearised once more
 COMPLIANCE = 1e-7  # of a segment
+FRICTION_TOLERANCE = 0.003  # of the limits of friction; beyond it they are taken from the solve and it is repeated
+MAX_FRICTION_SOLVES = 5  # of a step; then the limits are those of the solve before
 MAX_STEP_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
 
 
@@ -97,11 +100,12 @@ def assemble_step(
     motion: MotionBuffers,
     given: StepInput,
     elsewhere: float,
-) -> tuple[int, float]:
+) -> tuple[int, float, bool]:
     """Write the program about a predicted end point; where that came from a solve and is exact, do not.
 
-    Returns the number of contacts, -1 if there is no room for them, and how far off the barriers the point
-    is: the strain, the depth, or what barriers from elsewhere are, over what is allowed; 1 or less if it is exact.
+    Returns the number of rows of contacts and friction, -1 if there is no room for them; how far off the barriers the
+    point is: the strain, the depth, or what barriers from elsewhere are, over what is allowed, 1 or less if it is
+    exact; and whether the limits of friction are still to be found.
     """
     about, start, known, interval = motion.about, motion.start, motion.known, given.interval
     segments = len(about) - 1
@@ -110,10 +114,15 @@ def assemble_step(
     contacts, depth = contact_rows(
         buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius, True
     )
+    rubs = False
+    if contacts > 0 and knows_friction(workspace):
+        rubbing, change = friction_rows(buffers, segments, contacts, workspace, motion.before, start, known, interval)
+        contacts = contacts + rubbing if rubbing >= 0 else -1
+        rubs = change > FRICTION_TOLERANCE and 0 < solves < MAX_FRICTION_SOLVES
     off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
-    if contacts >= 0 and (solves == 0 or off > 1.0):
+    if contacts >= 0 and (solves == 0 or off > 1.0 or rubs):
         _objective(rod, buffers, motion, given)
-    return contacts, off if solves > 0 else np.inf
+    return contacts, off if solves > 0 else np.inf, rubs
 
 
 @compiled
@@ -291,8 +300,8 @@ def solve_step(
 
     Returns:
         `ENDED`, `NO_ROOM` for all contacts in the buffers, or `UNSOLVED`, and then the program is there for
-        another solver; the number of contacts; solves; how far off the barriers are, see `assemble`; the
-        first status that is not 0, see `banded.STATUS`; the largest residual of each kind.
+        another solver; the number of rows of contacts and friction; solves; how far off the barriers are, see
+        `assemble_step`; the first status that is not 0, see `banded.STATUS`; the largest residual of each kind.
     """
     given = StepInput(positions, velocities, nodes, ends, heading, interval, last_interval)
     if solves == 0:
@@ -300,16 +309,16 @@ def solve_step(
     worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
     last_off, last_about = np.inf, motion.about.copy()
     while True:
-        contacts, off = assemble_step(solves, rod, buffers, workspace, motion, given, elsewhere)
+        contacts, off, rubs = assemble_step(solves, rod, buffers, workspace, motion, given, elsewhere)
         if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < max_solves:
             # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
             motion.about[:] = 0.5 * (motion.about + last_about)
-            contacts, _ = assemble_step(0, rod, buffers, workspace, motion, given, elsewhere)
+            contacts, _, _ = assemble_step(0, rod, buffers, workspace, motion, given, elsewhere)
         last_off = off
         last_about[:] = motion.about
         if contacts < 0:
             return NO_ROOM, contacts, solves, off, status, worst
-        if off <= 1.0 or solves == max_solves:
+        if (off <= 1.0 and not rubs) or solves == max_solves:
             if off > 1.0:  # whatever else holds, nothing passes the wall
                 moved_inside(motion.about, motion.known, (workspace.wall_radius - rod.radius) / rod.unit)
             return ENDED, contacts, solves, off, status, worst
@@ -321,16 +330,23 @@ def solve_step(
         word, _, found = banded.solve_and_check(axes, program, u, multipliers, solver_buffers)
         if not max(found) <= tolerance:
             return UNSOLVED, contacts, solves, off, status, worst
-        accept_step(buffers, motion, u, multipliers, given.interval)
+        accept_step(buffers, workspace, motion, u, multipliers, given.interval)
         worst = (max(worst[0], found[0]), max(worst[1], found[1]), max(worst[2], found[2]))
         status, solves = status if status != 0 else word, solves + 1
 
 
 @compiled
 def accept_step(
-    buffers: StepBuffers, motion: MotionBuffers, velocities: Points, multipliers: Vector, interval: float
+    buffers: StepBuffers,
+    workspace: WorkspaceData,
+    motion: MotionBuffers,
+    velocities: Points,
+    multipliers: Vector,
+    interval: float,
 ) -> None:
     """Accept a solution: velocities, end positions, and multipliers as the guess for the next step."""
     keep_multipliers(buffers, multipliers, len(velocities) - 1)
+    if knows_friction(workspace):
+        keep_grips(buffers, multipliers, len(velocities) - 1, workspace)
     motion.velocities[:] = velocities
     motion.about[:] = motion.start + interval * velocities  # known nodes have moved, and have no velocity

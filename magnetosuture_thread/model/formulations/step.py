@@ -29,6 +29,8 @@ from magnetosuture_thread.model.program import (
 )
 from magnetosuture_thread.model.thread import Thread
 
+GRIPS = 3  # shapes at most that a node or a chord has friction with at once
+NO_SHAPE = -2  # in place of a shape
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
 
 
@@ -105,6 +107,7 @@ class StepResult:
             `paper` the hard ones, those of the obstacles.
         multipliers: of the segments, shape (n,), and of contacts as forces on the nodes, shape (n + 1, d), in the
             program's units; None where these are of no mechanics.
+        grip: of friction, as in `StepBuffers`; None where no shape has any.
     """
 
     state: ThreadState
@@ -114,6 +117,10 @@ class StepResult:
     solves: int
     converged: bool
     multipliers: tuple[Vector, Points] | None = field(default=None, compare=False)
+    grip: NDArray[np.float64] | None = field(default=None, compare=False)
+
+
+WarmStart = tuple[Vector, Vector, NDArray[np.int64], NDArray[np.float64]]
 
 
 class StepBuffers(NamedTuple):
@@ -128,6 +135,7 @@ class StepBuffers(NamedTuple):
         lower: shape (r,).
         upper: shape (r,).
         compliance: shape (r,).
+        limit: shape (r,).
         value: h of each row, shape (r,).
         multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
         chords: length of each segment, shape (n,).
@@ -139,7 +147,11 @@ class StepBuffers(NamedTuple):
         nearest: shape (c,).
         place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
         push: what contacts last pushed each node and each segment with, shape (2, n + 1).
-        contact_force: the same as vectors, of all contacts of a node, shape (n + 1, d).
+        contact_force: the same as vectors, with friction, of all contacts of a node, shape (n + 1, d).
+        grip_shape: the shapes with friction that last pushed each node, and each chord between its nodes, `NO_SHAPE`
+            for none, shape (2, n + 1, GRIPS).
+        grip: of these, the force (2), the multiplier of friction, its limit, and the place on the chord, shape
+            (2, n + 1, GRIPS, 5).
     """
 
     blocks: NDArray[np.float64]
@@ -150,6 +162,7 @@ class StepBuffers(NamedTuple):
     lower: Vector
     upper: Vector
     compliance: Vector
+    limit: Vector
     value: Vector
     multipliers: Vector
     chords: Vector
@@ -162,6 +175,8 @@ class StepBuffers(NamedTuple):
     place: Vector
     push: NDArray[np.float64]
     contact_force: Points
+    grip_shape: NDArray[np.int64]
+    grip: NDArray[np.float64]
 
     @classmethod
     def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> StepBuffers:
@@ -176,6 +191,7 @@ class StepBuffers(NamedTuple):
             np.zeros(total),
             np.zeros(total),
             np.zeros(total),
+            np.full(total, np.inf),
             np.zeros(total),
             np.zeros(total),
             np.zeros(nodes - 1),
@@ -188,6 +204,8 @@ class StepBuffers(NamedTuple):
             np.zeros(contacts),
             np.zeros((2, nodes)),
             np.zeros((nodes, dimension)),
+            np.full((2, nodes, GRIPS), NO_SHAPE),
+            np.zeros((2, nodes, GRIPS, 5)),
         )
 
     def enlarged(self) -> StepBuffers:
@@ -198,12 +216,14 @@ class StepBuffers(NamedTuple):
         larger.multipliers[:rows] = self.multipliers[:rows]
         larger.chords[:] = self.chords
         larger.push[:] = self.push
+        larger.grip_shape[:], larger.grip[:] = self.grip_shape, self.grip
         return larger
 
     def forget(self) -> None:
         """Forget the last solve: the next step starts without tension and contacts."""
         self.multipliers[:] = 0.0
         self.push[:] = 0.0
+        self.grip_shape[:], self.grip[:] = NO_SHAPE, 0.0
 
 
 @compiled
@@ -219,6 +239,7 @@ def program_of(buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> Cha
         buffers.lower[:rows],
         buffers.upper[:rows],
         buffers.compliance[:rows],
+        buffers.limit[:rows],
     )
 
 
@@ -249,10 +270,12 @@ class Formulation(ABC):
     Attributes:
         name: of the formulation.
         dimension: 2 or 3.
+        has_friction: whether it knows friction; else shapes have none.
         added: the barriers that a user has added.
     """
 
     name: str
+    has_friction = False
 
     def __init__(
         self,
@@ -266,7 +289,8 @@ class Formulation(ABC):
         nodes, self.dimension = thread.segments + 1, workspace.dimension
         self._thread, self._workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
         self._radius, reach = 0.5 * thread.diameter, ROW_REACH * thread.segment_length
-        self._near = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius)
+        friction = (workspace.friction, workspace.wall_friction) if self.has_friction else ((), 0.0)
+        self._near = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius, *friction)
         self.added = AddedBarriers(barriers, thread.segment_length)
         self._rows, self._buffers = rows, StepBuffers.of(nodes, self.dimension, rows, 2 * nodes)
 
@@ -291,14 +315,21 @@ class Formulation(ABC):
         """Obstacles and wall, with the reach of the program's rows [m]."""
         return self._near
 
-    def warm_start(self) -> tuple[Vector, Vector]:
-        """Return what the next step takes over from the last besides the state: the solver's guess."""
-        return self._buffers.multipliers[: self._rows].copy(), self._buffers.push.copy()
+    def warm_start(self) -> WarmStart:
+        """Return what the next step takes over from the last besides the state: the solver's guess, and friction."""
+        buffers = self._buffers
+        return (
+            buffers.multipliers[: self._rows].copy(),
+            buffers.push.copy(),
+            buffers.grip_shape.copy(),
+            buffers.grip.copy(),
+        )
 
-    def restore(self, warm_start: tuple[Vector, Vector]) -> None:
+    def restore(self, warm_start: WarmStart) -> None:
         """Restore what `warm_start` returned, so that the next step is that one again to the last bit."""
         self._buffers.multipliers[: self._rows] = warm_start[0]
         self._buffers.push[:] = warm_start[1]
+        self._buffers.grip_shape[:], self._buffers.grip[:] = warm_start[2:]
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""

@@ -5,9 +5,12 @@ A row's multiplier is a function of the velocities and of a proximal centre lamb
     lambda_r(u) = w_r [lower_r - a_r' u + mu_r lambda_r^k]_+  +  w_r [upper_r - a_r' u + mu_r lambda_r^k]_-
     w_r = 1 / (c_r + mu_r),    mu_r = max(0, 1 / w_max - c_r)
 
+and no more than the row's limit, |lambda_r(u)| <= F_r, where it has one;
 so that what remains is the balance of forces, a piecewise linear equation in u alone,
 
-    F(u) = P u + q - sum_r a_r lambda_r(u) = 0,    F'(u) = P + sum over the rows that push of w_r a_r a_r'
+    F(u) = P u + q - sum_r a_r lambda_r(u) = 0,    F'(u) = P + sum over the active rows of w_r a_r a_r'
+
+A row is active if its multiplier is neither 0 nor at its limit.
 
 F' is one band of half-width 3 d. Newton's method with an exact line search solves F = 0 in finitely many
 steps; a change of the active rows costs one factorisation, linear in the number of nodes. A row of
@@ -129,7 +132,7 @@ class SolverBuffers(NamedTuple):
         iterations: the most Newton steps it may take.
         band: of the matrix, shape (m d + 3 d, 3 d + 1).
         vectors: seven of them, of the unknowns and of the rows.
-        active: which rows push.
+        active: the rows whose multipliers change with the velocities.
     """
 
     tolerance: float
@@ -212,7 +215,14 @@ def images(axes: Axes, program: ChainProgram, u: Points, image: Vector) -> None:
 def multiplier_of(program: ChainProgram, r: int, image: float, weight: float, centre: float) -> float:
     """Return lambda_r(u) for a row's image a_r' u."""
     pull = (1.0 / weight - program.compliance[r]) * centre - image
-    return float(weight * (max(program.lower[r] + pull, 0.0) + min(program.upper[r] + pull, 0.0)))
+    multiplier = weight * (max(program.lower[r] + pull, 0.0) + min(program.upper[r] + pull, 0.0))
+    return float(max(min(multiplier, program.limit[r]), -program.limit[r]))
+
+
+@compiled
+def is_active(program: ChainProgram, r: int, multiplier: float) -> bool:
+    """Return whether a row's multiplier changes with its image."""
+    return multiplier != 0.0 and abs(multiplier) < program.limit[r]
 
 
 @compiled
@@ -249,13 +259,14 @@ def update(
     multipliers: Vector,
     active: NDArray[np.bool_],
 ) -> tuple[int, float]:
-    """Write every multiplier; return how many rows began or ceased to push, and how far they are from bounds."""
+    """Write every multiplier; return how many rows began or ceased to be active, and how far they are from bounds."""
     changes, gap = 0, 0.0
     for r in range(len(program.first)):
         multiplier = multiplier_of(program, r, image[r], weights[r], centre[r])
-        if (multiplier != 0.0) != active[r]:
+        now = is_active(program, r, multiplier)
+        if now != active[r]:
             changes += 1
-            active[r] = multiplier != 0.0
+            active[r] = now
         multipliers[r] = multiplier
         hard = 1.0 / weights[r] - program.compliance[r]
         if hard > 0.0:
@@ -279,7 +290,7 @@ def search(
             change = after[r] - before[r]
             push = multiplier_of(program, r, before[r] + part * change, weights[r], centre[r])
             value -= push * change
-            if push != 0.0:
+            if is_active(program, r, push):
                 slope += weights[r] * change * change
         if part == 1.0 and value <= 0.0:
             return 1.0
@@ -324,12 +335,12 @@ def solve(
         centre[r] = multipliers[r]
         multipliers[r] = multiplier_of(program, r, image[r], weights[r], centre[r])
         # The first guess: what pushed before pushes again, though it may seem to pull.
-        if multipliers[r] == 0.0 and centre[r] != 0.0:
+        if multipliers[r] == 0.0 and centre[r] != 0.0 and program.limit[r] == np.inf:
             bound = program.lower[r] if centre[r] > 0.0 else program.upper[r]
             if np.isfinite(bound):
                 hard = 1.0 / weights[r] - program.compliance[r]
                 multipliers[r] = weights[r] * (bound - image[r] + hard * centre[r])
-        active[r] = multipliers[r] != 0.0
+        active[r] = is_active(program, r, multipliers[r])
     forces(axes, program, smooth, multipliers, force)
     changes, stalled, least = 1, 0, np.inf
     for iteration in range(1, iterations + 1):

@@ -58,6 +58,8 @@ class _GeneralSolver(ABC):
         if x is not None:
             flat[general.unknown] = x[: len(general.unknown)]
         u = flat.reshape(program.linear.shape)
+        # Rows with a limit have brought further rows of their own.
+        multipliers = multipliers[: len(program.first) + (len(wide.lower) if wide is not None else 0)]
         return Solution(u, multipliers, self.name, status, iterations, residuals_of(program, u, multipliers, wide))
 
 

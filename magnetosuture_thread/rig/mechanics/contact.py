@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
@@ -38,6 +38,7 @@ class Shapes(NamedTuple):
         convex: 1 at corners that stick out of the solid, else 0, shape (c,).
         wall: radius of the dish's wall around the origin, infinite if there is none [m].
         stiffness: k of every contact [N/m].
+        friction: mu, of the thread on everything; the needle has none.
     """
 
     discs: NDArray[np.float64]
@@ -51,6 +52,7 @@ class Shapes(NamedTuple):
     convex: NDArray[np.float64]
     wall: float
     stiffness: float
+    friction: float
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ class Surface:
         stiffness: k of a contact; a force f sinks in by f / k [N/m].
         skin: how far outside a contact begins, so that up to k times this nothing gets in at all [m]. A harder
             contact without it costs more: nodes that slide then leave and meet the surface at every step.
+        friction: Coulomb's coefficient of the thread on all of it; the needle has no friction.
 
     Raises:
         ConfigurationError: a value is not finite, or out of bounds.
@@ -74,6 +77,7 @@ class Surface:
     wall_radius: float | None = None
     stiffness: float = 500.0
     skin: float = 1.5e-6
+    friction: float = 0.0
 
     def packed(self) -> Shapes:
         """Return the arrays that kernels read."""
@@ -84,6 +88,8 @@ class Surface:
             raise ConfigurationError("surface.stiffness", self.stiffness, "a positive number [N/m]")
         if not 0.0 <= self.skin < 1e-3:
             raise ConfigurationError("surface.skin", self.skin, "from 0 to less than 1e-3 m")
+        if not 0.0 <= self.friction <= MAX_FRICTION:
+            raise ConfigurationError("surface.friction", self.friction, f"a coefficient from 0 to {MAX_FRICTION:g}")
         discs = np.array([(*disc.centre[:2], disc.radius) for disc in self.discs], dtype=np.float64).reshape(-1, 3)
         if not (np.isfinite(discs).all() and (discs[:, 2] > 0.0).all()):
             raise ConfigurationError("surface.discs", discs.tolist(), "finite centres and positive radii [m]")
@@ -104,8 +110,8 @@ class Surface:
             low, high = np.min(reached, axis=0)[:2], np.max(reached, axis=0)[2:]
             grid = np.array([*low, float(max(high - low)) / GRID])
             cells = np.full(np.ceil((high - low)[::-1] / grid[2]).astype(int), np.inf)
-        wall, stiffness = float(wall), float(self.stiffness)
-        shapes = Shapes(discs, corners, starts, boxes, edges, first_runs, grid, cells, convex, wall, stiffness)
+        numbers = float(wall), float(self.stiffness), float(self.friction)
+        shapes = Shapes(discs, corners, starts, boxes, edges, first_runs, grid, cells, convex, *numbers)
         _find_clearances(shapes)
         return shapes
 

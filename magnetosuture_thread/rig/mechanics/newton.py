@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.rig.mechanics.contact import Shapes
+from magnetosuture_thread.rig.mechanics.friction import SLIP_SPEED, add_friction, find_friction
 from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle, turn_resistance
 from magnetosuture_thread.rig.mechanics.rod import (
     WIDTH,
@@ -33,7 +34,10 @@ FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere els
 
 
 class NewtonBuffers(NamedTuple):
-    """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows."""
+    """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows.
+
+    Of friction: what rubs, the state that slip is measured from, and the slip that smooths it.
+    """
 
     trial: NDArray[np.float64]
     step: NDArray[np.float64]
@@ -44,6 +48,9 @@ class NewtonBuffers(NamedTuple):
     drag: NDArray[np.float64]
     turned: NDArray[np.float64]
     rows: NDArray[np.float64]
+    friction: NDArray[np.float64]
+    begin: NDArray[np.float64]
+    slip: NDArray[np.float64]
 
 
 def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
@@ -59,6 +66,9 @@ def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
         drag=np.zeros((segments + 1, 3)),
         turned=np.zeros((3, 3)),
         rows=np.zeros((contacts, 5)),
+        friction=np.zeros((4 * segments + 1, 5)),
+        begin=np.zeros(size),
+        slip=np.zeros(1),
     )
 
 
@@ -83,6 +93,7 @@ def assemble_energy(
     energy = add_drag(q, buffers.rest, buffers.drag, g, band)
     energy += add_stretching(q, rod, g, band, convex) + add_bending(q, rod, g, band, convex)
     energy += add_contact(q, rod, shapes, buffers.rows, g, band, convex)
+    energy += add_friction(q, buffers.begin, buffers.slip[0], buffers.friction, g, band)
     energy += add_clamp(q, needle, rod.segment, g, band, convex)
     if not driven:
         rest, turned, rows = buffers.rest, buffers.turned, buffers.rows
@@ -216,6 +227,8 @@ def advance(
             trial[i] = q[i] + ratio * (q[i] - before[i])
     drag_matrices(trial, rod, 1.0 / (beta * dt), buffers.drag)
     turn_resistance(needle, trial[0], 1.0 / (beta * dt), buffers.turned)
+    find_friction(q, rod, shapes, buffers.rows, buffers.friction)
+    buffers.begin[:], buffers.slip[0] = q, SLIP_SPEED * dt
     start = trial.copy()
     done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, False)
     if done < 0:

@@ -1,0 +1,54 @@
+"""Friction of the simulated rig's thread."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import ConfigurationError, Disc
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+
+RATE, SPEED, DRAG = 60.0, 1e-3, 0.5
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.4])
+def test_the_rigs_thread_around_a_post_has_the_tensions_of_a_capstan(friction: float):
+    """T_2 = T_1 exp(mu theta) + f r (exp(mu theta) - 1) / mu, with the drag f per length of the part on the post."""
+    radius, lead = 1.03e-3, 2e-3
+    segment = math.pi * radius / 20
+    segments = round(lead / segment) + 20 + 60
+    at = segment * np.arange(segments + 1)
+    turned = math.pi / 2 + np.clip((at - lead) / radius, 0.0, math.pi)
+    tail = np.clip(at - lead - math.pi * radius, 0.0, None)
+    x = radius * np.cos(turned) - tail * np.sin(turned) + np.clip(lead - at, 0.0, None)
+    nodes = np.column_stack([x, radius * np.sin(turned) + tail * np.cos(turned)])
+    thread = ThreadProperties(
+        length=segments * segment,
+        segments=segments,
+        bending_stiffness=1e-14,
+        stretching_stiffness=5.65,
+        drag_across=2.0 * DRAG,
+        drag_along=DRAG,
+        attachment=NeedleJoint.PINNED,
+        diameter=60e-6,
+    )
+    surface = Surface((Disc((0.0, 0.0), 1e-3),), stiffness=5000.0, friction=friction)
+    rig = RigDynamics(NeedleBody(2e-4, 5e-5, 0.0, 0.0, 1.0), thread, surface, None, nodes[0], 0.0, nodes)
+    for k in range(1, 21):
+        rig.drive(nodes[0] + np.array([SPEED * k / RATE, 0.0]), 0.0, 1.0 / RATE)
+    along = np.diff(rig.thread, axis=0)
+    angles = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+    bent = np.flatnonzero(np.abs(np.diff(angles)) > 0.02)
+    first, last = bent[0], bent[-1] + 1  # segments before and behind the post
+    gain = math.exp(friction * abs(angles[last] - angles[first]))
+    wanted = rig.tension[last] * gain + DRAG * SPEED * radius * (gain - 1.0) / friction
+    assert rig.tension[first] == pytest.approx(wanted, rel=0.02)
+
+
+@pytest.mark.parametrize("value", [-0.1, 3.0, math.nan])
+def test_a_coefficient_out_of_bounds_is_refused(value: float):
+    with pytest.raises(ConfigurationError, match="friction"):
+        Surface(friction=value).packed()
