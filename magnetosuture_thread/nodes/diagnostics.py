@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -64,6 +68,24 @@ class Health:
             self._values.update(values)
         else:
             self._set(DiagnosticStatus.WARN, f"refused: {self._last_refusal}", values)
+
+    @contextmanager
+    def busy(self, text: str) -> Iterator[None]:
+        """Report once a second, at level WARN, what keeps the node from its callbacks, as long as it does."""
+        self.warn(text)
+        done = threading.Event()
+
+        def repeat() -> None:
+            while not done.wait(PERIOD):
+                self.publish()
+
+        thread = threading.Thread(target=repeat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
 
     def publish(self) -> None:
         """Publish the state now."""

@@ -32,6 +32,7 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.warm_up import warm_up
 
 NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
+LOADING = "loading the tracker's kernels; the first start on a machine compiles them, for a minute or more"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
 
 
@@ -51,8 +52,9 @@ class VisionTrackerNode(PackageNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("vision_tracker", **node_options("vision_tracker", options))
         settings = declare(self, VisionTrackerSettings)
-        self.get_logger().info("loading the tracker's kernels; the first start on a machine compiles them")
-        warm_up()
+        self.get_logger().info(LOADING)
+        with self.health.busy(LOADING):
+            warm_up()
         scene = initial_scene(settings.scene)
         self._settings = settings
         self._session = TrackerSession(settings, scene) if scene is not None else None

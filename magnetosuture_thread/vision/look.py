@@ -316,7 +316,7 @@ def tracked(
     `otherwise` is the state if it is unknown which end is the tail; `search` is that of `observe`.
     """
     local = _local(view, picture)
-    heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_px)
+    heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_edge_px)
     covariance = _in_dish(needle, view)
     return Track(
         state=State.TRACKED if needle.heading_known else otherwise,

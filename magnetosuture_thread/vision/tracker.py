@@ -203,7 +203,8 @@ class VisionTracker:
         if not chosen.heading_known:
             return found
         if chosen.size_measured:
-            self._length.add(chosen.length_px * view.metres_per_pixel, chosen.confidence)
+            length = chosen.length_px - chosen.tail_shift_px
+            self._length.add(length * view.metres_per_pixel, chosen.confidence)
         ends = np.array([found.tail, found.tip])
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
@@ -360,7 +361,7 @@ def _enlarged(track: Track, factor: int) -> Track:
 
 def _pose(needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> _Pose:
     heading = view.directions_to_dish(needle.direction_px)
-    tail = view.to_dish(needle.tail_px + picture.origin)
+    tail = view.to_dish(needle.tail_edge_px + picture.origin)
     return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0)
 
 

@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes import topics, vision_tracker
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import Dish, Scene
@@ -41,6 +41,17 @@ def compressed(image: np.ndarray, stamp) -> CompressedImage:
 def states(diagnostics) -> list[str]:
     """Return what the node said of itself, in order."""
     return [array.status[0].message for array in diagnostics]
+
+
+def test_that_kernels_are_being_compiled_is_reported_meanwhile(graph, monkeypatch):
+    reports = graph.listen_later(topics.DIAGNOSTICS)
+    monkeypatch.setattr(
+        vision_tracker,
+        "warm_up",
+        lambda: graph.wait(lambda: states(reports).count(vision_tracker.LOADING) > 1, "the report, and once more"),
+    )
+    graph.add(VisionTrackerNode, scene="dish_35mm")
+    graph.wait(lambda: states(reports)[-1] == "no camera frame yet", "the end of it")
 
 
 def test_a_frame_becomes_a_pose_and_a_centreline_with_its_stamp(graph, camera, thread_arc):

@@ -13,6 +13,7 @@ from magnetosuture_thread.vision.needle.comparison import bluntness, excess, fad
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
+from magnetosuture_thread.vision.needle.tail_edge import tail_shift
 from magnetosuture_thread.vision.needle.template import BLOOM_PX, FIRST_ROUNDS, THIN, TemplateFit, fit_template
 from magnetosuture_thread.vision.sampling import middle, straighten
 
@@ -167,6 +168,7 @@ def _checked(
         covariance=covariance,
         heading_known=is_known,
         size_measured=is_measured,
+        tail_shift_px=(tail_shift(steel, fit) or 0.0) if is_known else 0.0,
     )
 
 

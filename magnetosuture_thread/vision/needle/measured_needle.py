@@ -14,14 +14,15 @@ class MeasuredNeedle:
     """The needle in the image.
 
     Attributes:
-        arc: its axis from the tail on.
-        length_px: of the axis, from tail to tip [px].
+        arc: axis of the drawn needle that fits, from its tail on; the thread is looked for by it.
+        length_px: of the drawn needle, from tail to tip [px].
         width_px: mean width of the body [px].
         contrast: darkness of the body as a share of the floor's brightness, 0 to 1.
         confidence: how well all fits, 0 to 1.
         covariance: of the tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3).
         heading_known: whether it is told which end is the tail.
         size_measured: whether the length was measured, and not only known before.
+        tail_shift_px: how far along the axis the tail's edge lies from where the tail is drawn [px]; see `tail_shift`.
     """
 
     arc: Arc
@@ -32,6 +33,7 @@ class MeasuredNeedle:
     covariance: np.ndarray | None = None
     heading_known: bool = True
     size_measured: bool = False
+    tail_shift_px: float = 0.0
 
     def shifted(self, offset: tuple[float, float]) -> MeasuredNeedle:
         """Return the needle in pixels that begin elsewhere."""
@@ -39,8 +41,13 @@ class MeasuredNeedle:
 
     @property
     def tail_px(self) -> np.ndarray:
-        """The blunt end, shape (2,) [px]."""
+        """The blunt end as it is drawn, shape (2,) [px]."""
         return self.arc.start
+
+    @property
+    def tail_edge_px(self) -> np.ndarray:
+        """The blunt end as it is measured by its edge, shape (2,) [px]."""
+        return self.arc.at(self.tail_shift_px)
 
     @property
     def tip_px(self) -> np.ndarray:
@@ -50,7 +57,7 @@ class MeasuredNeedle:
     @property
     def direction_px(self) -> np.ndarray:
         """Unit tangent at the tail, u right and v down, shape (2,)."""
-        return self.arc.direction()
+        return self.arc.direction(self.tail_shift_px)
 
     @property
     def curvature_px(self) -> float:

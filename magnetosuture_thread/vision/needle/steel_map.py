@@ -27,6 +27,7 @@ class SteelMap:
     Attributes:
         surely: by the brightest of the three colours, in which steel alone is dark, shape (rows, columns), 0 to 1.
         perhaps: by the darkest of them, in which a coloured thread is dark too; the same without colours.
+        dark: darkness of the brightest of the three colours, as a share of the floor's brightness.
         depth: darkness of steel, 0 to 1.
         light: how much brighter than the floor, as a share of it, the brightest colour is around each pixel,
             shape (rows, columns).
@@ -38,6 +39,7 @@ class SteelMap:
 
     surely: NDArray[np.float32]
     perhaps: NDArray[np.float32]
+    dark: NDArray[np.float32]
     depth: float
     light: NDArray[np.float32]
     pixels: NDArray[np.uint8]
@@ -108,7 +110,7 @@ class SteelMap:
         perhaps = surely if darkest is brightest else _share(_darkness(darkest, box, factor, wall), depth)
         pixels = np.ascontiguousarray(darkest.pixels[box])
         light = np.asarray(cv2.blur(-dark, (LIGHT_PX, LIGHT_PX)), dtype=np.float32)
-        return SteelMap(surely, perhaps, depth, light, pixels, (float(left), float(top)), (columns, rows))
+        return SteelMap(surely, perhaps, dark, depth, light, pixels, (float(left), float(top)), (columns, rows))
 
 
 def _darkness(channel: Layer, box: tuple[slice, slice], factor: int, wall: Wall) -> NDArray[np.float32]:

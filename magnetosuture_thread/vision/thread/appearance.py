@@ -107,7 +107,7 @@ def appearance_of(picture: Picture, gray: NDArray[np.uint8], points: Points, vis
         visible: where it is visible for sure, shape (m,), or nowhere for all of it.
     """
     shown = np.flatnonzero(visible) if visible.sum() >= MIN_POINTS else np.arange(len(points))
-    shown = shown[:: max(1, len(shown) // ENOUGH_POINTS)]
+    shown = shown[:: max(1, len(shown) // ENOUGH_POINTS)].copy()  # Compiled code is compiled anew for a view.
     aside = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
     usual = np.empty(len(aside))
     usual_profile(_profiles(gray, points, aside, shown), aside, 0.5 * REACH_PX, usual)
