@@ -21,6 +21,7 @@ from magnetosuture_thread.model.estimator.noise import (
     MIN_INTERVAL,
     WINDOWS,
     NoiseModel,
+    grow,
     interpolate_to_nodes,
     shift_errors,
 )
@@ -278,8 +279,11 @@ class ThreadEstimator:
         hidden = take_over(points, weights, work, density, self._variance, self._applied)
         self._slow.correct(self._corrector, self._variance)
         shift_errors(self._noise.bank, self._applied * unit)
-        own = self._sums.own * unit**2
-        self._test.add(work.moved * unit, work.normals, own, pose.stamp, np.asarray(pose.deviation))
+        variance = self._sums.own * (max(self._noise.scale, 1.0) / self._noise.scale * unit**2)
+        # Errors of the dish's place in the image are the same for all points of a window and at both times, so that they
+        # count once, where those of the points alone count twice.
+        variance *= 1.0 + 0.5 * self._sums.independent
+        self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
         corrected = ThreadState(work.about * unit, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True
@@ -297,16 +301,11 @@ class ThreadEstimator:
 
     def _learn(self, points: MeasuredPoints, weights: Vector, elapsed: float) -> Innovations:
         """Learn the noise from the innovations, and grow the prior where it rose."""
-        nodes = self.thread.segments + 1
         weigh(points, self._variance, weights, self._sums)
         before = self._noise.bank.intensity.copy()
         innovations = self._noise.learn(self._sums, self._unit, elapsed)
-        interpolate_to_nodes(np.maximum(self._noise.intensity, before), nodes, self._added)
-        interpolate_to_nodes(before, nodes, self._work)
-        extra = np.maximum(self._added - self._work, 0.0) * (max(elapsed, MIN_INTERVAL) / self._unit**2)
-        extra[0] = 0.0
-        self._variance = self._variance + extra
-        self._density = self._density + 2.0 * self._length * extra
+        amount = max(elapsed, MIN_INTERVAL) / self._unit**2
+        grow(before, self._noise.intensity, amount, 2.0 * self._length, self._variance, self._density)
         return innovations
 
     def _set_variance(self, variance: Vector) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.model.estimator import ThreadEstimator
+from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimator
 from magnetosuture_thread.model.estimator.relaxation import relax
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
@@ -44,7 +44,7 @@ def test_a_pose_that_is_a_little_off_is_no_disturbance(material: str, attachment
     way = [NeedlePose(k / RATE, tails[k], headings[k]) for k in range(len(tails))]
     truth = true_shapes(thread, way)
     estimator = ThreadEstimator(ThreadPredictor(thread))
-    found = []
+    found: list[Disturbance] = []
     for k, pose in enumerate(way):
         turned = angles[k] + HEADING_ERROR
         measured = replace(
