@@ -54,9 +54,9 @@ def path_without_outliers(points: Points, spacing: float, penalty: float, kept: 
 
 @compiled
 def usable_points(
-    points: Points, deviation: Vector, largest: float, min_deviation: float, unit: float, room: int
+    points: Points, deviation: Vector, largest: float, min_deviation: float, unit: float, max_points: int
 ) -> tuple[Points, Vector, int]:
-    """Return the points of a piece that are finite, not more than there is room for, and how many of all are.
+    """Return the points of a piece that are finite, at most so many, and how many of all are.
 
     Args:
         points: shape (m, 2) [m].
@@ -64,7 +64,7 @@ def usable_points(
         largest: coordinate and deviation [m].
         min_deviation: what is less is taken as this [m].
         unit: D, the unit of what is returned [m].
-        room: number of points; of more, every so many is taken.
+        max_points: that are returned; of more, every so many is taken.
     """
     good = np.empty(len(points), dtype=np.int64)
     count = 0
@@ -73,7 +73,7 @@ def usable_points(
         if inside and 0.0 <= deviation[p] <= largest:
             good[count] = p
             count += 1
-    stride = max(1, -(-count // room))
+    stride = max(1, -(-count // max_points))
     taken = -(-count // stride)
     places, deviations = np.empty((taken, 2)), np.empty(taken)
     for k in range(taken):

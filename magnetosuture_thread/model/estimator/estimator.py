@@ -46,6 +46,7 @@ LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farthe
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
 MIN_VARIANCE = 1e-12  # D^2
+MIN_SHARED = 0.4  # of a point's variance, which the points of a window share and which lasts
 
 
 class ThreadEstimator:
@@ -279,10 +280,10 @@ class ThreadEstimator:
         hidden = take_over(points, weights, work, density, self._variance, self._applied)
         self._slow.correct(self._corrector, self._variance)
         shift_errors(self._noise.bank, self._applied * unit)
-        variance = self._sums.own * (max(self._noise.scale, 1.0) / self._noise.scale * unit**2)
-        # Errors of the dish's place in the image are the same for all points of a window and at both times, so that they
-        # count once, where those of the points alone count twice.
-        variance *= 1.0 + 0.5 * self._sums.independent
+        # What of a point's variance does not change from frame to frame is of the dish's place in the image: the points
+        # of a window share it, and so do both times that the test compares.
+        shared = max(1.0 - self._noise.scale, MIN_SHARED) / self._noise.scale * self._sums.independent
+        variance = self._sums.own * (1.0 + 0.5 * shared) * unit**2
         self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
         corrected = ThreadState(work.about * unit, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected

@@ -124,8 +124,10 @@ def _place(
     deviation = np.ascontiguousarray(piece.deviation, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
         return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
-    room = MAX_POINTS * segments
-    points, deviation, finite = usable_points(points, deviation, MAX_COORDINATE, options.min_deviation, unit, room)
+    max_points = MAX_POINTS * segments
+    points, deviation, finite = usable_points(
+        points, deviation, MAX_COORDINATE, options.min_deviation, unit, max_points
+    )
     if finite < FRESH_POINTS:
         return "a piece has fewer than two finite points"
     points, deviation, arcs, share = clean_path(points, deviation, DETOUR, STEP, options.point_correlation / unit)
