@@ -53,6 +53,37 @@ def path_without_outliers(points: Points, spacing: float, penalty: float, kept: 
 
 
 @compiled
+def usable_points(
+    points: Points, deviation: Vector, largest: float, min_deviation: float, unit: float, max_points: int
+) -> tuple[Points, Vector, int]:
+    """Return the points of a piece that are finite, at most so many, and how many of all are.
+
+    Args:
+        points: shape (m, 2) [m].
+        deviation: of each, shape (m,) [m].
+        largest: coordinate and deviation [m].
+        min_deviation: what is less is taken as this [m].
+        unit: D, the unit of what is returned [m].
+        max_points: that are returned; of more, every so many is taken.
+    """
+    good = np.empty(len(points), dtype=np.int64)
+    count = 0
+    for p in range(len(points)):
+        inside = abs(points[p, 0]) <= largest and abs(points[p, 1]) <= largest
+        if inside and 0.0 <= deviation[p] <= largest:
+            good[count] = p
+            count += 1
+    stride = max(1, -(-count // max_points))
+    taken = -(-count // stride)
+    places, deviations = np.empty((taken, 2)), np.empty(taken)
+    for k in range(taken):
+        p = good[k * stride]
+        places[k, 0], places[k, 1] = points[p, 0] / unit, points[p, 1] / unit
+        deviations[k] = max(deviation[p], min_deviation) / unit
+    return places, deviations, count
+
+
+@compiled
 def clean_path(
     points: Points, deviation: Vector, detour: float, step: float, correlation: float
 ) -> tuple[Points, Vector, Vector, Vector]:

@@ -294,7 +294,7 @@ def correct(
     weights: Vector,
     end: tuple[float, float],
     tolerance: float,
-) -> tuple[int, int, float, tuple[float, float, float]]:
+) -> tuple[int, int, float, tuple[float, float, float], float]:
     """Correct a thread by measured points.
 
     Args:
@@ -317,7 +317,7 @@ def correct(
 
     Returns:
         `CORRECTED`, `NO_ROOM` for contacts, or `FAILED`; number of solves; how far off the hard constraints are over
-        what is allowed, at most 1 where they hold; the residuals of the last solve.
+        what is allowed, at most 1 where they hold; the residuals of the last solve; the scale of the program.
     """
     nodes, segments = len(start), len(start) - 1
     known, about, moved = work.known, work.about, work.moved
@@ -346,7 +346,7 @@ def correct(
             row += 1
         contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True)
         if contacts < 0:
-            return NO_ROOM, solves, off, found
+            return NO_ROOM, solves, off, found, scale
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
         if solves > 0 and ((off <= 1.0 and change <= CHANGED) or solves >= MAX_SOLVES):
             break
@@ -357,7 +357,7 @@ def correct(
         _, _, found = banded.solve_and_check(axes, program, u, multipliers, solver_buffers)
         solves += 1
         if not max(found) <= tolerance:
-            return FAILED, solves, off, found
+            return FAILED, solves, off, found, scale
         moved[:] = u
         about[:] = start + moved
         buffers.multipliers[:segments] = multipliers[:segments]
@@ -377,4 +377,4 @@ def correct(
                 j = 2 * i
                 value = work.inverse[j + min(a, b), abs(a - b)] / scale
                 work.covariance[i, a, b] = 0.0 if known[i] else value
-    return CORRECTED, solves, off, found
+    return CORRECTED, solves, off, found, scale

@@ -114,10 +114,9 @@ class Corrector:
         """
         rod = self._formulation.rod
         stiffness = rod.bending_stiffness / (rod.drag_across * self._unit**4)
-        scale = max(float((1.0 / density[1:]).max()), float((points.share / points.variance).max()))  # as in `correct`
         while True:
             self.work.known[:] = self._known
-            code, solves, off, residuals = correct(
+            code, solves, off, residuals, scale = correct(
                 (0, 1),
                 rod,
                 self._buffers,

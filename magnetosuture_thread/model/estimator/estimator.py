@@ -21,6 +21,7 @@ from magnetosuture_thread.model.estimator.noise import (
     MIN_INTERVAL,
     WINDOWS,
     NoiseModel,
+    grow,
     interpolate_to_nodes,
     shift_errors,
 )
@@ -45,6 +46,7 @@ LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farthe
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
 MIN_VARIANCE = 1e-12  # D^2
+MIN_SHARED = 0.4  # of a point's variance, which the points of a window share and which lasts
 
 
 class ThreadEstimator:
@@ -278,8 +280,11 @@ class ThreadEstimator:
         hidden = take_over(points, weights, work, density, self._variance, self._applied)
         self._slow.correct(self._corrector, self._variance)
         shift_errors(self._noise.bank, self._applied * unit)
-        own = self._sums.own * unit**2
-        self._test.add(work.moved * unit, work.normals, own, pose.stamp, np.asarray(pose.deviation))
+        # What of a point's variance does not change from frame to frame is of the dish's place in the image: the points
+        # of a window share it, and so do both times that the test compares.
+        shared = max(1.0 - self._noise.scale, MIN_SHARED) / self._noise.scale * self._sums.independent
+        variance = self._sums.own * (1.0 + 0.5 * shared) * unit**2
+        self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
         corrected = ThreadState(work.about * unit, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True
@@ -297,16 +302,11 @@ class ThreadEstimator:
 
     def _learn(self, points: MeasuredPoints, weights: Vector, elapsed: float) -> Innovations:
         """Learn the noise from the innovations, and grow the prior where it rose."""
-        nodes = self.thread.segments + 1
         weigh(points, self._variance, weights, self._sums)
         before = self._noise.bank.intensity.copy()
         innovations = self._noise.learn(self._sums, self._unit, elapsed)
-        interpolate_to_nodes(np.maximum(self._noise.intensity, before), nodes, self._added)
-        interpolate_to_nodes(before, nodes, self._work)
-        extra = np.maximum(self._added - self._work, 0.0) * (max(elapsed, MIN_INTERVAL) / self._unit**2)
-        extra[0] = 0.0
-        self._variance = self._variance + extra
-        self._density = self._density + 2.0 * self._length * extra
+        amount = max(elapsed, MIN_INTERVAL) / self._unit**2
+        grow(before, self._noise.intensity, amount, 2.0 * self._length, self._variance, self._density)
         return innovations
 
     def _set_variance(self, variance: Vector) -> None:

@@ -45,16 +45,18 @@ class WindowSums(NamedTuple):
         mean: mean innovation of its points, nan where there is none [D].
         own: variance of it by the points' own, inf where there is none [D^2].
         known: variance of the prior, in the points' mean [D^2].
+        independent: number of its points that err independently.
     """
 
     mean: Vector
     own: Vector
     known: Vector
+    independent: Vector
 
     @classmethod
     def of(cls, windows: int) -> WindowSums:
         """Return arrays for so many windows."""
-        return cls(np.empty(windows), np.empty(windows), np.empty(windows))
+        return cls(*(np.empty(windows) for _ in range(4)))
 
 
 @compiled
@@ -78,11 +80,12 @@ def weigh(points: MeasuredPoints, variance: Vector, weights: Vector, sums: Windo
     for p in range(count):
         expected[p] = points.variance[p] + _at(variance, points.place[p])
     robust_weights(points, points.innovation, expected, weights)
-    sums.mean[:], sums.known[:], sums.own[:] = 0.0, 0.0, 0.0
+    sums.mean[:], sums.known[:], sums.own[:], sums.independent[:] = 0.0, 0.0, 0.0, 0.0
     for p in range(count):
         w = min(int(points.place[p] * windows / segments), windows - 1)
         precision = weights[p] * points.share[p] / points.variance[p]
         sums.own[w] += precision
+        sums.independent[w] += weights[p] * points.share[p]
         sums.mean[w] += precision * points.innovation[p]
         sums.known[w] += precision * (expected[p] - points.variance[p])
     for w in range(windows):

@@ -105,9 +105,107 @@ def learn(
         bank.intensity[w] = np.exp(mean)
 
 
-def unexplained(bank: NoiseBank) -> tuple[Vector, Vector]:
-    """Return the error that each window's filters expect of the estimate [m], and their variance of it [m^2]."""
-    return (bank.weight * bank.error).sum(axis=1), (bank.weight * bank.variance).sum(axis=1)
+@compiled
+def share_of(elapsed: float, learned_for: float, time_constant: float) -> float:
+    """Return the share of a new value in a mean: of all values at first, later of those of some time."""
+    return float(min(elapsed / (min(learned_for, time_constant) + LEARNING_PRIOR), 1.0))
+
+
+@compiled
+def match_innovations(
+    sums: WindowSums,
+    unit: float,
+    scale: float,
+    ratio: float,
+    elapsed: float,
+    learned_for: float,
+    last_mean: Vector,
+    last_variance: Vector,
+    mean: Vector,
+    variance: Vector,
+    expected: Vector,
+) -> tuple[float, float]:
+    """Match what is expected of innovations to those of a frame; return the new scale and ratio.
+
+        E nu^2 = c (r + p)                  c, the ratio
+        E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames are independent
+
+    Args:
+        sums: of the windows.
+        unit: D [m].
+        scale: s, by which the points' variance r of `sums` is larger than the camera says.
+        ratio: c.
+        elapsed: since the last measurement [s].
+        learned_for: time of all measurements before [s].
+        last_mean: of the frame before, nan where nothing was measured, shape (w,) [m].
+        last_variance: r of it, as the camera says [m^2].
+        mean: nu of each window, written, shape (w,) [m].
+        variance: r of each as the camera says, written, shape (w,) [m^2].
+        expected: c (r + p) of each, with the ratio before, written, shape (w,) [m^2].
+    """
+    squares, seen, changes, both = 0.0, 0, 0.0, 0
+    for w in range(len(mean)):
+        mean[w] = sums.mean[w] * unit
+        variance[w] = sums.own[w] * unit**2 / scale
+        total = (sums.own[w] + sums.known[w]) * unit**2
+        expected[w] = ratio * total
+        if not np.isfinite(mean[w]):
+            continue
+        squares += mean[w] ** 2 / total
+        seen += 1
+        if np.isfinite(last_mean[w]):
+            change = (mean[w] - last_mean[w]) ** 2
+            changes += min(change / (variance[w] + last_variance[w]), MAX_SCALE)
+            both += 1
+    if seen:
+        ratio += share_of(elapsed, learned_for, RATIO_TIME) * (squares / seen - ratio)
+    if both:
+        scale += share_of(elapsed, learned_for, SCALE_TIME) * (changes / both - scale)
+        scale = min(max(scale, MIN_SCALE), MAX_SCALE)
+    return scale, ratio
+
+
+@compiled
+def intensity_with_excess(bank: NoiseBank, mean: Vector, interval: float, intensity: Vector) -> None:
+    """Write the process noise of each window, and what must have come in one interval of what it did not explain.
+
+    Args:
+        bank: the filters.
+        mean: innovation of each window, nan where nothing is measured, shape (w,) [m].
+        interval: since the last measurement [s].
+        intensity: written, shape (w,) [m^2/s].
+    """
+    for w in range(len(mean)):
+        intensity[w] = bank.intensity[w]
+        if not np.isfinite(mean[w]):
+            continue
+        left, doubt = 0.0, 0.0  # error that the filters expect of the estimate, and their variance of it
+        for g in range(bank.error.shape[1]):
+            left += bank.weight[w, g] * bank.error[w, g]
+            doubt += bank.weight[w, g] * bank.variance[w, g]
+        intensity[w] += max(left * left - SURE**2 * doubt, 0.0) / interval
+
+
+@compiled
+def grow(before: Vector, after: Vector, amount: float, factor: float, variance: Vector, density: Vector) -> None:
+    """Grow a prior by process noise that has turned out to be larger.
+
+    Args:
+        before: intensity of each window that the prior grew by, shape (w,) [m^2/s].
+        after: what it should have been [m^2/s].
+        amount: the interval, in the units of the variance.
+        factor: of the density over the variance.
+        variance: of each node, written, shape (n + 1,).
+        density: of each node, written, shape (n + 1,).
+    """
+    nodes = len(variance)
+    less, more = np.empty(nodes), np.empty(nodes)
+    interpolate_to_nodes(before, nodes, less)
+    interpolate_to_nodes(np.maximum(before, after), nodes, more)
+    for i in range(1, nodes):
+        extra = max(more[i] - less[i], 0.0) * amount
+        variance[i] += extra
+        density[i] += factor * extra
 
 
 @compiled
@@ -164,33 +262,23 @@ class NoiseModel:
             unit: D [m].
             elapsed: since the last measurement [s].
         """
-        mean, own = sums.mean * unit, sums.own * unit**2
-        seen, expected = np.isfinite(mean), own + sums.known * unit**2
-        innovations = Innovations(mean, self.ratio * expected)
-        if seen.any():
-            self.ratio += self._share(elapsed, RATIO_TIME) * (float((mean**2 / expected)[seen].mean()) - self.ratio)
-        self._learn_scale(mean, own / self.scale, seen, elapsed)
-        learn(self.bank, GRID, mean, own, elapsed, self._time_constant)
+        mean, variance, expected = (np.empty(WINDOWS) for _ in range(3))
+        self.scale, self.ratio = match_innovations(
+            sums,
+            unit,
+            self.scale,
+            self.ratio,
+            elapsed,
+            self._learned_for,
+            self._last_mean,
+            self._last_variance,
+            mean,
+            variance,
+            expected,
+        )
+        self._last_mean, self._last_variance = mean, variance
+        learn(self.bank, GRID, mean, sums.own * unit**2, elapsed, self._time_constant)
         # Where the bank knows of an error that the last correction left, the noise was too low: as if it came at once.
-        left, doubt = unexplained(self.bank)
-        excess = np.where(seen, np.maximum(left**2 - SURE**2 * doubt, 0.0), 0.0)
-        self.intensity = self.bank.intensity + excess / max(elapsed, MIN_INTERVAL)
+        intensity_with_excess(self.bank, mean, max(elapsed, MIN_INTERVAL), self.intensity)
         self._learned_for += elapsed
-        return innovations
-
-    def _learn_scale(self, mean: Vector, variance: Vector, seen: NDArray[np.bool_], elapsed: float) -> None:
-        """Learn by how much the points' variance is larger than told, from what changes between two frames.
-
-        E (nu_k - nu_{k-1})^2 = 2 s r,    as errors of the model last, and those of two frames are independent
-        """
-        both = seen & np.isfinite(self._last_mean)
-        if both.any():
-            change = (mean - self._last_mean)[both] ** 2
-            ratio = float(np.minimum(change / (variance + self._last_variance)[both], MAX_SCALE).mean())
-            share = self._share(elapsed, SCALE_TIME)
-            self.scale = min(max(self.scale + share * (ratio - self.scale), MIN_SCALE), MAX_SCALE)
-        self._last_mean, self._last_variance = np.where(seen, mean, np.nan), variance
-
-    def _share(self, elapsed: float, time_constant: float) -> float:
-        """Return the share of a new value in a mean: of all values at first, later of those of some time."""
-        return min(elapsed / (min(self._learned_for, time_constant) + LEARNING_PRIOR), 1.0)
+        return Innovations(mean, expected)

@@ -14,6 +14,7 @@ from magnetosuture_thread.model.estimator.association import (
     clean_path,
     project,
     search_start,
+    usable_points,
 )
 from magnetosuture_thread.model.estimator.correction import MeasuredPoints
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
@@ -95,7 +96,7 @@ def place_pieces(
             problems.append(found)
             continue
         low, high = max(int(found.start), 0), min(math.ceil(found.start + found.arcs[-1]), segments)
-        if high > low and covered[low:high].mean() > OVERLAP:
+        if high > low and np.count_nonzero(covered[low:high]) > OVERLAP * (high - low):
             problems.append("a piece lies where another one shows the thread already")
             continue
         covered[low:high] = True
@@ -112,27 +113,24 @@ def _first_arc(piece: ThreadPiece) -> float:
 
 
 def _known(piece: ThreadPiece) -> bool:
-    return all(math.isfinite(value) for value in piece.arc_length)
+    return math.isfinite(piece.arc_length[0]) and math.isfinite(piece.arc_length[1])
 
 
 def _place(
     piece: ThreadPiece, nodes: Points, variance: Vector, unit: float, options: EstimatorOptions
 ) -> PlacedPiece | str:
     """Return a piece on the thread, or why it is none of it."""
-    points, segments = np.asarray(piece.points, dtype=np.float64), len(nodes) - 1
-    deviation = np.asarray(piece.deviation, dtype=np.float64)
+    points, segments = np.ascontiguousarray(piece.points, dtype=np.float64), len(nodes) - 1
+    deviation = np.ascontiguousarray(piece.deviation, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
         return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
-    good = (np.abs(points) <= MAX_COORDINATE).all(axis=1) & (deviation >= 0.0) & (deviation <= MAX_COORDINATE)
-    if np.count_nonzero(good) < FRESH_POINTS:
-        return "a piece has fewer than two finite points"
-    points, deviation = points[good] / unit, np.maximum(deviation[good], options.min_deviation) / unit
-    stride = math.ceil(len(points) / (MAX_POINTS * segments))
-    if stride > 1:
-        points, deviation = points[::stride], deviation[::stride]
-    points, deviation, arcs, share = clean_path(
-        np.ascontiguousarray(points), deviation, DETOUR, STEP, options.point_correlation / unit
+    max_points = MAX_POINTS * segments
+    points, deviation, finite = usable_points(
+        points, deviation, MAX_COORDINATE, options.min_deviation, unit, max_points
     )
+    if finite < FRESH_POINTS:
+        return "a piece has fewer than two finite points"
+    points, deviation, arcs, share = clean_path(points, deviation, DETOUR, STEP, options.point_correlation / unit)
     if len(points) < FRESH_POINTS:
         return "a piece has fewer than two points on a path"
     if not arcs[-1] > 0.0:
@@ -242,8 +240,7 @@ def measured_points(
     for piece in placed:
         place, innovation = piece.projected(nodes)
         good = np.isfinite(place)
-        far = good & (np.abs(innovation) > 0.5)
-        if len(workspace.shapes) and far.any():
+        if len(workspace.shapes) and (far := good & (np.abs(innovation) > 0.5)).any():
             at = np.minimum(place[far].astype(np.int64), len(nodes) - 2)
             part = (place[far] - at)[:, None]
             start = (1.0 - part) * nodes[at] + part * nodes[at + 1]
@@ -251,10 +248,14 @@ def measured_points(
             if parted.any():
                 problems.append(f"{int(parted.sum())} points lie beyond an obstacle")
                 good[np.flatnonzero(far)[parted]] = False
-        if good.any():
+        if good.all():
+            found.append((place, innovation, scale * piece.variance, piece.share))
+        elif good.any():
             found.append((place[good], innovation[good], scale * piece.variance[good], piece.share[good]))
     if not found:
         return None
+    if len(found) == 1:
+        return MeasuredPoints(*found[0])
     return MeasuredPoints(*(np.ascontiguousarray(np.concatenate(each)) for each in zip(*found, strict=True)))
 
 
@@ -268,8 +269,9 @@ def free_end(placed: list[PlacedPiece], nodes: Points, variance: float) -> tuple
     """
     for piece in placed:
         if piece.free_end:
-            along = nodes[-1] - nodes[-2]
-            off = float((piece.points[-1] - nodes[-1]) @ along) / math.hypot(*along)
+            (ax, ay), (bx, by) = nodes[-2:].tolist()
+            px, py = piece.points[-1].tolist()
+            off = ((px - bx) * (bx - ax) + (py - by) * (by - ay)) / math.hypot(bx - ax, by - ay)
             deviation = LENGTH_ERROR * (len(nodes) - 1)
             if abs(off) < 6.0 * (deviation + math.sqrt(variance)):
                 return off, deviation**2 + float(piece.variance[-1])

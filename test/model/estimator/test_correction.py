@@ -152,7 +152,7 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     memory.known[0] = True
     formulation, solver = estimator.predictor.formulation, BandedSolver()
     assert isinstance(formulation, RodFormulation)
-    code, _, off, residuals = correct(
+    code, _, off, residuals, _ = correct(
         (0, 1),
         formulation.rod,
         buffers,
