@@ -89,7 +89,7 @@ def _with_friction(setup: Setup, friction: float) -> Setup:
     """Return a setup whose rig and scene have friction."""
     shapes = tuple(replace(shape, friction=friction) for shape in setup.scene.shapes)
     scene = replace(setup.scene, dish=replace(setup.scene.dish, wall_friction=friction), shapes=shapes)
-    return replace(setup, scene=scene, rig=replace(setup.rig, thread_friction=friction))
+    return replace(setup, rig=replace(setup.rig, thread_friction=friction)).with_scene(scene)
 
 
 def _simulate(setup: Setup, poses: list[NeedlePose]) -> tuple[list[Points], Points]:
