@@ -14,11 +14,22 @@ from magnetosuture_thread.calibration.parameters import DRAG_ANISOTROPY, REST_CU
 from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from test.calibration.runs import SETTINGS, rig_passage
 
-PASSAGE = rig_passage(1.3e-9)
-SHAPE = PASSAGE.known.shape
 PARAMETERS = (STIFFNESS_OVER_DRAG, DRAG_ANISOTROPY, REST_CURVATURE)
 X = np.array([STIFFNESS_OVER_DRAG.to_fit(1.3e-9), DRAG_ANISOTROPY.to_fit(0.5), 0.0])
 Array = NDArray[np.float64]
+Shape = tuple[int, ...]
+
+
+@pytest.fixture(scope="module")
+def passage() -> RecordedRun:
+    """Return a run of the rig."""
+    return rig_passage(1.3e-9)
+
+
+@pytest.fixture
+def shape(passage: RecordedRun) -> Shape:
+    """Return the shape of its residuals."""
+    return passage.known.shape
 
 
 def solved(jacobian: Array, residuals: Array, x: Array = X) -> FitSolution:
@@ -36,84 +47,84 @@ def names(solution: FitSolution, passages: list[RecordedRun]) -> list[str]:
     return [verdict.reason for verdict in assess_identifiability(solution, passages)]
 
 
-def test_of_white_noise_the_interval_is_that_of_least_squares():
-    jacobian, noise = 0.02 * random(1, *SHAPE, 3), 1e-2
+def test_of_white_noise_the_interval_is_that_of_least_squares(passage: RecordedRun, shape: Shape):
+    jacobian, noise = 0.02 * random(1, *shape, 3), 1e-2
     gram = np.linalg.inv(jacobian.reshape(-1, 3).T @ jacobian.reshape(-1, 3))
     halves = []
     for seed in range(100, 140):
-        spread = estimate_uncertainty(solved(jacobian, noise * random(seed, *SHAPE)), [PASSAGE], range(3))
+        spread = estimate_uncertainty(solved(jacobian, noise * random(seed, *shape)), [passage], range(3))
         halves.append(spread.half - CHAIN / spread.effect)
     student = 2.262  # of nine degrees of freedom
     assert np.mean(halves, axis=0) == pytest.approx(student * noise * np.sqrt(np.diag(gram)), rel=0.2)
 
 
-def test_residuals_that_stay_for_long_widen_the_interval():
-    jacobian = 0.02 * random(1, *SHAPE, 3) + 0.02
+def test_residuals_that_stay_for_long_widen_the_interval(passage: RecordedRun, shape: Shape):
+    jacobian = 0.02 * random(1, *shape, 3) + 0.02
     halves = []
     for index in range(20):
-        white = random(100 + index, *SHAPE)
-        slow = math.sqrt(2.0) * np.sin(2.0 * math.pi * PASSAGE.times / 3.0 + index)[:, None] * np.ones(SHAPE)
+        white = random(100 + index, *shape)
+        slow = math.sqrt(2.0) * np.sin(2.0 * math.pi * passage.times / 3.0 + index)[:, None] * np.ones(shape)
         spreads = [
-            estimate_uncertainty(solved(jacobian, 1e-3 * residuals), [PASSAGE], range(3)) for residuals in (white, slow)
+            estimate_uncertainty(solved(jacobian, 1e-3 * residuals), [passage], range(3)) for residuals in (white, slow)
         ]
         halves.append([(spread.half - CHAIN / spread.effect).mean() for spread in spreads])
     narrow, wide = np.mean(halves, axis=0)
     assert wide > 1.5 * narrow
 
 
-def test_bags_that_disagree_widen_the_interval():
-    jacobian = 0.02 * np.ones((*SHAPE, 1)) + 0.002 * random(1, *SHAPE, 1)
-    passages, signs = [PASSAGE] * 4, (1.0, -1.0, 1.0, -1.0)
+def test_bags_that_disagree_widen_the_interval(passage: RecordedRun, shape: Shape):
+    jacobian = 0.02 * np.ones((*shape, 1)) + 0.002 * random(1, *shape, 1)
+    passages, signs = [passage] * 4, (1.0, -1.0, 1.0, -1.0)
     bags = FitSolution(
-        SETTINGS, PARAMETERS[:1], X[:1], [s * 1e-3 * np.ones(SHAPE) for s in signs], [jacobian] * 4, math.inf, 0.0
+        SETTINGS, PARAMETERS[:1], X[:1], [s * 1e-3 * np.ones(shape) for s in signs], [jacobian] * 4, math.inf, 0.0
     )
-    alone = estimate_uncertainty(solved(np.repeat(jacobian, 3, axis=2), 1e-6 * np.ones(SHAPE)), [PASSAGE], [0])
+    alone = estimate_uncertainty(solved(np.repeat(jacobian, 3, axis=2), 1e-6 * np.ones(shape)), [passage], [0])
     assert estimate_uncertainty(bags, passages, [0]).half[0] > 2.0 * alone.half[0]
 
 
-def test_what_all_is_well_with_is_identified():
-    assert names(solved(0.1 * random(1, *SHAPE, 3), 1e-3 * random(2, *SHAPE)), [PASSAGE]) == ["", "", ""]
+def test_what_all_is_well_with_is_identified(passage: RecordedRun, shape: Shape):
+    assert names(solved(0.1 * random(1, *shape, 3), 1e-3 * random(2, *shape)), [passage]) == ["", "", ""]
 
 
-def test_two_that_do_the_same_are_named_and_one_is_kept():
-    jacobian = 0.1 * random(1, *SHAPE, 3)
-    jacobian[..., 1] = 0.5 * jacobian[..., 0] + 0.005 * random(3, *SHAPE)
-    first, second, third = names(solved(jacobian, 1e-4 * random(2, *SHAPE)), [PASSAGE])
+def test_two_that_do_the_same_are_named_and_one_is_kept(passage: RecordedRun, shape: Shape):
+    jacobian = 0.1 * random(1, *shape, 3)
+    jacobian[..., 1] = 0.5 * jacobian[..., 0] + 0.005 * random(3, *shape)
+    first, second, third = names(solved(jacobian, 1e-4 * random(2, *shape)), [passage])
     assert (first, third) == ("", "")
     assert "cannot be told apart from stiffness over drag: correlation -1.00" in second
 
 
-def test_at_a_bound_nothing_is_known():
+def test_at_a_bound_nothing_is_known(passage: RecordedRun, shape: Shape):
     x = np.array([X[0], DRAG_ANISOTROPY.to_fit(1.0), 0.0])
-    reasons = names(solved(0.1 * random(1, *SHAPE, 3), 1e-3 * random(2, *SHAPE), x), [PASSAGE])
+    reasons = names(solved(0.1 * random(1, *shape, 3), 1e-3 * random(2, *shape), x), [passage])
     assert reasons[0] == reasons[2] == ""
     assert reasons[1] == "the fit ends at its bound, 1"
 
 
-def test_what_moves_nothing_is_not_known():
-    jacobian = 0.1 * random(1, *SHAPE, 3)
+def test_what_moves_nothing_is_not_known(passage: RecordedRun, shape: Shape):
+    jacobian = 0.1 * random(1, *shape, 3)
     jacobian[..., 1] *= 0.02
-    reasons = names(solved(jacobian, 1e-4 * random(2, *SHAPE)), [PASSAGE])
+    reasons = names(solved(jacobian, 1e-4 * random(2, *shape)), [passage])
     assert "a factor of two moves the prediction by 0.11 % of the length only" in reasons[1]
 
 
-def test_a_wide_interval_is_no_knowledge():
-    jacobian = 0.1 * random(1, *SHAPE, 3)
-    block = np.sign(np.sin(7.0 * PASSAGE.times))[:, None]
-    reasons = names(solved(jacobian, 0.8 * block * np.sign(jacobian[..., 1])), [PASSAGE])
+def test_a_wide_interval_is_no_knowledge(passage: RecordedRun, shape: Shape):
+    jacobian = 0.1 * random(1, *shape, 3)
+    block = np.sign(np.sin(7.0 * passage.times))[:, None]
+    reasons = names(solved(jacobian, 0.8 * block * np.sign(jacobian[..., 1])), [passage])
     assert "its 95 % interval is" in reasons[1]
     assert reasons[1].endswith("too wide to be of use")
 
 
-def test_of_a_thread_that_bends_on_a_small_part_only_the_stiffness_is_not_known():
+def test_of_a_thread_that_bends_on_a_small_part_only_the_stiffness_is_not_known(passage: RecordedRun, shape: Shape):
     x = np.array([STIFFNESS_OVER_DRAG.to_fit(2e-12), X[1], X[2]])
-    reasons = names(solved(0.1 * random(1, *SHAPE, 3), 1e-3 * random(2, *SHAPE), x), [PASSAGE])
+    reasons = names(solved(0.1 * random(1, *shape, 3), 1e-3 * random(2, *shape), x), [passage])
     assert reasons[0].startswith("bending acts within 0.7 mm, 3.")
     assert reasons[1:] == ["", ""]
 
 
-def test_the_scale_of_outliers():
-    residuals = 2e-3 * random(4, *SHAPE)
+def test_the_scale_of_outliers(shape: Shape):
+    residuals = 2e-3 * random(4, *shape)
     residuals[:3] = 0.5  # a frame or two that were tracked wrongly
     assert robust_scale([residuals]) == pytest.approx(6e-3, rel=0.1)
-    assert robust_scale([np.zeros(SHAPE)]) == 1e-3
+    assert robust_scale([np.zeros(shape)]) == 1e-3
