@@ -61,7 +61,9 @@ def made_metrics(
             metrics.observe(Observation(stamp, reason=f"hidden by {EVIL}"))
             continue
         metrics.observe(sight)
-        forces = ThreadForces(np.array([1e-6 * index, 5e-6]), np.zeros((26, 2)), np.array([-3e-6, 4e-6]), 0.0)
+        forces = ThreadForces(
+            np.array([1e-6 * index, 5e-6]), np.zeros((26, 2)), np.array([-3e-6, 4e-6]), 0.0, *np.zeros((2, 26))
+        )
         prediction: Any = SimpleNamespace(positions=NODES, strain=np.array([0.0, -1e-5]), residual=1e-9, forces=forces)
         frame = FrameResult.of(sight, prediction, margins(1e-3 - 1e-5 * index), 1e-4, recorded=seen)
         if estimated:
