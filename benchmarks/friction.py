@@ -111,7 +111,7 @@ def step_time(friction: float) -> dict[str, float]:
         solves.append(result.solves)
         return result
 
-    predictor.formulation.step = counted  # type: ignore[method-assign]
+    vars(predictor.formulation)["step"] = counted
     for k in range(1, 121):
         pose = NeedlePose(k / RATE, nodes[0] + SPEED * k / RATE * EAST, EAST)
         began = time.process_time()

@@ -26,14 +26,13 @@ def scene_fields(scene: Scene) -> dict[str, Any]:
     A shape has `disc`, a list of none or one of x, y, radius, and `polygon`, a list of none or one of `outline` and
     `holes`. An outline is a dictionary whose `corners` are dictionaries of x, y and z.
     """
-    fields: dict[str, Any] = {
+    return {
         "version": scene.version,
         "dish_diameter": scene.dish.diameter,
         "dish_depth": scene.dish.depth,
+        "wall_friction": scene.dish.wall_friction,
         "shapes": [_shape_fields(shape) for shape in scene.shapes],
     }
-    # Messages of before there was friction have no field for it; only a scene that has some needs one.
-    return {**fields, "wall_friction": scene.dish.wall_friction} if scene.dish.wall_friction else fields
 
 
 def parse_scene_message(message: Any) -> Scene:
@@ -65,8 +64,7 @@ def parse_scene_message(message: Any) -> Scene:
 def _shape_fields(shape: SceneShape) -> dict[str, Any]:
     geometry = shape.geometry
     fields: dict[str, Any] = {"name": shape.name, "kind": shape.kind, "disc": [], "polygon": []}
-    if shape.friction:
-        fields["friction"] = shape.friction
+    fields["friction"] = shape.friction
     if isinstance(geometry, Disc):
         fields["disc"] = [{"x": geometry.centre[0], "y": geometry.centre[1], "radius": geometry.radius}]
     else:

@@ -68,6 +68,7 @@ def test_the_fields_are_plain_and_those_of_the_message():
         "kind": "instrument",
         "disc": [{"x": 0.0077, "y": 0.0039, "radius": 0.0015}],
         "polygon": [],
+        "friction": 0.0,
     }
     block = fields["shapes"][5]
     assert (block["name"], block["disc"], len(block["polygon"][0]["holes"])) == ("block", [], 1)

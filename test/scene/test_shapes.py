@@ -138,8 +138,8 @@ DISC = {"center": [0.0, 0.0], "radius": 0.001}
 BAD: list[tuple[Any, str]] = [
     (None, "post: got None, expected a shape, one of disc, annulus"),
     ([], "post: got [], expected a shape"),
-    ({}, "post: got 'no shape', expected kind, corner_radius and one of disc"),
-    ({"disk": DISC}, "post: got 'disk', expected kind, corner_radius and one of disc"),
+    ({}, "post: got 'no shape', expected kind, corner_radius, friction and one of disc"),
+    ({"disk": DISC}, "post: got 'disk', expected kind, corner_radius, friction and one of disc"),
     ({"disc": DISC, "annulus": RING}, "post: got ['disc', 'annulus'], expected"),
     ({"disc": DISC, "color": "red"}, "post: got 'color', expected"),
     ({"disc": DISC, "kind": "bone"}, "post.kind: got 'bone', expected one of tissue, instrument, wall"),
