@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from functools import lru_cache
 
@@ -117,7 +116,7 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
         step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
     """
     vertices, forces = prediction.positions, prediction.forces
-    tension, contact, pull, moment = np.empty(0), np.empty((0, 2)), (math.nan, math.nan), math.nan
+    tension, contact, pull, moment = np.empty(0), np.empty((0, 2)), (0.0, 0.0), 0.0
     if forces is not None:
         tension, contact = forces.tension, forces.contact
         pull, moment = forces.needle_force.tolist(), forces.needle_moment

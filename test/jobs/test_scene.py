@@ -37,7 +37,10 @@ def test_check_shows_dish_version_and_shapes(capsys: pytest.CaptureFixture[str],
         assert words in shown
     assert "warning" not in shown
     found = json.loads((tmp_path / "a.json").read_text())
-    assert (found["version"], found["dish"]) == (scene.version, {"diameter": 0.05, "depth": 0.003})
+    assert (found["version"], found["dish"]) == (
+        scene.version,
+        {"diameter": 0.05, "depth": 0.003, "wall_friction": 0.0},
+    )
     assert [shape["name"] for shape in found["shapes"]] == list(scene.names)
     ring = found["shapes"][0]
     assert ring["definition"]["annulus"]["outer_radius"] == 0.006

@@ -70,7 +70,9 @@ def test_the_threads_pull_is_compensated_by_the_coils(graph):
     def pull(force: float, frame: str = "dish") -> None:
         header = MESSAGES.header(graph.now())
         header.frame_id = frame
-        graph.publish(topics.PREDICTED_THREAD, PredictedThread(header=header, needle_force=Vector3(x=force)))
+        graph.publish(
+            topics.PREDICTED_THREAD, PredictedThread(header=header, tension=[0.0], needle_force=Vector3(x=force))
+        )
 
     force = -0.004 * CoilBridgeSettings().needle_drag  # 4 mm/s of 5, reduced to half of the command
 

@@ -49,6 +49,8 @@ class PullSubscription:
             reading.require_dish_frame(message.header.frame_id, name)
             stamp = reading.checked_nanoseconds(message.header.stamp, f"{name}.header.stamp") * 1e-9
             force = np.array([message.needle_force.x, message.needle_force.y])
+            if not len(message.tension):  # no force is known
+                force[:] = np.nan
             self._bridge.feedforward.update(force, stamp, time.monotonic())
         except INPUT_ERRORS as error:
             self._refuse(error)

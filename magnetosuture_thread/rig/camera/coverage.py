@@ -1,9 +1,9 @@
-"""How much of each pixel a drawn shape covers, polygons exactly and lines on a larger canvas."""
+"""How much of each pixel a drawn shape covers, by drawing it larger than the image."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 
-OVERSAMPLING = 4  # of a line
-SCANLINES = 8  # in a row of pixels of a polygon
+OVERSAMPLING = 4
 TILE_PX = 60.0  # a long line is drawn in pieces of this length: a large, nearly empty canvas would be slow
 
 Light = NDArray[np.float32]
 Box = tuple[slice, slice]
+ToCanvas = Callable[[Points], NDArray[np.int32]]
 
 
 def box_around(points: Points, size: tuple[int, int], margin: float) -> Box | None:
@@ -39,42 +39,19 @@ def box_around(points: Points, size: tuple[int, int], margin: float) -> Box | No
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
-def polygon_covered(box: Box, rings: Sequence[Points]) -> Light:
-    """Return the share of each pixel in a box that a polygon covers, shape (rows, columns).
-
-    Exact along rows, whose share is taken on `SCANLINES` lines of each: filling a larger canvas by `cv2.fillPoly` would
-    round the vertices and draw the boundary too, so that all solids came out an eighth of a pixel too large.
+def covered(box: Box, draw: Callable[[Any, ToCanvas], Any]) -> Light:
+    """Return the share of each pixel in a box that a shape covers, shape (rows, columns).
 
     Args:
         box: rows and columns.
-        rings: closed outlines, each of shape (m, 2) [px]; what is inside of an odd number of them is covered.
+        draw: called with a canvas and what turns pixels (u, v) into its coordinates, in sixteenths.
     """
-    rows, columns = box
-    result = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.float32)
-    begins = np.vstack(rings) - (columns.start - 0.5, rows.start - 0.5)  # in the box, from its first pixel's corner
-    ends = np.vstack([np.roll(ring, -1, axis=0) for ring in rings]) - (columns.start - 0.5, rows.start - 0.5)
-    _fill(begins, ends, result)
-    return result
+    rows, columns = box[0].stop - box[0].start, box[1].stop - box[1].start
+    canvas = np.zeros((rows * OVERSAMPLING, columns * OVERSAMPLING), np.uint8)
 
-
-@compiled
-def _fill(begins: NDArray[np.float64], ends: NDArray[np.float64], share: Light) -> None:
-    """Add the share of each pixel that is inside of a closed outline, by its edges, shape (edges, 2)."""
-    rows, columns = share.shape
-    crossings = np.empty(len(begins))
-    part = np.float32(1.0 / SCANLINES)
-    for line in range(rows * SCANLINES):
-        height, count = (line + 0.5) / SCANLINES, 0
-        for edge in range(len(begins)):
-            if (begins[edge, 1] <= height) != (ends[edge, 1] <= height):
-                along = (height - begins[edge, 1]) / (ends[edge, 1] - begins[edge, 1])
-                crossings[count] = begins[edge, 0] + along * (ends[edge, 0] - begins[edge, 0])
-                count += 1
-        crossings[:count].sort()
-        for first in range(0, count - 1, 2):
-            left, right = max(crossings[first], 0.0), min(crossings[first + 1], float(columns))
-            for column in range(int(left), min(math.ceil(right), columns)):
-                share[line // SCANLINES, column] += part * (min(right, column + 1.0) - max(left, float(column)))
+    draw(canvas, lambda pixels: _on_canvas(pixels - (box[1].start, box[0].start)))
+    small = cv2.resize(canvas, (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(small * np.float32(1.0 / 255.0), dtype=np.float32)
 
 
 def line_covered(box: Box, line: Points, width_px: float) -> Light:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.coverage import Box, Light, blurred, box_around, lay, line_covered, polygon_covered
+from magnetosuture_thread.rig.camera.coverage import Box, Light, blurred, box_around, covered, lay, line_covered
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.rig.camera.still_life import StillLife
 
@@ -130,7 +130,7 @@ class DishCamera:
         near = box_around(outline, self.size, REACH_PX)
         needle = None
         if near is not None:
-            needle = polygon_covered(near, [outline])
+            needle = covered(near, lambda canvas, at: cv2.fillPoly(canvas, [at(outline)], 255, cv2.LINE_8, 4))
             inside = _within(near, box)
             np.maximum(shade[inside], needle, out=shade[inside])
         lay(region, blurred(shade, SHADOW, *SHADOW_BEGIN_PX), 0.16, (0.0, 0.0, 0.0))
@@ -142,7 +142,7 @@ class DishCamera:
             )
 
     def _add_cover(self, region: Light, box: Box, cover: Cover, edge: Points) -> None:
-        hidden = polygon_covered(box, [edge])
+        hidden = covered(box, lambda canvas, at: cv2.fillPoly(canvas, [at(edge)], 255, cv2.LINE_8, 4))
         lay(region, cv2.GaussianBlur(hidden, (0, 0), cover.blur_px), cover.opacity, cover.bgr)
 
     def _needle_outline(self, tail: Points, heading: float) -> Points:

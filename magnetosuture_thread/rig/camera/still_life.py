@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.coverage import Light, box_around, polygon_covered
+from magnetosuture_thread.rig.camera.coverage import Light, box_around, covered
 from magnetosuture_thread.rig.camera.scene import SILICONE, CameraScene, Lighting, Look
 
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
@@ -84,16 +86,19 @@ class StillLife:
             return
         region = image[box]
 
-        shade = cv2.GaussianBlur(polygon_covered(box, [ring + DROP_SHADOW_PX for ring in rings]), (0, 0), 4.0)
+        def solid(of: Sequence[Points]) -> Light:
+            return covered(box, lambda canvas, to: cv2.fillPoly(canvas, [to(r) for r in of], 255, cv2.LINE_8, 4))
+
+        shade = cv2.GaussianBlur(solid([ring + DROP_SHADOW_PX for ring in rings]), (0, 0), 4.0)
         region *= 1.0 - 0.2 * shade[:, :, None]
-        top = polygon_covered(box, rings)
+        top = solid(rings)
         colour = self._surface(top, look) + (self._smear(look.mottle, 9.0)[box][:, :, None] if look.mottle else 0.0)
         region += top[:, :, None] * (colour - region)
         if isinstance(obstacle, Disc):
             radius = obstacle.radius / self._view.metres_per_pixel
             small = self._view.to_pixels(np.asarray(obstacle.centre)) - 0.35 * radius
             ring = small + 0.25 * radius * circle(128)
-            shine = cv2.GaussianBlur(polygon_covered(box, [ring]), (0, 0), 0.15 * radius + 0.5)
+            shine = cv2.GaussianBlur(solid([ring]), (0, 0), 0.15 * radius + 0.5)
             region += shine[:, :, None] * 40.0
 
     def _surface(self, top: Light, look: Look) -> Light:

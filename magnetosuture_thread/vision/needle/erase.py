@@ -76,7 +76,7 @@ def _erase(pixels, floor, factor, start, shape, box):
                 continue  # Four edges for each pixel of the box would take longer than all else.
             part = min(max((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0), 1.0)
             own = half * (1.0 - (1.0 - THIN) * part)
-            share = (edge(own - d) - edge(-own - d)) * edge(s + BLOOM_PX) * edge(length - s + BLOOM_PX)
+            share = (edge(own - d) - edge(-own - d)) * edge(s) * edge(length - s)
             if share > 0.01:
                 ground = float(floor[min(row // factor, len(floor) - 1), min(column // factor, floor.shape[1] - 1)])
                 value = pixels[row, column] + ground * contrast * share

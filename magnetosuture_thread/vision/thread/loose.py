@@ -37,34 +37,23 @@ def has_loose_thread(picture: Picture, needle: MeasuredNeedle, wall: Wall, lengt
         strong[np.abs(picture.mask.depth) < picture.mask.band_px] = 0
         strong[picture.mask.depth > 0.0] = 0
     # What leaves the tail may be its own thread, of which nothing was followed, and so may one line that leaves its
-    # side, folded below it. One that leaves either on two sides passes it.
+    # side, folded below it. One that leaves it on two sides passes it.
     axis = needle.arc.at(np.linspace(-COVERED_PX, needle.length_px + COVERED_PX, 24))
     at = np.round(axis * 16.0).astype(np.int32)
     covered = np.zeros_like(strong)
     cv2.polylines(covered, [at], False, 1, round(needle.width_px + 2.0 * COVERED_PX), cv2.LINE_8, 4)
-    u, v = (int(value) for value in np.round(needle.tail_px))
-    reach = round(0.5 * needle.width_px + 2.0 * COVERED_PX + TAIL_PX)  # of what is covered there, and more
-    around, near = np.zeros_like(strong), np.zeros_like(strong)
-    cv2.circle(around, (u, v), reach + WINDOW_PX, 1, -1)  # A line that passes is cut apart by it.
-    cv2.circle(near, (u, v), reach, 1, -1)
-    labels = cv2.connectedComponents(strong & around)[1]
-    at_tail = (np.isin(labels, labels[near > 0]) & (labels > 0)).astype(np.uint8)
-    leaves, leaves_tail = (cv2.dilate(part, np.ones((3, 3), np.uint8)) for part in (strong & covered, at_tail))
-    strong[(covered | at_tail) > 0] = 0
+    leaves = cv2.dilate(strong & covered, np.ones((3, 3), np.uint8))
+    strong[covered > 0] = 0
+    u, v = np.round(needle.tail_px).astype(int)
+    cv2.circle(strong, (int(u), int(v)), round(0.5 * needle.width_px + COVERED_PX + TAIL_PX), 1, -1)
+    cv2.floodFill(strong, None, (int(u), int(v)), 0, flags=8)
     outlines, _ = cv2.findContours(strong, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    from_tail: list[float] = []
-    from_side: list[float] = []
+    passing: list[float] = []
     for outline in outlines:
         extent = 0.5 * cv2.arcLength(outline, True)
-        rows, columns = outline[:, 0, 1], outline[:, 0, 0]
-        if leaves_tail[rows, columns].any():
-            branches = from_tail
-        elif leaves[rows, columns].any():
-            branches = from_side
-        elif extent > length:
+        touches = bool(leaves[outline[:, 0, 1], outline[:, 0, 0]].any())
+        if extent > length and not touches:
             return True
-        else:
-            continue
-        if extent > BRANCH * length:
-            branches.append(extent)
-    return any(len(branches) > 1 and sum(branches) > length for branches in (from_tail, from_side))
+        if touches and extent > BRANCH * length:
+            passing.append(extent)
+    return len(passing) > 1 and sum(passing) > length
