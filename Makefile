@@ -31,7 +31,7 @@ demo: $(READY)
 
 test: $(READY)
 	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph"
-	$(RUN)/python -m pytest --numprocesses=2 --dist=loadscope --no-loadscope-reorder -m whole_graph
+	$(RUN)/python -m pytest -m whole_graph
 
 lint: $(READY)
 	$(RUN)/ruff check .
