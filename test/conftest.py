@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import atexit
-import fcntl
 import os
 import shutil
 import signal
 import tempfile
 import uuid
-from collections.abc import Generator, Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -43,49 +40,6 @@ def arc(tail: np.ndarray, angle: float, curvature: float, length: float = 0.019,
     turned = angle + curvature * s
     steps = np.diff(s)[:, None] * np.column_stack([np.cos(turned), np.sin(turned)])[:-1]
     return np.vstack([tail, tail + np.cumsum(steps, axis=0)])
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests last that run alone, so that others wait for them once."""
-    items.sort(key=runs_alone)
-
-
-@contextmanager
-def turn(alone: bool) -> Iterator[None]:
-    """Wait until a whole graph may run, beside others or alone; who waits to be alone lets no other begin.
-
-    The locks are on two files that are there: nothing is left behind, and all processes of pytest-xdist share them.
-    """
-    with Path(__file__).open() as door, (Path(__file__).parents[1] / "pyproject.toml").open() as room:
-        fcntl.flock(door, fcntl.LOCK_EX)
-        fcntl.flock(room, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
-        fcntl.flock(door, fcntl.LOCK_UN)
-        yield
-
-
-def runs_alone(item: pytest.Item) -> bool:
-    """Return whether a test needs the machine for itself."""
-    return item.get_closest_marker("undisturbed") is not None
-
-
-turns: list[ExitStack] = []  # the one that this process has
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
-    """Run a test that starts a whole graph, with its fixtures, when it is its turn."""
-    if item.get_closest_marker("whole_graph") is None:
-        return (yield)
-    if not turns:
-        turns.append(ExitStack())
-        turns[0].enter_context(turn(runs_alone(item)))
-    try:
-        return (yield)
-    finally:
-        # A graph that a module's tests share runs on between them.
-        goes_on = runs_alone(item) and nextitem is not None and runs_alone(nextitem) and nextitem.path == item.path
-        if not goes_on:
-            turns.pop().close()
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,6 @@ from benchmarks.bridge.report import BridgeReport, ZeroDelays, bridge_table
 
 
 @pytest.mark.whole_graph
-@pytest.mark.undisturbed
 def test_whatever_falls_silent_or_is_killed_the_boards_go_to_zero_and_work_again():
     report = measure_bridge(trials=2, kills=1, hostile=3000, busy=False)
     assert [each.count > 0 for each in report.delays] == [True] * 4

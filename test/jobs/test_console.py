@@ -264,7 +264,6 @@ def check(path: Path) -> Bag:
 
 
 @pytest.mark.whole_graph
-@pytest.mark.undisturbed
 def test_a_person_steers_the_simulated_rig(tmp_path: Path):
     recordings = tmp_path / "recordings"
 

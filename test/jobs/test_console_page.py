@@ -126,7 +126,6 @@ def light_and_dark(page: Page, folder: Path, name: str) -> None:
 
 
 @pytest.mark.whole_graph
-@pytest.mark.undisturbed
 def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path):
     pilot, page = bench.pilot, bench.page
     pilot.begin()
@@ -173,7 +172,6 @@ def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path)
 
 
 @pytest.mark.whole_graph
-@pytest.mark.undisturbed
 def test_a_dropped_connection_stops_the_needle(bench: Bench):
     pilot, page = bench.pilot, bench.page
     pilot.press("ArrowUp")

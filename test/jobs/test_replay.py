@@ -57,7 +57,6 @@ def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceT
     return path
 
 
-@pytest.mark.undisturbed
 def test_a_bag_is_replayed_judged_and_recorded(short_bag: Path, tmp_path: Path):
     count_diagnostics: list[str] = []
     shares: list[float] = []

@@ -59,7 +59,6 @@ def run(scenario: Path, tmp_path_factory: pytest.TempPathFactory):
     return bag, summary, said, shares
 
 
-@pytest.mark.undisturbed
 def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     _, summary, said, shares = run
     assert summary.setup == "short"
@@ -90,7 +89,6 @@ def test_a_run_whose_bridge_is_stopped_ends_and_says_so(scenario: Path, tmp_path
     assert not any(states[-1].current)
 
 
-@pytest.mark.undisturbed
 def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: Path, tmp_path: Path):
     summary = simulate(str(scenario), tmp_path / "bag", boards=True)
     assert summary.path_error < 2e-3
@@ -101,7 +99,6 @@ def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: 
     assert max(abs(current) for state in following for current in state.measured_current) > 0.5
 
 
-@pytest.mark.undisturbed
 def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     bag = Bag(run[0])
     assert bag.damage is None
@@ -135,7 +132,6 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     assert all(0.0 < covariance[0] < 1e-8 for covariance in covariances)
 
 
-@pytest.mark.undisturbed
 def test_replay_takes_the_bag(run, scenario: Path, tmp_path: Path):
     scenario.rename(scenario.with_suffix(".gone"))  # the bag must know it by itself
     try:
@@ -159,7 +155,6 @@ def test_under_faults_the_tracker_is_right_or_silent_and_the_needle_goes_on(tmp_
     assert summary.tracked > 15
 
 
-@pytest.mark.undisturbed
 def test_with_a_simulated_clock_it_runs_faster_than_real_time(tmp_path: Path):
     # Few frames: how many a second can be tracked is for a benchmark.
     path = tmp_path / "short.yaml"

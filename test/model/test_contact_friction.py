@@ -7,13 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.friction import DIAMETER, DRAG, EAST, POST, RATE, SPEED, capstan
 from magnetosuture_thread import ConfigurationError, Disc, NeedlePose, Polygon, Scene, ThreadPredictor, Workspace
 from magnetosuture_thread.model.margins import FrictionState
 from magnetosuture_thread.model.thread import Attachment, Medium, Thread
 from magnetosuture_thread.scene import Dish, SceneShape
-
-RATE = 60.0
-DIAMETER = 60e-6
 
 
 def thread_of(length: float, segments: int, medium: Medium, bending_stiffness: float = 0.0) -> Thread:
@@ -24,20 +22,10 @@ def thread_of(length: float, segments: int, medium: Medium, bending_stiffness: f
 @pytest.mark.parametrize("friction", [0.1, 0.3, 0.5])
 def test_a_flexible_thread_around_a_post_has_the_tensions_of_a_capstan(friction: float, angle: float):
     """T_2 = T_1 exp(mu theta) + f r (exp(mu theta) - 1) / mu, with the drag f per length of the part on the post."""
-    radius, speed, drag, lead = 1e-3 + 0.5 * DIAMETER, 1e-3, 0.5, 4e-3
-    segment = 2.0 * math.pi * radius / 40
-    segments = round((lead + angle * radius) / segment) + 120
-    at = segment * np.arange(segments + 1)
-    turned = math.pi / 2 + np.clip((at - lead) / radius, 0.0, angle)
-    tail = np.clip(at - lead - angle * radius, 0.0, None)
-    x = radius * np.cos(turned) - tail * np.sin(turned) + np.clip(lead - at, 0.0, None)
-    nodes = np.column_stack([x, radius * np.sin(turned) + tail * np.cos(turned)])
-    thread = thread_of(segments * segment, segments, Medium(2.0 * drag, drag))
-    predictor = ThreadPredictor(thread, Workspace((Disc((0.0, 0.0), 1e-3),), 2e-3, friction=(friction,)))
-    east, ratios = np.array([1.0, 0.0]), []
-    predictor.start_at(NeedlePose(0.0, nodes[0], east), nodes)
+    predictor, nodes = capstan(friction, angle, 120)
+    radius, ratios = POST + 0.5 * DIAMETER, []
     for k in range(1, 26):
-        prediction = predictor.step(NeedlePose(k / RATE, nodes[0] + speed * k / RATE * east, east))
+        prediction = predictor.step(NeedlePose(k / RATE, nodes[0] + SPEED * k / RATE * EAST, EAST))
         assert prediction.converged
         assert prediction.residual < 1e-6
         forces, along = prediction.forces, np.diff(prediction.positions, axis=0)
@@ -46,7 +34,7 @@ def test_a_flexible_thread_around_a_post_has_the_tensions_of_a_capstan(friction:
         first, last = touching[0] - 1, touching[-1]  # segments before and behind the post
         theta = np.ptp(np.unwrap(np.arctan2(along[:, 1], along[:, 0]))[first : last + 1])
         gain = math.exp(friction * theta)
-        wanted = forces.tension[last] * gain + drag * speed * radius * (gain - 1.0) / friction
+        wanted = forces.tension[last] * gain + DRAG * SPEED * radius * (gain - 1.0) / friction
         ratios.append(forces.tension[first] / wanted)
         if k > 15:
             assert {forces.friction_states[node] for node in touching} == {FrictionState.SLIDING}
