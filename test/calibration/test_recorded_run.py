@@ -1,4 +1,4 @@
-"""What a bag's sights say as arrays, and which bags are of no use."""
+"""What a bag's observations say as arrays, and which bags are of no use."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation,
 from test.calibration.runs import LENGTH, SETTINGS, path, rig_run, stiff
 
 TRUE = 1.3e-9
-Sights = Sequence[Observation]
+Observations = Sequence[Observation]
 
 
 @pytest.fixture
-def sights() -> tuple[Observation, ...]:
+def observations() -> tuple[Observation, ...]:
     """Return a run whose parameters are known."""
     return rig_run(TRUE)
 
@@ -38,12 +38,12 @@ def still(first: Observation, sight: Observation, shift: float) -> Observation:
     return replace(sight, tail=first.tail + by, heading=first.heading, measured=first.measured + by)
 
 
-def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on(sights: Sights):
-    hidden = [replace(sight, measured=np.empty((0, 2))) if k < 5 else sight for k, sight in enumerate(sights)]
+def test_it_begins_where_the_thread_is_first_measured_and_compares_from_a_second_on(observations: Observations):
+    hidden = [replace(sight, measured=np.empty((0, 2))) if k < 5 else sight for k, sight in enumerate(observations)]
     lost = [Observation(sight.stamp, reason="glare") if k == 50 else sight for k, sight in enumerate(hidden)]
     passage = read_run("bag", lost, SETTINGS)
-    assert passage.stamps[0] == sights[5].stamp
-    assert sights[50].stamp not in passage.stamps
+    assert passage.stamps[0] == observations[5].stamp
+    assert observations[50].stamp not in passage.stamps
     assert passage.times[0] == pytest.approx(SETTLING, abs=0.1)
     assert len(passage.frames) <= MAX_FRAMES
     assert passage.targets.shape == (len(passage.frames), SETTINGS.segments, 2)
@@ -52,15 +52,15 @@ def test_it_begins_where_the_thread_is_first_seen_and_compares_from_a_second_on(
     assert passage.speed == pytest.approx(np.percentile(steps, 75.0), rel=0.15)
 
 
-def test_after_a_gap_it_begins_anew_from_the_thread_as_seen(sights: Sights):
-    gap = [sight for k, sight in enumerate(sights) if not 40 <= k < 50]
+def test_after_a_gap_it_begins_anew_from_the_measured_thread(observations: Observations):
+    gap = [sight for k, sight in enumerate(observations) if not 40 <= k < 50]
     passage = read_run("bag", gap, SETTINGS)
     assert passage.legs == (0, 40)
-    assert np.array_equal(passage.initials[1], sights[50].measured)
-    times = (passage.stamps[passage.frames] - sights[50].stamp) * 1e-9
+    assert np.array_equal(passage.initials[1], observations[50].measured)
+    times = (passage.stamps[passage.frames] - observations[50].stamp) * 1e-9
     assert not ((times >= 0.0) & (times < SETTLING)).any()
     model = stiff(TRUE)
-    whole, parts = (read_run("bag", each, SETTINGS) for each in (sights, gap))
+    whole, parts = (read_run("bag", each, SETTINGS) for each in (observations, gap))
     last = [
         frame_errors(replay_with_parameters(passage, model), passage.targets, LENGTH)[-1] for passage in (whole, parts)
     ]
@@ -76,30 +76,30 @@ def observed(sight: Observation, shown: int) -> Observation:
     return replace(sight, measured=points, observation=ThreadObservation((piece,), complete=whole))
 
 
-def test_a_leg_starts_from_a_complete_observation(sights: Sights):
-    covered = [observed(sight, 40 if k < 8 else 64) for k, sight in enumerate(sights)]
+def test_a_leg_starts_from_a_complete_observation(observations: Observations):
+    covered = [observed(sight, 40 if k < 8 else 64) for k, sight in enumerate(observations)]
     passage = read_run("bag", covered, SETTINGS)
-    assert passage.stamps[0] == sights[8].stamp
-    assert np.array_equal(passage.initials[0], sights[8].measured)
+    assert passage.stamps[0] == observations[8].stamp
+    assert np.array_equal(passage.initials[0], observations[8].measured)
 
 
-def test_a_leg_starts_from_a_part_where_no_more_was_seen_for_a_second(sights: Sights):
-    part = [observed(sight, 40) for sight in sights]
+def test_a_leg_starts_from_a_part_where_no_more_was_measured_for_a_second(observations: Observations):
+    part = [observed(sight, 40) for sight in observations]
     passage = read_run("bag", part, SETTINGS)
-    assert (passage.stamps[0] - sights[0].stamp) * 1e-9 == pytest.approx(PARTIAL_WAIT * 1e-9, abs=0.1)
+    assert (passage.stamps[0] - observations[0].stamp) * 1e-9 == pytest.approx(PARTIAL_WAIT * 1e-9, abs=0.1)
     assert len(passage.initials[0]) == 40
 
 
-def test_a_frame_that_does_not_show_the_tail_starts_no_leg(sights: Sights):
+def test_a_frame_that_does_not_show_the_tail_starts_no_leg(observations: Observations):
     away = [
         replace(observed(sight, 64), observation=ThreadObservation()) if k < 5 else sight
-        for k, sight in enumerate(sights)
+        for k, sight in enumerate(observations)
     ]
-    assert read_run("bag", away, SETTINGS).stamps[0] == sights[5].stamp
+    assert read_run("bag", away, SETTINGS).stamps[0] == observations[5].stamp
 
 
-def test_what_is_not_seen_is_not_known(sights: Sights):
-    part = [replace(sight, measured=sight.measured[:40]) for sight in sights]
+def test_what_is_not_measured_is_not_known(observations: Observations):
+    part = [replace(sight, measured=sight.measured[:40]) for sight in observations]
     passage = read_run("bag", part, SETTINGS)
     seen = 39.0 / 63.0 * SETTINGS.segments
     assert (passage.known.sum(axis=1) == int(seen)).all()
@@ -107,20 +107,20 @@ def test_what_is_not_seen_is_not_known(sights: Sights):
     assert not across_residuals(vertices, passage, LENGTH)[~passage.known].any()
 
 
-def test_errors_are_those_of_the_score(sights: Sights):
-    passage = read_run("bag", sights, SETTINGS)
+def test_errors_are_those_of_the_score(observations: Observations):
+    passage = read_run("bag", observations, SETTINGS)
     vertices = replay_with_parameters(passage, SETTINGS)
     found = frame_errors(vertices, passage.targets, LENGTH)
     for slot in (0, 30, -1):
-        curve = sights[int(passage.frames[slot])].measured
+        curve = observations[int(passage.frames[slot])].measured
         assert found[slot] == pytest.approx(prediction_error_percent(vertices[slot], curve, LENGTH), rel=1e-6)
     both = offset_residuals(vertices, passage, LENGTH).reshape(len(found), 2, -1)
     assert 100.0 * np.hypot(both[:, 0], both[:, 1])[passage.known].mean() == pytest.approx(found.mean())
     assert (np.abs(across_residuals(vertices, passage, LENGTH)) <= np.hypot(both[:, 0], both[:, 1]) + 1e-12).all()
 
 
-def test_a_thread_that_cannot_start_is_as_wrong_as_can_be(sights: Sights):
-    passage = read_run("bag", sights, SETTINGS)
+def test_a_thread_that_cannot_start_is_as_wrong_as_can_be(observations: Observations):
+    passage = read_run("bag", observations, SETTINGS)
     passage = replace(passage, initials=(passage.initials[0] + 0.01,))
     vertices = replay_with_parameters(passage, SETTINGS)
     assert np.isnan(vertices).all()
@@ -131,33 +131,48 @@ def test_a_thread_that_cannot_start_is_as_wrong_as_can_be(sights: Sights):
 @pytest.mark.parametrize(
     ("changed", "against", "words"),
     [
-        (lambda sights: [Observation(sight.stamp, reason="dark") for sight in sights], "seen", "no needle"),
-        (lambda sights: [replace(sight, measured=np.empty((0, 2))) for sight in sights], "seen", "no thread"),
+        (lambda observations: [Observation(sight.stamp, reason="dark") for sight in observations], "seen", "no needle"),
         (
-            lambda sights: [replace(sight, ground_truth=np.empty((0, 2))) for sight in sights],
+            lambda observations: [replace(sight, measured=np.empty((0, 2))) for sight in observations],
+            "seen",
+            "no thread",
+        ),
+        (
+            lambda observations: [replace(sight, ground_truth=np.empty((0, 2))) for sight in observations],
             "truth",
             "no ground truth",
         ),
-        (lambda sights: sights[:40], "seen", "too short"),
+        (lambda observations: observations[:40], "seen", "too short"),
         (
-            lambda sights: [sights[0], *(replace(sight, measured=sight.measured[:20]) for sight in sights[1:])],
+            lambda observations: [
+                observations[0],
+                *(replace(sight, measured=sight.measured[:20]) for sight in observations[1:]),
+            ],
             "seen",
             "half of the thread",
         ),
-        (lambda sights: [replace(sight, measured=sight.measured[:20]) for sight in sights], "seen", "never shows half"),
-        (lambda sights: [still(sights[0], sight, 0.0) for sight in sights], "seen", "nothing moves"),
-        (lambda sights: [still(sights[0], sight, 1e-5 * k) for k, sight in enumerate(sights)], "seen", "too slow"),
-        (lambda sights: [], "seen", "no needle"),
+        (
+            lambda observations: [replace(sight, measured=sight.measured[:20]) for sight in observations],
+            "seen",
+            "never shows half",
+        ),
+        (lambda observations: [still(observations[0], sight, 0.0) for sight in observations], "seen", "nothing moves"),
+        (
+            lambda observations: [still(observations[0], sight, 1e-5 * k) for k, sight in enumerate(observations)],
+            "seen",
+            "too slow",
+        ),
+        (lambda observations: [], "seen", "no needle"),
     ],
 )
-def test_bags_of_no_use_are_refused_in_words(
-    sights: Sights, changed: Callable[[Sights], Sights], against: str, words: str
+def test_bags_that_cannot_be_used_are_refused_with_the_reason(
+    observations: Observations, changed: Callable[[Observations], Observations], against: str, words: str
 ):
     with pytest.raises(BagError, match=words) as refused:
-        read_run("a bag", changed(sights), SETTINGS, against)
+        read_run("a bag", changed(observations), SETTINGS, against)
     assert str(refused.value).startswith("a bag: ")
 
 
-def test_two_runs_in_one_bag_are_refused(sights: Sights):
+def test_two_runs_in_one_bag_are_refused(observations: Observations):
     with pytest.raises(InvalidInputError, match="before the last"):
-        read_run("a bag", [*sights, *sights], SETTINGS)
+        read_run("a bag", [*observations, *observations], SETTINGS)

@@ -221,7 +221,7 @@ def test_raw_frames_are_refused_as_the_bag_would_not_hold_them(tmp_path: Path):
         simulate(str(path), tmp_path / "bag")
 
 
-def test_a_run_in_which_nothing_is_seen_fails_but_its_bag_and_logs_stay(
+def test_a_run_without_a_measured_needle_fails_but_its_bag_and_logs_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(simulate_module, "PREDICTION_TIMEOUT", 2.0)  # s; in vain
