@@ -27,7 +27,7 @@ class RigFrame:
 
     Attributes:
         time: since the start [s].
-        image: BGR, shape (height, width, 3); None if the frame got lost.
+        image: BGR, shape (height, width, 3); None if the frame got lost, or was not wanted.
         lateness: how long it is held back before anybody gets it [s].
         tail: the needle's true tail, shape (2,) [m].
         heading: its true angle at the tail [rad].
@@ -205,14 +205,24 @@ class Rig:
         text = "running" if self.running >= 0.0 else "held until the first current"
         return f"{text}, with {faults}" if faults else text
 
-    def look(self, time: float) -> RigFrame:
-        """Take a frame at a time since the start [s]."""
+    @property
+    def tension(self) -> Vector:
+        """Tension of each segment of the thread, shape (n,) [N]."""
+        return self._dynamics.tension
+
+    def look(self, time: float, *, rendered: bool = True) -> RigFrame:
+        """Take a frame at a time since the start [s].
+
+        Args:
+            time: of the frame.
+            rendered: whether the picture is wanted too, which takes most of the time.
+        """
         self.advance(time)
         faults, dynamics, running = self.faults, self._dynamics, self.running
         away = faults.lifted(running)
         tail, thread = dynamics.tail + away, dynamics.thread + away
         image = None
-        if not faults.drops(running, float(self._random.uniform())):
+        if not faults.drops(running, float(self._random.uniform())) and rendered:
             covers = faults.covers(running, tail, dynamics.tip + away)
             image = self.camera.render(tail, dynamics.heading, thread, covers, faults.gain(running))
         return RigFrame(self.time, image, faults.lateness(running), tail, dynamics.heading, thread)

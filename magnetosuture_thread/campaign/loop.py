@@ -1,0 +1,237 @@
+"""The closed loop without a graph: rig, tracker or its noise, estimator, procedure, and bridge on simulated time."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.coils.bridge import NEEDLE, CoilBridge
+from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.session import PredictionResult, ThreadSession
+from magnetosuture_thread.planning.executor import ThreadCondition
+from magnetosuture_thread.rig.rig import Rig
+from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.vision.session import TrackerSession
+
+Vector = NDArray[np.float64]
+
+START = 1.0  # s; simulated time of the first frame, as 0 is no time in ROS
+LATENCY = 0.02  # s; from a frame to the command that follows from it, as measured in the graph
+TAIL_DEVIATION, HEADING_DEVIATION = 1e-5, 5e-3  # m and rad; of a tracked needle, see docs/results.md
+THREAD_DEVIATION, THREAD_CORRELATION = 1e-5, 5e-4  # m; of a tracked centreline, and along it
+THREAD_POINTS = 64
+UNMEASURED = 1.0  # s; without a measurement of the thread an estimate is unsure
+
+Controller = Callable[[float, Vector, Vector, ThreadCondition], Vector]
+"""From stamp [s], tail [m], heading and the thread's condition to the velocity commanded of the tip [m/s]."""
+
+
+@dataclass(frozen=True)
+class LoopFrame:
+    """The moment of a frame, as it is and as the nodes have it.
+
+    Attributes:
+        time: since the loop began [s].
+        tail: of the needle in truth, shape (2,) [m].
+        heading: of the needle in truth [rad].
+        thread: in truth, shape (n + 1, 2) [m].
+        tension: peak of the thread in truth [N].
+        condition: what the model knows of the thread.
+        commanded: velocity of the tip that the controller wants, shape (2,) [m/s].
+        reason: why the coils are at zero; empty if they are not.
+    """
+
+    time: float
+    tail: Vector
+    heading: float
+    thread: Points
+    tension: float
+    condition: ThreadCondition
+    commanded: Vector
+    reason: str
+
+
+@dataclass(order=True)
+class _Measurement:
+    due: float
+    stamp: float
+    tail: Vector = field(compare=False)
+    heading: Vector = field(compare=False)
+    covariance: Vector = field(compare=False)
+    observation: ThreadObservation | None = field(compare=False)
+
+
+class ClosedLoop:
+    """Runs rig, measurement, thread model and coil bridge, as the graph does, in one process and without clocks.
+
+    Args:
+        setup: what the nodes believe.
+        rig: the simulated rig, which may differ from that.
+        controller: commands the needle from each pose.
+        seed: of noise and lost frames.
+        camera: whether frames are rendered and tracked; else the tracker's noise is added to the truth.
+        losses: share of the frames that get lost, 0 to 1.
+        coil_gains: by which the coils are stronger than the bridge believes, shape (m,); all 1 if None.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        rig: Rig,
+        controller: Controller,
+        seed: int = 0,
+        *,
+        camera: bool = False,
+        losses: float = 0.0,
+        coil_gains: Vector | None = None,
+    ) -> None:
+        self.setup, self.rig, self._controller = setup, rig, controller
+        self._random = np.random.default_rng([seed, 1])
+        self._losses = losses
+        self._gains = np.ones(len(rig.currents)) if coil_gains is None else coil_gains
+        latch = ArmingLatch()
+        self.bridge = CoilBridge(setup.coils, latch, setup.scene)
+        self._driver = DriverState(True)
+        latch.activate()
+        self.bridge.arm(self._driver)
+        self.session = ThreadSession(setup.model, setup.scene)
+        self._tracker = TrackerSession(setup.vision, setup.scene) if camera else None
+        self.now = START
+        self._period = 1.0 / setup.coils.rate
+        self._frame_period = 1.0 / setup.rig.frame_rate
+        self._next_frame = START
+        self._waiting: list[_Measurement] = []
+        self._count = 0
+        self._condition = ThreadCondition(problem="no thread yet")
+        self._commanded = np.zeros(2)
+        self._reason = ""
+
+    def step(self) -> LoopFrame | None:
+        """Go on by a period of the bridge; return the frame if one was taken.
+
+        Raises:
+            SolverError: the rig's mechanics find no next state.
+        """
+        frame = None
+        if self.now >= self._next_frame - 1e-9:
+            self._next_frame += self._frame_period
+            frame = self._look()
+        else:
+            self.rig.advance(self.now - START)
+        while self._waiting and self._waiting[0].due <= self.now + 1e-9:
+            self._measured(heapq.heappop(self._waiting))
+        output = self.bridge.step(self.now, self.now, self._driver)
+        self._reason = output.reason
+        self.rig.apply(self._gains * output.allocation.currents, self.now - START)
+        self.now += self._period
+        return frame
+
+    def _look(self) -> LoopFrame:
+        frame = self.rig.look(self.now - START, rendered=self._tracker is not None)
+        lost = self._random.uniform() < self._losses
+        measured = None if lost else self._measure(frame)
+        if measured is not None:
+            heapq.heappush(self._waiting, measured)
+        return LoopFrame(
+            self.now - START,
+            frame.tail.copy(),
+            frame.heading,
+            frame.thread.copy(),
+            float(self.rig.tension.max(initial=0.0)),
+            self._condition,
+            self._commanded,
+            self._reason,
+        )
+
+    def _measure(self, frame: Any) -> _Measurement | None:
+        due = self.now + LATENCY
+        if self._tracker is not None:
+            if frame.image is None:
+                return None
+            track = self._tracker.on_image(self.now, frame.image).track
+            if not len(track.tail) or len(track.heading) == 0:
+                return None
+            observation = track.observation
+            return _Measurement(due, self.now, track.tail, track.heading, track.covariance, observation)
+        tail = frame.tail + TAIL_DEVIATION * self._random.standard_normal(2)
+        angle = frame.heading + HEADING_DEVIATION * self._random.standard_normal()
+        covariance = np.diag([TAIL_DEVIATION**2, TAIL_DEVIATION**2, HEADING_DEVIATION**2])
+        heading = np.array([math.cos(angle), math.sin(angle)])
+        return _Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
+
+    def _observe(self, thread: Points) -> ThreadObservation:
+        """Return the thread with the noise of a tracked centreline: alike over `THREAD_CORRELATION`."""
+        length = float(arc_lengths(thread)[-1])
+        at = np.linspace(0.0, length, THREAD_POINTS)
+        points = points_at(thread, at)
+        knots = np.arange(0.0, length + THREAD_CORRELATION, THREAD_CORRELATION)
+        noise = np.column_stack([np.interp(at, knots, self._random.standard_normal(len(knots))) for _ in range(2)])
+        piece = ThreadPiece(
+            points + THREAD_DEVIATION * noise,
+            np.full(len(points), THREAD_DEVIATION),
+            PieceEnd.TAIL,
+            PieceEnd.FREE,
+            (0.0, 0.0),
+        )
+        return ThreadObservation((piece,), complete=True)
+
+    def _measured(self, measured: _Measurement) -> None:
+        """Hand a measurement to bridge, thread model and controller, in the order of the graph."""
+        self._count += 1
+        stamp, now = measured.stamp, self.now
+        try:
+            self.bridge.extrapolator.update(
+                measured.tail, measured.heading, stamp, self._count, now, now, measured.covariance
+            )
+        except InvalidInputError:
+            return  # as the node does, which reports it
+        nanoseconds = round(1e9 * stamp)
+        if measured.observation is not None:
+            list(self.session.on_observation(nanoseconds, measured.observation))
+        deviation = tuple(np.sqrt(np.maximum(0.0, np.diag(measured.covariance)[[0, 2]])).tolist())
+        pose = NeedlePose(1e-9 * nanoseconds, measured.tail, measured.heading, deviation)
+        result = self.session.on_pose(nanoseconds, pose)
+        self.session.late_estimates()
+        margins = result.margins
+        self.bridge.on_margins(
+            stamp, margins is not None, margins.friction.slowdown if margins else 1.0, result.scene_version, now
+        )
+        self._condition = condition_of(result)
+        self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
+        self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
+
+
+def condition_of(result: PredictionResult) -> ThreadCondition:
+    """Return what a prediction and an estimate say of the thread's condition."""
+    thread = result.estimate or result.prediction
+    if thread is None:
+        return ThreadCondition(problem=result.reason)
+    margins, problem = result.margins, ""
+    if margins is None:
+        problem = result.reason
+    estimate = result.estimate
+    if estimate is not None and estimate.unmeasured_for > UNMEASURED:
+        problem = f"the thread has not been measured for {estimate.unmeasured_for:.1f} s"
+    forces = result.prediction.forces if result.prediction is not None else None
+    return ThreadCondition(
+        thread.positions,
+        forces.peak_tension if forces is not None else 0.0,
+        len(margins.friction.nodes) if margins is not None else 0,
+        problem,
+    )
+
+
+def varied(setup: Setup, **rig: Any) -> Setup:
+    """Return a setup with other settings of the rig."""
+    return replace(setup, rig=replace(setup.rig, **rig)).with_scene(setup.scene)

@@ -1,0 +1,1 @@
+"""Autonomous procedures: goals, paths of the needle's body, and their execution."""

@@ -1,0 +1,273 @@
+"""Runs a procedure: plans each goal, tracks its path, and notices when the needle does not get on."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.planning.path import BodyPath
+from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
+from magnetosuture_thread.planning.procedure import Procedure, Tighten, Wrap
+from magnetosuture_thread.planning.tracking import PathTracker
+
+Vector = NDArray[np.float64]
+
+REST_TIME = 1.0  # s; a needle that is commanded and has not moved for this long rests
+REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
+BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
+MAX_REPLANS = 6  # of one goal, after which it is given up
+OFF_PATH = 8e-4  # m; an error beyond which a new path is planned
+WRAPPED = 0.02  # rad; of a wrap may be left
+TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
+
+
+class ProcedureState(Enum):
+    """What a procedure does now."""
+
+    READY = "ready"
+    RUNNING = "running"
+    PAUSED = "paused"
+    DONE = "done"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class ThreadCondition:
+    """What is known of the thread, for the limits of a procedure and for goals about it.
+
+    Attributes:
+        vertices: of the estimated thread, the tail first, shape (n + 1, 2) [m]; None if unknown.
+        tension: its peak by the model [N]; 0 if unknown.
+        friction_nodes: how many nodes are under friction.
+        problem: why it is not known well enough to go on; empty if it is.
+    """
+
+    vertices: Points | None = None
+    tension: float = 0.0
+    friction_nodes: int = 0
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class ProcedureOutput:
+    """What comes of one needle pose.
+
+    Attributes:
+        velocity: commanded velocity of the tip, shape (2,) [m/s].
+        state: of the procedure.
+        goal: index of the goal.
+        progress: completed share of the goal's path, 0 to 1.
+        reason: why it is paused or has failed; empty else.
+    """
+
+    velocity: Vector
+    state: ProcedureState
+    goal: int
+    progress: float
+    reason: str = ""
+
+
+@dataclass
+class _Rest:
+    """The last poses of a needle that is commanded."""
+
+    poses: deque[tuple[float, float, float, float]] = field(default_factory=deque)
+
+    def update(self, stamp: float, pivot: Vector, angle: float, lever: float, commanded: bool) -> bool:
+        """Return whether the needle has rested for `REST_TIME`, while it was commanded."""
+        if not commanded:
+            self.poses.clear()
+            return False
+        self.poses.append((stamp, float(pivot[0]), float(pivot[1]), lever * angle))
+        while len(self.poses) > 2 and self.poses[1][0] <= stamp - REST_TIME:
+            self.poses.popleft()
+        first = self.poses[0]
+        if stamp - first[0] < REST_TIME:
+            return False
+        return all(math.dist(first[1:], each[1:]) < REST_WAY for each in self.poses)
+
+
+class ProcedureExecutor:
+    """Takes the needle through the goals of a procedure.
+
+    A goal's path is planned when its turn comes, from where the needle is then. A needle that rests for `REST_TIME` while
+    it is commanded backs off, and its goal is planned anew; one that is off its path by more than `OFF_PATH` too. After
+    `MAX_REPLANS` the goal is given up, and the needle is at rest.
+
+    Pure: time comes in with the poses.
+
+    Args:
+        procedure: what to do.
+        planner: of paths in the scene.
+    """
+
+    def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
+        self.procedure, self.planner = procedure, planner
+        self.state, self.reason, self.goal = ProcedureState.READY, "", 0
+        self.path: BodyPath | None = None
+        self._tracker: PathTracker | None = None
+        self._begin: Vector | None = None
+        self._rest = _Rest()
+        self._replans = 0
+        self._back_off_until = -math.inf
+        self._back_off = np.zeros(2)
+        self._swept = 0.0  # of the goal's wrap, so far [rad]
+        self._bearing: float | None = None
+        self._speed = math.inf
+        self._unwrapped: float | None = None
+
+    def plan(self, tail: Vector, heading: Vector) -> tuple[BodyPath, ...]:
+        """Return paths for all goals, from a pose of the needle, without beginning.
+
+        Raises:
+            ConfigurationError: see `NeedlePlanner.check`.
+            PlanningError: there is no way to a goal.
+        """
+        pivot, angle = self._pose(tail, heading)
+        return self.planner.plan_all(self.procedure, pivot, angle)
+
+    def start(self) -> None:
+        """Begin, or go on after a pause; the goal's path is planned anew with the next pose."""
+        if self.state in (ProcedureState.READY, ProcedureState.PAUSED):
+            self.state, self.reason, self._tracker = ProcedureState.RUNNING, "", None
+            self._rest = _Rest()
+
+    def pause(self, reason: str) -> None:
+        """Rest until `start` is called again."""
+        if self.state is ProcedureState.RUNNING:
+            self.state, self.reason = ProcedureState.PAUSED, reason
+
+    def abort(self, reason: str) -> None:
+        """Rest for good."""
+        if self.state not in (ProcedureState.DONE, ProcedureState.FAILED):
+            self.state, self.reason = ProcedureState.FAILED, reason
+
+    def set_planner(self, planner: NeedlePlanner) -> None:
+        """Plan in another scene from now on; a procedure that does not fit it fails."""
+        self.planner, self._tracker = planner, None
+        try:
+            planner.check(self.procedure)
+        except MagnetosutureError as error:
+            self.abort(str(error))
+
+    def update(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> ProcedureOutput:
+        """Return the command for a needle pose.
+
+        Args:
+            stamp: of the pose [s].
+            tail: shape (2,) [m].
+            heading: unit vector at the tail, shape (2,).
+            thread: what is known of it now.
+        """
+        pivot, angle = self._pose(tail, heading)
+        if self._begin is None:
+            self._begin = pivot + self.planner.ahead_of_pivot * np.array([math.cos(angle), math.sin(angle)])
+        if self.state is ProcedureState.RUNNING and thread.problem:
+            self.pause(thread.problem)
+        if self.state is not ProcedureState.RUNNING:
+            self._rest = _Rest()
+            return self._output(np.zeros(2))
+        self._sweep(pivot)
+        if stamp < self._back_off_until:
+            return self._output(self._back_off)
+        try:
+            return self._pursue(stamp, pivot, angle, thread)
+        except PlanningError as error:
+            self.abort(str(error))
+            return self._output(np.zeros(2))
+
+    def _pursue(self, stamp: float, pivot: Vector, angle: float, thread: ThreadCondition) -> ProcedureOutput:
+        goal = self.procedure.goals[self.goal]
+        if isinstance(goal, Wrap) and abs(goal.swept) - self._swept * math.copysign(1.0, goal.swept) < WRAPPED:
+            return self._next_goal(np.zeros(2))
+        if self._tracker is None:
+            self._plan(pivot, angle)
+        assert self._tracker is not None
+        if isinstance(goal, Tighten) and self._is_tight(goal, thread):
+            return self._next_goal(np.zeros(2))
+        command = self._tracker.compute_command(stamp, pivot, angle, self._allowed_speed(thread))
+        self.dbg=getattr(self._tracker,'dbg',None)
+        if command.done:
+            if isinstance(goal, Tighten):
+                self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
+                return self._output(np.zeros(2))
+            return self._next_goal(np.zeros(2))
+        rests = self._rest.update(stamp, pivot, angle, self.planner.lever, bool(command.velocity.any()))
+        if rests or command.error > max(OFF_PATH, 2.0 * self._tracker.room):
+            return self._replan(stamp, command.velocity if rests else np.zeros(2))
+        return self._output(command.velocity)
+
+    def _plan(self, pivot: Vector, angle: float) -> None:
+        goal, limits = self.procedure.goals[self.goal], self.procedure.limits[self.goal]
+        assert self._begin is not None
+        left = goal.swept - self._swept if isinstance(goal, Wrap) else None
+        self.path = self.planner.plan(goal, limits, pivot, angle, self._begin, left)
+        self._tracker = PathTracker(self.path, self.planner.turning)
+
+    def _replan(self, stamp: float, stopped: Vector) -> ProcedureOutput:
+        """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
+        self._replans += 1
+        if self._replans > MAX_REPLANS:
+            self.abort(f"goal {self.goal + 1} is given up: the needle rests however it is planned")
+            return self._output(np.zeros(2))
+        self._tracker, self._rest = None, _Rest()
+        if stopped.any():
+            self._back_off, self._back_off_until = -stopped, stamp + BACK_OFF_TIME
+        return self._output(np.zeros(2))
+
+    def _next_goal(self, velocity: Vector) -> ProcedureOutput:
+        self._tracker, self._rest, self._replans = None, _Rest(), 0
+        self._swept, self._bearing = 0.0, None
+        if self.goal + 1 == len(self.procedure.goals):
+            self.state = ProcedureState.DONE
+            return ProcedureOutput(np.zeros(2), self.state, self.goal, 1.0)
+        self.goal += 1
+        return self._output(velocity)
+
+    def _allowed_speed(self, thread: ThreadCondition) -> float:
+        """Return the speed at which tension and friction stay within the goal's limits [m/s]."""
+        limits = self.procedure.limits[self.goal]
+        if thread.tension > TENSION_SHARE * limits.tension:
+            self._speed = max(0.0, self._speed * TENSION_SHARE * limits.tension / thread.tension)
+        self._speed = min(limits.speed, max(self._speed * 1.03, 0.02 * limits.speed))
+        crowded = thread.friction_nodes - limits.friction_nodes
+        return self._speed if crowded < 0 or limits.friction_nodes >= 10_000 else 0.3 * self._speed
+
+    def _is_tight(self, goal: Tighten, thread: ThreadCondition) -> bool:
+        if goal.tension > 0.0 and thread.tension < goal.tension:
+            return False
+        if goal.clearance > 0.0:
+            if thread.vertices is None:
+                return False
+            return self.planner.thread_clearance(goal.around, thread.vertices) <= goal.clearance
+        return True
+
+    def _sweep(self, pivot: Vector) -> None:
+        """Add up the angle that the needle sweeps about the shape of a wrap."""
+        goal = self.procedure.goals[self.goal]
+        if not isinstance(goal, Wrap):
+            return
+        bearing = self.planner.bearing(goal.around, pivot)
+        if self._bearing is not None:
+            self._swept += math.remainder(bearing - self._bearing, 2.0 * math.pi)
+        self._bearing = bearing
+
+    def _pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
+        pivot, angle = self.planner.pose(tail, heading)
+        if self._unwrapped is not None:
+            angle = self._unwrapped + math.remainder(angle - self._unwrapped, 2.0 * math.pi)
+        self._unwrapped = angle
+        return pivot, angle
+
+    def _output(self, velocity: Vector) -> ProcedureOutput:
+        progress = 0.0
+        if self._tracker is not None and self.path is not None and self.path.length > 0.0:
+            progress = min(1.0, self._tracker.travel / self.path.length)
+        return ProcedureOutput(velocity, self.state, self.goal, progress, self.reason)

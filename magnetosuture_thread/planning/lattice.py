@@ -1,0 +1,180 @@
+"""The shortest way of the needle's body through a scene: A* over a lattice of its positions and headings.
+
+The needle is driven along its chord and turned about a point of it, its pivot, so a way is a sequence of straight
+drives, ahead or back, and of turns on the spot. The lattice has the pivots on a square grid and 32 directions to other
+points of it. Where a way is to lead around a shape, the angle swept about that shape is a further coordinate.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.planning.clearance_map import ClearanceMap, body_clearance
+
+STRIDE = 2  # of the clearance map's grid between two points of the lattice
+REVERSE_COST = 1.5  # of a way driven back, in that of the same way ahead
+NEAR_COST = 4.0  # of a way at the required clearance, more than at the preferred one
+_QUARTER = np.array([(1, 0), (3, 1), (2, 1), (3, 2), (1, 1), (2, 3), (1, 2), (1, 3)])
+_TURNS = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))
+MOVES = np.concatenate([_QUARTER @ np.array(turn).T for turn in _TURNS])
+"""Points ahead for each direction, counterclockwise from the x axis, shape (32, 2)."""
+DIRECTIONS = np.unwrap(np.arctan2(MOVES[:, 1], MOVES[:, 0]))
+"""Their angles, rising from 0, shape (32,) [rad]."""
+
+
+class LatticeGoal(NamedTuple):
+    """Where a way may end.
+
+    Attributes:
+        places: at which points of the lattice the middle of the needle may be, shape (m, m), rows along y.
+        headings: which of the directions, shape (32,).
+        swept: angle that must have been swept about `centre`, positive counterclockwise [rad]; 0 for any.
+        centre: of the shape that the way leads around, shape (2,) [m].
+        target: a place that the goal is near, for the heuristic; NaN where there is none, shape (2,) [m].
+    """
+
+    places: NDArray[np.bool_]
+    headings: NDArray[np.bool_]
+    swept: float
+    centre: NDArray[np.float64]
+    target: NDArray[np.float64]
+
+
+@compiled
+def search_lattice(
+    start: NDArray[np.int64],
+    body: Points,
+    lever: float,
+    ahead_of_pivot: float,
+    required: float,
+    preferred: float,
+    goal: LatticeGoal,
+    near: ClearanceMap,
+    moves: NDArray[np.int64],
+    directions: NDArray[np.float64],
+    most: int,
+) -> NDArray[np.float64]:
+    """Return the cheapest way from a point of the lattice to the goal: x, y and direction of each state.
+
+    The cost is the way of the tip, times `NEAR_COST` where the body is as close as it may be, falling to 1 where it is
+    at the preferred clearance.
+
+    Args:
+        start: column, row and direction, shape (3,).
+        body: points of the needle's axis, see `body_clearance`.
+        lever: from the pivot to the tip [m].
+        ahead_of_pivot: from the pivot to the middle of the needle [m].
+        required: clearance of the body [m].
+        preferred: clearance beyond which more is not worth a longer way [m].
+        goal: where the way may end.
+        near: distances from wall and shapes.
+        moves: `MOVES`.
+        directions: `DIRECTIONS`.
+        most: states to look at.
+
+    Returns:
+        Shape (k, 4): x, y [m], direction [rad], and swept angle [rad]; empty where there is no way, or none was found
+        within `most` states.
+    """
+    count, size, step = len(directions), len(goal.places), STRIDE * near.step
+    sheets = int(math.ceil(abs(goal.swept) / (2.0 * math.pi))) + 2 if goal.swept != 0.0 else 1
+    cells = size * size * count
+    cost = np.full(cells * sheets, np.inf, np.float32)
+    parent = np.full(cells * sheets, -1, np.int32)
+    done = np.zeros(cells * sheets, np.bool_)
+    clear = np.full(cells, np.nan, np.float32)
+    sense = 1.0 if goal.swept >= 0.0 else -1.0
+    guided = not math.isnan(goal.target[0])
+
+    x0, y0 = near.origin + step * start[0], near.origin + step * start[1]
+    begin = math.atan2(y0 - goal.centre[1], x0 - goal.centre[0])
+    first = (start[1] * size + start[0]) * count + start[2] + (cells if sheets > 1 else 0)
+    cost[first] = 0.0
+    heap = [(0.0, first)]
+    looked, last = 0, -1
+    while len(heap) > 0 and looked < most:
+        _, state = heapq.heappop(heap)
+        if done[state]:
+            continue
+        done[state] = True
+        looked += 1
+        sheet, cell = state // cells, state % cells
+        direction, place = cell % count, cell // count
+        i, j = place % size, place // size
+        x, y = near.origin + step * i, near.origin + step * j
+        angle = math.atan2(y - goal.centre[1], x - goal.centre[0])
+        ahead = (sense * (angle - begin)) % (2.0 * math.pi)  # of the start, on sheet 0 from 0 to 2 pi
+        mi = int(round((x + ahead_of_pivot * math.cos(directions[direction]) - near.origin) / step))
+        mj = int(round((y + ahead_of_pivot * math.sin(directions[direction]) - near.origin) / step))
+        inside = 0 <= mi < size and 0 <= mj < size
+        if inside and goal.places[mj, mi] and goal.headings[direction]:
+            swept = ahead + 2.0 * math.pi * (sheet - 1 if sheets > 1 else 0)
+            if goal.swept == 0.0 or swept >= abs(goal.swept) - 1e-9:
+                last = state
+                break
+        for choice in range(4):
+            ni, nj, nd, nsheet = i, j, direction, sheet
+            if choice < 2:
+                sign = 1 if choice == 0 else -1
+                ni, nj = i + sign * moves[direction, 0], j + sign * moves[direction, 1]
+                if ni < 0 or nj < 0 or ni >= size or nj >= size:
+                    continue
+                length = step * math.hypot(float(moves[direction, 0]), float(moves[direction, 1]))
+                length *= 1.0 if choice == 0 else REVERSE_COST
+            else:
+                nd = (direction + (1 if choice == 2 else count - 1)) % count
+                turn = abs(directions[nd] - directions[direction])
+                length = lever * min(turn, 2.0 * math.pi - turn)
+            nx, ny = near.origin + step * ni, near.origin + step * nj
+            key = (nj * size + ni) * count + nd
+            if math.isnan(clear[key]):
+                clear[key] = body_clearance(nx, ny, directions[nd], body, near)
+            room = clear[key]
+            if room < required:
+                continue
+            if choice < 2:
+                room = min(room, body_clearance(0.5 * (x + nx), 0.5 * (y + ny), directions[nd], body, near))
+                if room < required:
+                    continue
+            if sheets > 1 and choice < 2:
+                there = math.atan2(ny - goal.centre[1], nx - goal.centre[0])
+                way = (there - angle + math.pi) % (2.0 * math.pi) - math.pi
+                later = (sense * (there - begin)) % (2.0 * math.pi)
+                turns = (ahead + sense * way - later) / (2.0 * math.pi)
+                nsheet = sheet + int(round(turns))
+                if nsheet < 0 or nsheet >= sheets:
+                    continue
+            share = min(1.0, max(0.0, (preferred - room) / max(preferred - required, 1e-12)))
+            onward = cost[state] + length * (1.0 + (NEAR_COST - 1.0) * share)
+            following = nsheet * cells + key
+            if onward < cost[following]:
+                cost[following] = onward
+                parent[following] = state
+                rest = math.hypot(nx - goal.target[0], ny - goal.target[1]) if guided else 0.0
+                heapq.heappush(heap, (float(onward) + rest, following))
+    if last < 0:
+        return np.empty((0, 4))
+    steps = 1
+    state = last
+    while parent[state] >= 0:
+        state = parent[state]
+        steps += 1
+    path = np.empty((steps, 4))
+    state = last
+    for k in range(steps - 1, -1, -1):
+        sheet, cell = state // cells, state % cells
+        place = cell // count
+        path[k, 0] = near.origin + step * (place % size)
+        path[k, 1] = near.origin + step * (place // size)
+        path[k, 2] = directions[cell % count]
+        angle = math.atan2(path[k, 1] - goal.centre[1], path[k, 0] - goal.centre[0])
+        path[k, 3] = sense * ((sense * (angle - begin)) % (2.0 * math.pi)) + sense * 2.0 * math.pi * (sheet - 1)
+        state = parent[state]
+    return path

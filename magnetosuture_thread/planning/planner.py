@@ -1,0 +1,287 @@
+"""From goals to paths: what a goal asks of the needle's pose, and the way there through the scene."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.geometry.needle_arc import needle_points
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.planning.clearance_map import CELLS, body_clearance, map_clearance
+from magnetosuture_thread.planning.lattice import DIRECTIONS, MOVES, STRIDE, LatticeGoal, search_lattice
+from magnetosuture_thread.planning.path import BodyPath, smooth_path
+from magnetosuture_thread.planning.procedure import Goal, GoTo, PassThrough, Procedure, ProcedureLimits, Tighten, Withdraw, Wrap
+from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.scene import Scene
+
+Vector = NDArray[np.float64]
+
+MARGINS = (1e-4, 3e-5, 5e-6)  # m; kept beyond the required clearance for errors of control, the widest that there is room for
+PREFERRED = 3e-4  # m; beyond the required clearance, more is not worth a longer way
+PIVOT = 0.45  # of half the chord; so far behind the middle the needle turns, as the thread holds its tail
+MAX_STATES = 20_000_000
+HEADING_TOLERANCE = 0.3  # rad
+GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
+GAP_WIDTH_RATIO = 1.03  # of a gap's narrowest place, up to which it is one gap
+
+
+class PlanningError(MagnetosutureError):
+    """There is no way to a goal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gap:
+    """The narrowest place between two shapes.
+
+    Attributes:
+        centre: midway between them, shape (2,) [m].
+        along: unit vector that it is passed along, shape (2,).
+        width: between the shapes [m].
+    """
+
+    centre: Vector
+    along: Vector
+    width: float
+
+
+class NeedlePlanner:
+    """Plans paths of the needle's body through a scene.
+
+    Args:
+        scene: dish and shapes.
+        needle: its kinematics.
+        keep_out: least distance of the needle's axis from wall and shapes [m].
+        thread_length: of the thread behind it [m].
+    """
+
+    def __init__(self, scene: Scene, needle: NeedleKinematics, keep_out: float, thread_length: float) -> None:
+        self.scene, self.needle = scene, needle
+        self._keep_out, self._thread_length = keep_out, thread_length
+        self.near = map_clearance(scene)
+        self.turning = 0.5 * needle.chord
+        self.ahead_of_pivot = PIVOT * self.turning
+        self.lever = self.turning + self.ahead_of_pivot
+        # Points a step of the grid apart, in the frame of the pivot.
+        axis = needle_points(needle.length, needle.curvature, self.near.step).points
+        along = needle.chord_direction(np.array([1.0, 0.0]))
+        turn = np.array([[along[0], along[1]], [-along[1], along[0]]])
+        self.body = np.ascontiguousarray((axis - (self.turning - self.ahead_of_pivot) * along) @ turn.T)
+        self._step = STRIDE * self.near.step
+        self._size = CELLS // STRIDE + 1
+
+    def pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
+        """Return pivot, shape (2,) [m], and angle of the chord [rad] of a needle with this tail and heading."""
+        along = self.needle.chord_direction(heading)
+        return tail + (self.turning - self.ahead_of_pivot) * along, math.atan2(float(along[1]), float(along[0]))
+
+    def check(self, procedure: Procedure) -> None:
+        """Refuse what can be seen to be impossible without planning.
+
+        Raises:
+            ConfigurationError: a name is not of the scene, a place is not free, a gap is too narrow, or the thread is
+                too short.
+        """
+        for index, (goal, limits) in enumerate(zip(procedure.goals, procedure.limits, strict=True)):
+            where, required = f"goals[{index}].{goal.GROUP}", max(self._keep_out, limits.clearance)
+            if isinstance(goal, PassThrough):
+                for name in goal.between:
+                    self._check_name(f"{where}.between", name)
+                gaps = self.gaps(goal)
+                if not gaps:
+                    raise ConfigurationError(f"{where}.direction", list(goal.direction), "one along a gap between them")
+                width = max(gap.width for gap in gaps)
+                if width <= 2.0 * required:
+                    expected = f"a gap wider than {2e3 * required:.3g} mm, twice the needle's clearance"
+                    raise ConfigurationError(f"{where}.between", f"a gap of {1e3 * width:.3g} mm", expected)
+            elif isinstance(goal, Wrap):
+                self._check_name(f"{where}.around", goal.around)
+                needed = goal.angle / (2.0 * math.pi) * self._girth(goal.around)
+                if needed > self._thread_length:
+                    expected = f"an angle for which {1e3 * self._thread_length:.3g} mm of thread are enough"
+                    raise ConfigurationError(f"{where}.angle", goal.angle, expected)
+            elif isinstance(goal, Tighten):
+                if goal.around:
+                    self._check_name(f"{where}.around", goal.around)
+                self._check_place(f"{where}.toward", goal.toward, required)
+            elif isinstance(goal, GoTo):
+                self._check_place(f"{where}.position", goal.position, required)
+            elif goal.to:
+                self._check_place(f"{where}.to", goal.to, required)
+
+    def plan(
+        self, goal: Goal, limits: ProcedureLimits, pivot: Vector, angle: float, start: Vector, swept: float | None = None
+    ) -> BodyPath:
+        """Return a path from a pose to a goal.
+
+        Args:
+            goal: to reach.
+            limits: on the way.
+            pivot: of the needle, shape (2,) [m]; see `pose`.
+            angle: of the chord [rad].
+            start: where the procedure began, shape (2,) [m].
+            swept: what is left to sweep of a wrap [rad]; all of it if None.
+
+        Raises:
+            PlanningError: there is no way.
+        """
+        target = self._lattice_goal(goal, start, swept)
+        required = max(self._keep_out, limits.clearance)
+        for margin in MARGINS:
+            path = self._path(target, required, margin, pivot, angle)
+            if path is not None:
+                return path
+        raise PlanningError(f"no way for the needle to {goal.GROUP} from {1e3 * pivot[0]:.1f}, {1e3 * pivot[1]:.1f} mm")
+
+    def plan_all(self, procedure: Procedure, pivot: Vector, angle: float) -> tuple[BodyPath, ...]:
+        """Return a path for each goal, each from where the one before ends.
+
+        Raises:
+            ConfigurationError: see `check`.
+            PlanningError: there is no way to a goal.
+        """
+        self.check(procedure)
+        start, paths = pivot + self.ahead_of_pivot * np.array([math.cos(angle), math.sin(angle)]), []
+        for goal, limits in zip(procedure.goals, procedure.limits, strict=True):
+            paths.append(self.plan(goal, limits, pivot, angle, start))
+            pivot, angle = paths[-1].pivots[-1], float(paths[-1].angles[-1])
+        return tuple(paths)
+
+    def gaps(self, goal: PassThrough) -> list[Gap]:
+        """Return the gaps between the two shapes that are passed along the goal's direction."""
+        first, second = (map_clearance(self.scene, (name,)).distance for name in goal.between)
+        width, step = first + second, self.near.step
+        midway = (np.abs(first - second) <= 1.5 * step) & (self.near.distance >= 0.45 * width)
+        if not midway.any():
+            return []
+        narrow = midway & (width <= ndimage.minimum_filter(np.where(midway, width, np.inf), 9) * GAP_WIDTH_RATIO)
+        labels, count = ndimage.label(narrow, np.ones((3, 3)))
+        wanted = np.array(goal.direction) / math.hypot(*goal.direction)
+        slope_y, slope_x = np.gradient(first - second)
+        found = []
+        for label in range(1, count + 1):
+            rows, columns = np.nonzero(labels == label)
+            narrowest = float(width[rows, columns].min())
+            across = np.array([slope_x[rows, columns].mean(), slope_y[rows, columns].mean()])
+            if not (size := math.hypot(*across)) > 0.0:
+                continue
+            along = np.array([-across[1], across[0]]) / size
+            along *= math.copysign(1.0, float(along @ wanted))
+            # The middle of the gap along its direction, on the line midway between the shapes.
+            points = self.near.origin + step * np.column_stack([columns, rows])
+            centre = points.mean(axis=0)
+            if along @ wanted >= 0.5:
+                found.append(Gap(centre, along, narrowest))
+        if not found:
+            return []
+        least = min(gap.width for gap in found)
+        return [gap for gap in found if gap.width <= 2.0 * least]
+
+    def thread_clearance(self, name: str, thread: Points) -> float:
+        """Return the greatest distance from a shape of the part of a thread that sweeps the most about it [m]."""
+        geometry, centre = self._geometry(name), self._centre(name)
+        turns = np.unwrap(np.arctan2(*(thread - centre).T[::-1]))
+        sense = math.copysign(1.0, turns[-1] - turns[0])
+        # The part between the least and the greatest angle.
+        first, last = sorted((int(np.argmin(sense * turns)), int(np.argmax(sense * turns))))
+        line = shapely.points(thread[first : last + 1])
+        return float(np.max(shapely.distance(geometry, line)))
+
+    def bearing(self, name: str, point: Vector) -> float:
+        """Return the direction of a point from the centre of a shape [rad]."""
+        x, y = point - self._centre(name)
+        return math.atan2(float(y), float(x))
+
+    def swept_by(self, name: str, points: Points) -> float:
+        """Return the angle that a polyline sweeps about a shape from its first point to its last [rad]."""
+        turns = np.unwrap(np.arctan2(*(points - self._centre(name)).T[::-1]))
+        return float(turns[-1] - turns[0])
+
+    def _path(self, goal: LatticeGoal, required: float, margin: float, pivot: Vector, angle: float) -> BodyPath | None:
+        kept = required + margin
+        start = self._nearest_free(pivot, angle, kept)
+        if start is None:
+            return None
+        states = search_lattice(
+            start, self.body, self.lever, self.ahead_of_pivot, kept, kept + PREFERRED, goal, self.near, MOVES, DIRECTIONS, MAX_STATES
+        )
+        if not len(states):
+            return None
+        # It begins where the needle is, which may be closer than what is required from then on.
+        begin = np.array([[*pivot, states[0, 2] + _turn(angle - states[0, 2])]])
+        return smooth_path(np.vstack([begin, states[:, :3]]), self.lever, self.body, required, margin, self.near)
+
+    def _nearest_free(self, pivot: Vector, angle: float, required: float) -> NDArray[np.int64] | None:
+        """Return the free state of the lattice that is nearest to a pose; None where none is near."""
+        column, row = np.rint((pivot - self.near.origin) / self._step).astype(int)
+        best, found = np.inf, None
+        for j in range(max(0, row - 4), min(self._size, row + 5)):
+            for i in range(max(0, column - 4), min(self._size, column + 5)):
+                x, y = self.near.origin + self._step * np.array([i, j])
+                for k, direction in enumerate(DIRECTIONS):
+                    off = math.hypot(x - pivot[0], y - pivot[1]) + self.lever * abs(_turn(direction - angle))
+                    if off < best and body_clearance(x, y, direction, self.body, self.near) >= required:
+                        best, found = off, np.array([i, j, k])
+        return found
+
+    def _lattice_goal(self, goal: Goal, start: Vector, swept: float | None) -> LatticeGoal:
+        everywhere, nowhere = np.ones((self._size, self._size), bool), np.full(2, np.nan)
+        any_heading = np.ones(len(DIRECTIONS), bool)
+        if isinstance(goal, Wrap):
+            wanted = goal.swept if swept is None else swept
+            return LatticeGoal(everywhere, any_heading, wanted, self._centre(goal.around), nowhere)
+        at = self.near.origin + self._step * np.arange(self._size)
+        x, y = np.meshgrid(at, at)
+        if isinstance(goal, PassThrough):
+            places, headings = np.zeros_like(everywhere), np.zeros(len(DIRECTIONS), bool)
+            for gap in self.gaps(goal):
+                dx, dy = x - gap.centre[0], y - gap.centre[1]
+                ahead, aside = dx * gap.along[0] + dy * gap.along[1], dy * gap.along[0] - dx * gap.along[1]
+                places |= (ahead >= 0.0) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * gap.width)
+                off = np.abs(_turn(DIRECTIONS - math.atan2(gap.along[1], gap.along[0])))
+                headings |= off <= GAP_HEADING
+            return LatticeGoal(places, headings, 0.0, np.zeros(2), nowhere)
+        place, tolerance, headed = start, self._step, ()
+        if isinstance(goal, GoTo):
+            place, tolerance, headed = np.array(goal.position), goal.tolerance, goal.heading
+        elif isinstance(goal, Tighten):
+            place = np.array(goal.toward)
+        else:
+            place, tolerance = np.array(goal.to) if goal.to else start, goal.tolerance
+        # At least the nearest point of the lattice.
+        places = np.hypot(x - place[0], y - place[1]) <= max(0.7 * tolerance, 0.75 * self._step)
+        headings = np.abs(_turn(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
+        return LatticeGoal(places, headings, 0.0, np.zeros(2), place)
+
+    def _check_name(self, where: str, name: str) -> None:
+        if name not in self.scene.names:
+            raise ConfigurationError(where, name, f"a shape of the scene: {', '.join(self.scene.names) or 'it has none'}")
+
+    def _check_place(self, where: str, place: tuple[float, ...], required: float) -> None:
+        x, y = place
+        if not any(body_clearance(x, y, direction, self.body, self.near) >= required for direction in DIRECTIONS):
+            expected = f"a place with {1e3 * required:.3g} mm around the needle in some direction"
+            raise ConfigurationError(where, [x, y], expected)
+
+    def _geometry(self, name: str) -> shapely.Geometry:
+        shape = next(shape for shape in self.scene.shapes if shape.name == name).geometry
+        if isinstance(shape, Disc):
+            return shapely.Point(shape.centre).buffer(shape.radius, quad_segs=64)
+        return shapely.Polygon(shape.rings[0])
+
+    def _centre(self, name: str) -> Vector:
+        return np.array(self._geometry(name).centroid.coords[0])
+
+    def _girth(self, name: str) -> float:
+        return float(self._geometry(name).convex_hull.length)
+
+
+def _turn(angle: float | Vector) -> float | Vector:
+    """Return an angle within half a turn of 0."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
