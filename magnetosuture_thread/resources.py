@@ -1,4 +1,4 @@
-"""Finds the files that ship with the packages: setups, scenes, message definitions."""
+"""Finds the files that ship with the packages: setups, scenes, procedures, message definitions."""
 
 from __future__ import annotations
 
@@ -50,6 +50,15 @@ def find_scene_file(name: str) -> Path:
         ConfigurationError: there is no such file.
     """
     return _named_file("scene", name, "config/scenes", (".yaml", ".yml", ".json", ".geojson"))
+
+
+def find_procedure_file(name: str) -> Path:
+    """Return the file of a procedure, given as a path or as the name of one that ships with the package.
+
+    Raises:
+        ConfigurationError: there is no such file.
+    """
+    return _named_file("procedure", name, "config/procedures", (".yaml", ".yml"))
 
 
 def _named_file(what: str, name: str, folder: str, endings: tuple[str, ...]) -> Path:

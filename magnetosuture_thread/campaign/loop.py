@@ -207,6 +207,10 @@ class ClosedLoop:
         self.bridge.on_margins(
             stamp, margins is not None, margins.friction.slowdown if margins else 1.0, result.scene_version, now
         )
+        forces = result.prediction.forces if result.prediction is not None else None
+        if self.bridge.feedforward is not None:
+            force = np.full(2, np.nan) if forces is None else forces.needle_force
+            self.bridge.feedforward.update(force, stamp, now)
         self._condition = condition_of(result)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
         self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
@@ -228,6 +232,7 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
         thread.positions,
         forces.peak_tension if forces is not None else 0.0,
         len(margins.friction.nodes) if margins is not None else 0,
+        margins.friction.slowdown if margins is not None else 1.0,
         problem,
     )
 

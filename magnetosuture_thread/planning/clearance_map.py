@@ -58,7 +58,7 @@ def clearance_at(x: float, y: float, near: ClearanceMap) -> float:
     """Return the distance at a point, interpolated between the four around it; negative outside of the grid [m]."""
     count = len(near.distance)
     u, v = (x - near.origin) / near.step, (y - near.origin) / near.step
-    i, j = int(math.floor(u)), int(math.floor(v))
+    i, j = math.floor(u), math.floor(v)
     if i < 0 or j < 0 or i >= count - 1 or j >= count - 1:
         return -1.0
     p, q = u - i, v - j
@@ -72,10 +72,10 @@ def body_clearance(x: float, y: float, angle: float, body: Points, near: Clearan
     """Return the least distance of the needle's points from wall and shapes [m].
 
     Args:
-        x: of its pivot [m].
+        x: of the middle of its chord [m].
         y: of the same [m].
         angle: of its chord against the x axis [rad].
-        body: points of the needle's axis about its pivot, the chord along x, shape (m, 2) [m].
+        body: points of the needle's axis about the middle of its chord, the chord along x, shape (m, 2) [m].
         near: the distances.
     """
     c, s = math.cos(angle), math.sin(angle)

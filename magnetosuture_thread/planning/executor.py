@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
-from magnetosuture_thread.planning.procedure import Procedure, Tighten, Wrap
+from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
+from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tighten, Withdraw, Wrap
 from magnetosuture_thread.planning.tracking import PathTracker
 
 Vector = NDArray[np.float64]
@@ -23,7 +23,7 @@ REST_TIME = 1.0  # s; a needle that is commanded and has not moved for this long
 REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
 BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
 MAX_REPLANS = 6  # of one goal, after which it is given up
-OFF_PATH = 8e-4  # m; an error beyond which a new path is planned
+OFF_PATH, MAX_OFF_PATH = 8e-4, 3e-3  # m; an error beyond which a new path is planned: more where there is room
 WRAPPED = 0.02  # rad; of a wrap may be left
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
 
@@ -46,12 +46,14 @@ class ThreadCondition:
         vertices: of the estimated thread, the tail first, shape (n + 1, 2) [m]; None if unknown.
         tension: its peak by the model [N]; 0 if unknown.
         friction_nodes: how many nodes are under friction.
+        slowdown: factor on the needle's speed by the thread's friction, which the bridge applies.
         problem: why it is not known well enough to go on; empty if it is.
     """
 
     vertices: Points | None = None
     tension: float = 0.0
     friction_nodes: int = 0
+    slowdown: float = 1.0
     problem: str = ""
 
 
@@ -80,12 +82,12 @@ class _Rest:
 
     poses: deque[tuple[float, float, float, float]] = field(default_factory=deque)
 
-    def update(self, stamp: float, pivot: Vector, angle: float, lever: float, commanded: bool) -> bool:
+    def update(self, stamp: float, middle: Vector, angle: float, lever: float, commanded: bool) -> bool:
         """Return whether the needle has rested for `REST_TIME`, while it was commanded."""
         if not commanded:
             self.poses.clear()
             return False
-        self.poses.append((stamp, float(pivot[0]), float(pivot[1]), lever * angle))
+        self.poses.append((stamp, float(middle[0]), float(middle[1]), lever * angle))
         while len(self.poses) > 2 and self.poses[1][0] <= stamp - REST_TIME:
             self.poses.popleft()
         first = self.poses[0]
@@ -97,8 +99,8 @@ class _Rest:
 class ProcedureExecutor:
     """Takes the needle through the goals of a procedure.
 
-    A goal's path is planned when its turn comes, from where the needle is then. A needle that rests for `REST_TIME` while
-    it is commanded backs off, and its goal is planned anew; one that is off its path by more than `OFF_PATH` too. After
+    A goal's path is planned when its turn comes, from where the needle is then. A needle that rests for `REST_TIME`
+    while it is commanded backs off, and its goal is planned anew; one that is off its path by more than `OFF_PATH` too. After
     `MAX_REPLANS` the goal is given up, and the needle is at rest.
 
     Pure: time comes in with the poses.
@@ -122,6 +124,13 @@ class ProcedureExecutor:
         self._bearing: float | None = None
         self._speed = math.inf
         self._unwrapped: float | None = None
+        self._reached = 0  # goals on the path
+        self._unsure = False  # paused by itself, which goes on by itself once the thread is known again
+
+    @property
+    def travel(self) -> float:
+        """Way of the tip on the present path [m]; 0 without one."""
+        return 0.0 if self._tracker is None else self._tracker.travel
 
     def plan(self, tail: Vector, heading: Vector) -> tuple[BodyPath, ...]:
         """Return paths for all goals, from a pose of the needle, without beginning.
@@ -130,22 +139,25 @@ class ProcedureExecutor:
             ConfigurationError: see `NeedlePlanner.check`.
             PlanningError: there is no way to a goal.
         """
-        pivot, angle = self._pose(tail, heading)
-        return self.planner.plan_all(self.procedure, pivot, angle)
+        middle, angle = self._pose(tail, heading)
+        return self.planner.plan_all(self.procedure, middle, angle)
 
     def start(self) -> None:
         """Begin, or go on after a pause; the goal's path is planned anew with the next pose."""
+        self._unsure = False
         if self.state in (ProcedureState.READY, ProcedureState.PAUSED):
             self.state, self.reason, self._tracker = ProcedureState.RUNNING, "", None
             self._rest = _Rest()
 
     def pause(self, reason: str) -> None:
         """Rest until `start` is called again."""
+        self._unsure = False
         if self.state is ProcedureState.RUNNING:
             self.state, self.reason = ProcedureState.PAUSED, reason
 
     def abort(self, reason: str) -> None:
         """Rest for good."""
+        self._unsure = False
         if self.state not in (ProcedureState.DONE, ProcedureState.FAILED):
             self.state, self.reason = ProcedureState.FAILED, reason
 
@@ -166,50 +178,64 @@ class ProcedureExecutor:
             heading: unit vector at the tail, shape (2,).
             thread: what is known of it now.
         """
-        pivot, angle = self._pose(tail, heading)
+        middle, angle = self._pose(tail, heading)
         if self._begin is None:
-            self._begin = pivot + self.planner.ahead_of_pivot * np.array([math.cos(angle), math.sin(angle)])
+            self._begin = middle
         if self.state is ProcedureState.RUNNING and thread.problem:
             self.pause(thread.problem)
+            self._unsure = True
+        elif self._unsure and not thread.problem:
+            self.start()
         if self.state is not ProcedureState.RUNNING:
             self._rest = _Rest()
             return self._output(np.zeros(2))
-        self._sweep(pivot)
+        self._sweep(middle)
         if stamp < self._back_off_until:
             return self._output(self._back_off)
         try:
-            return self._pursue(stamp, pivot, angle, thread)
+            return self._pursue(stamp, middle, angle, thread)
         except PlanningError as error:
             self.abort(str(error))
             return self._output(np.zeros(2))
 
-    def _pursue(self, stamp: float, pivot: Vector, angle: float, thread: ThreadCondition) -> ProcedureOutput:
+    def _pursue(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> ProcedureOutput:
         goal = self.procedure.goals[self.goal]
         if isinstance(goal, Wrap) and abs(goal.swept) - self._swept * math.copysign(1.0, goal.swept) < WRAPPED:
-            return self._next_goal(np.zeros(2))
+            return self._next_goal()
         if self._tracker is None:
-            self._plan(pivot, angle)
+            self._plan(middle, angle)
         assert self._tracker is not None
         if isinstance(goal, Tighten) and self._is_tight(goal, thread):
-            return self._next_goal(np.zeros(2))
-        command = self._tracker.compute_command(stamp, pivot, angle, self._allowed_speed(thread))
-        self.dbg=getattr(self._tracker,'dbg',None)
+            return self._next_goal()
+        command = self._tracker.compute_command(stamp, middle, angle, self._allowed_speed(thread), thread.slowdown)
         if command.done:
-            if isinstance(goal, Tighten):
-                self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
-                return self._output(np.zeros(2))
-            return self._next_goal(np.zeros(2))
-        rests = self._rest.update(stamp, pivot, angle, self.planner.lever, bool(command.velocity.any()))
-        if rests or command.error > max(OFF_PATH, 2.0 * self._tracker.room):
+            return self._at_end(stamp, goal, middle, angle)
+        assert self.path is not None
+        if command.travel >= self.path.ends[self._reached]:
+            self._begin_goal(self.goal + 1)
+            self._reached += 1
+        rests = self._rest.update(stamp, middle, angle, self.planner.lever, bool(command.velocity.any()))
+        if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.room, MAX_OFF_PATH)):
             return self._replan(stamp, command.velocity if rests else np.zeros(2))
         return self._output(command.velocity)
 
-    def _plan(self, pivot: Vector, angle: float) -> None:
-        goal, limits = self.procedure.goals[self.goal], self.procedure.limits[self.goal]
+    def _at_end(self, stamp: float, goal: Goal, middle: Vector, angle: float) -> ProcedureOutput:
+        """Go on from the end of a path: to the next goal, or anew where this one is not reached."""
+        if isinstance(goal, Tighten):
+            self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
+            return self._output(np.zeros(2))
+        if isinstance(goal, GoTo | Withdraw):
+            target = np.array(goal.position if isinstance(goal, GoTo) else goal.to or self._begin)
+            if math.dist(middle, target) > goal.tolerance:
+                return self._replan(stamp, np.zeros(2))
+        return self._next_goal()
+
+    def _plan(self, middle: Vector, angle: float) -> None:
+        goals = chain(self.procedure, self.goal)
         assert self._begin is not None
-        left = goal.swept - self._swept if isinstance(goal, Wrap) else None
-        self.path = self.planner.plan(goal, limits, pivot, angle, self._begin, left)
-        self._tracker = PathTracker(self.path, self.planner.turning)
+        left = goals[0].swept - self._swept if isinstance(goals[0], Wrap) else None
+        self.path = self.planner.plan(goals, self.procedure.limits[self.goal], middle, angle, self._begin, left)
+        self._tracker, self._reached = PathTracker(self.path), 0
 
     def _replan(self, stamp: float, stopped: Vector) -> ProcedureOutput:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
@@ -222,14 +248,18 @@ class ProcedureExecutor:
             self._back_off, self._back_off_until = -stopped, stamp + BACK_OFF_TIME
         return self._output(np.zeros(2))
 
-    def _next_goal(self, velocity: Vector) -> ProcedureOutput:
-        self._tracker, self._rest, self._replans = None, _Rest(), 0
-        self._swept, self._bearing = 0.0, None
+    def _next_goal(self) -> ProcedureOutput:
+        """Rest, and plan from here in the next step; or be done."""
+        self._tracker, self._rest = None, _Rest()
         if self.goal + 1 == len(self.procedure.goals):
             self.state = ProcedureState.DONE
             return ProcedureOutput(np.zeros(2), self.state, self.goal, 1.0)
-        self.goal += 1
-        return self._output(velocity)
+        self._begin_goal(self.goal + 1)
+        return self._output(np.zeros(2))
+
+    def _begin_goal(self, goal: int) -> None:
+        self.goal, self._replans = goal, 0
+        self._swept, self._bearing = 0.0, None
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:
         """Return the speed at which tension and friction stay within the goal's limits [m/s]."""
@@ -249,25 +279,27 @@ class ProcedureExecutor:
             return self.planner.thread_clearance(goal.around, thread.vertices) <= goal.clearance
         return True
 
-    def _sweep(self, pivot: Vector) -> None:
+    def _sweep(self, middle: Vector) -> None:
         """Add up the angle that the needle sweeps about the shape of a wrap."""
         goal = self.procedure.goals[self.goal]
         if not isinstance(goal, Wrap):
             return
-        bearing = self.planner.bearing(goal.around, pivot)
+        bearing = self.planner.bearing(goal.around, middle)
         if self._bearing is not None:
             self._swept += math.remainder(bearing - self._bearing, 2.0 * math.pi)
         self._bearing = bearing
 
     def _pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
-        pivot, angle = self.planner.pose(tail, heading)
+        middle, angle = self.planner.pose(tail, heading)
         if self._unwrapped is not None:
             angle = self._unwrapped + math.remainder(angle - self._unwrapped, 2.0 * math.pi)
         self._unwrapped = angle
-        return pivot, angle
+        return middle, angle
 
     def _output(self, velocity: Vector) -> ProcedureOutput:
         progress = 0.0
-        if self._tracker is not None and self.path is not None and self.path.length > 0.0:
-            progress = min(1.0, self._tracker.travel / self.path.length)
+        if self._tracker is not None and self.path is not None:
+            before = float(self.path.ends[self._reached - 1]) if self._reached else 0.0
+            way = float(self.path.ends[self._reached]) - before
+            progress = min(1.0, max(0.0, (self._tracker.travel - before) / way)) if way > 0.0 else 1.0
         return ProcedureOutput(velocity, self.state, self.goal, progress, self.reason)

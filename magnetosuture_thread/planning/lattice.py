@@ -1,8 +1,8 @@
 """The shortest way of the needle's body through a scene: A* over a lattice of its positions and headings.
 
-The needle is driven along its chord and turned about a point of it, its pivot, so a way is a sequence of straight
-drives, ahead or back, and of turns on the spot. The lattice has the pivots on a square grid and 32 directions to other
-points of it. Where a way is to lead around a shape, the angle swept about that shape is a further coordinate.
+The needle is driven along its chord and turned about the chord's middle (`NeedleKinematics`), so a way is a sequence of
+straight drives, ahead or back, and of turns on the spot. The lattice has the middles on a square grid and 32 directions
+to other points of it. Where a way is to lead around a shape, the angle swept about that shape is a further coordinate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from magnetosuture_thread.planning.clearance_map import ClearanceMap, body_clear
 
 STRIDE = 2  # of the clearance map's grid between two points of the lattice
 REVERSE_COST = 1.5  # of a way driven back, in that of the same way ahead
-NEAR_COST = 4.0  # of a way at the required clearance, more than at the preferred one
+NEAR_COST = 3.0  # of a way at the required clearance, more than at the preferred one
 _QUARTER = np.array([(1, 0), (3, 1), (2, 1), (3, 2), (1, 1), (2, 3), (1, 2), (1, 3)])
 _TURNS = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))
 MOVES = np.concatenate([_QUARTER @ np.array(turn).T for turn in _TURNS])
@@ -33,13 +33,15 @@ class LatticeGoal(NamedTuple):
     """Where a way may end.
 
     Attributes:
-        places: at which points of the lattice the middle of the needle may be, shape (m, m), rows along y.
+        allowed: at which points of the lattice the way may be, shape (m, m), rows along y.
+        places: at which points of the lattice it may end, shape (m, m), rows along y.
         headings: which of the directions, shape (32,).
         swept: angle that must have been swept about `centre`, positive counterclockwise [rad]; 0 for any.
         centre: of the shape that the way leads around, shape (2,) [m].
         target: a place that the goal is near, for the heuristic; NaN where there is none, shape (2,) [m].
     """
 
+    allowed: NDArray[np.bool_]
     places: NDArray[np.bool_]
     headings: NDArray[np.bool_]
     swept: float
@@ -52,7 +54,6 @@ def search_lattice(
     start: NDArray[np.int64],
     body: Points,
     lever: float,
-    ahead_of_pivot: float,
     required: float,
     preferred: float,
     goal: LatticeGoal,
@@ -69,8 +70,7 @@ def search_lattice(
     Args:
         start: column, row and direction, shape (3,).
         body: points of the needle's axis, see `body_clearance`.
-        lever: from the pivot to the tip [m].
-        ahead_of_pivot: from the pivot to the middle of the needle [m].
+        lever: half of the needle's chord [m].
         required: clearance of the body [m].
         preferred: clearance beyond which more is not worth a longer way [m].
         goal: where the way may end.
@@ -80,11 +80,11 @@ def search_lattice(
         most: states to look at.
 
     Returns:
-        Shape (k, 4): x, y [m], direction [rad], and swept angle [rad]; empty where there is no way, or none was found
+        Shape (k, 3): x, y [m] and direction [rad]; empty where there is no way, or none was found
         within `most` states.
     """
     count, size, step = len(directions), len(goal.places), STRIDE * near.step
-    sheets = int(math.ceil(abs(goal.swept) / (2.0 * math.pi))) + 2 if goal.swept != 0.0 else 1
+    sheets = math.ceil(abs(goal.swept) / (2.0 * math.pi)) + 2 if goal.swept != 0.0 else 1
     cells = size * size * count
     cost = np.full(cells * sheets, np.inf, np.float32)
     parent = np.full(cells * sheets, -1, np.int32)
@@ -111,10 +111,7 @@ def search_lattice(
         x, y = near.origin + step * i, near.origin + step * j
         angle = math.atan2(y - goal.centre[1], x - goal.centre[0])
         ahead = (sense * (angle - begin)) % (2.0 * math.pi)  # of the start, on sheet 0 from 0 to 2 pi
-        mi = int(round((x + ahead_of_pivot * math.cos(directions[direction]) - near.origin) / step))
-        mj = int(round((y + ahead_of_pivot * math.sin(directions[direction]) - near.origin) / step))
-        inside = 0 <= mi < size and 0 <= mj < size
-        if inside and goal.places[mj, mi] and goal.headings[direction]:
+        if goal.places[j, i] and goal.headings[direction]:
             swept = ahead + 2.0 * math.pi * (sheet - 1 if sheets > 1 else 0)
             if goal.swept == 0.0 or swept >= abs(goal.swept) - 1e-9:
                 last = state
@@ -133,6 +130,8 @@ def search_lattice(
                 turn = abs(directions[nd] - directions[direction])
                 length = lever * min(turn, 2.0 * math.pi - turn)
             nx, ny = near.origin + step * ni, near.origin + step * nj
+            if not goal.allowed[nj, ni]:
+                continue
             key = (nj * size + ni) * count + nd
             if math.isnan(clear[key]):
                 clear[key] = body_clearance(nx, ny, directions[nd], body, near)
@@ -148,7 +147,7 @@ def search_lattice(
                 way = (there - angle + math.pi) % (2.0 * math.pi) - math.pi
                 later = (sense * (there - begin)) % (2.0 * math.pi)
                 turns = (ahead + sense * way - later) / (2.0 * math.pi)
-                nsheet = sheet + int(round(turns))
+                nsheet = sheet + round(turns)
                 if nsheet < 0 or nsheet >= sheets:
                     continue
             share = min(1.0, max(0.0, (preferred - room) / max(preferred - required, 1e-12)))
@@ -160,21 +159,19 @@ def search_lattice(
                 rest = math.hypot(nx - goal.target[0], ny - goal.target[1]) if guided else 0.0
                 heapq.heappush(heap, (float(onward) + rest, following))
     if last < 0:
-        return np.empty((0, 4))
+        return np.empty((0, 3))
     steps = 1
     state = last
     while parent[state] >= 0:
         state = parent[state]
         steps += 1
-    path = np.empty((steps, 4))
+    path = np.empty((steps, 3))
     state = last
     for k in range(steps - 1, -1, -1):
-        sheet, cell = state // cells, state % cells
+        cell = state % cells
         place = cell // count
         path[k, 0] = near.origin + step * (place % size)
         path[k, 1] = near.origin + step * (place // size)
         path[k, 2] = directions[cell % count]
-        angle = math.atan2(path[k, 1] - goal.centre[1], path[k, 0] - goal.centre[0])
-        path[k, 3] = sense * ((sense * (angle - begin)) % (2.0 * math.pi)) + sense * 2.0 * math.pi * (sheet - 1)
         state = parent[state]
     return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,16 +17,27 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.clearance_map import CELLS, body_clearance, map_clearance
 from magnetosuture_thread.planning.lattice import DIRECTIONS, MOVES, STRIDE, LatticeGoal, search_lattice
-from magnetosuture_thread.planning.path import BodyPath, smooth_path
-from magnetosuture_thread.planning.procedure import Goal, GoTo, PassThrough, Procedure, ProcedureLimits, Tighten, Withdraw, Wrap
+from magnetosuture_thread.planning.path import PREFERRED, BodyPath, smooth_path
+from magnetosuture_thread.planning.procedure import (
+    Goal,
+    GoTo,
+    PassThrough,
+    Procedure,
+    ProcedureLimits,
+    Tighten,
+    Wrap,
+)
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
 
-MARGINS = (1e-4, 3e-5, 5e-6)  # m; kept beyond the required clearance for errors of control, the widest that there is room for
-PREFERRED = 3e-4  # m; beyond the required clearance, more is not worth a longer way
-PIVOT = 0.45  # of half the chord; so far behind the middle the needle turns, as the thread holds its tail
+MARGINS = (
+    1e-4,
+    3e-5,
+    5e-6,
+)  # m; kept beyond the required clearance for errors of control, the widest that there is room for
+SIGHT_SAMPLES = 24
 MAX_STATES = 20_000_000
 HEADING_TOLERANCE = 0.3  # rad
 GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
@@ -65,21 +77,19 @@ class NeedlePlanner:
         self.scene, self.needle = scene, needle
         self._keep_out, self._thread_length = keep_out, thread_length
         self.near = map_clearance(scene)
-        self.turning = 0.5 * needle.chord
-        self.ahead_of_pivot = PIVOT * self.turning
-        self.lever = self.turning + self.ahead_of_pivot
-        # Points a step of the grid apart, in the frame of the pivot.
+        self.lever = 0.5 * needle.chord
+        # Points a step of the grid apart, about the middle of the chord.
         axis = needle_points(needle.length, needle.curvature, self.near.step).points
         along = needle.chord_direction(np.array([1.0, 0.0]))
         turn = np.array([[along[0], along[1]], [-along[1], along[0]]])
-        self.body = np.ascontiguousarray((axis - (self.turning - self.ahead_of_pivot) * along) @ turn.T)
+        self.body = np.ascontiguousarray((axis - self.lever * along) @ turn.T)
         self._step = STRIDE * self.near.step
         self._size = CELLS // STRIDE + 1
 
     def pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
-        """Return pivot, shape (2,) [m], and angle of the chord [rad] of a needle with this tail and heading."""
+        """Return middle, shape (2,) [m], and angle of the chord [rad] of a needle with this tail and heading."""
         along = self.needle.chord_direction(heading)
-        return tail + (self.turning - self.ahead_of_pivot) * along, math.atan2(float(along[1]), float(along[0]))
+        return tail + self.lever * along, math.atan2(float(along[1]), float(along[0]))
 
     def check(self, procedure: Procedure) -> None:
         """Refuse what can be seen to be impossible without planning.
@@ -116,41 +126,65 @@ class NeedlePlanner:
                 self._check_place(f"{where}.to", goal.to, required)
 
     def plan(
-        self, goal: Goal, limits: ProcedureLimits, pivot: Vector, angle: float, start: Vector, swept: float | None = None
+        self,
+        goals: Sequence[Goal],
+        limits: ProcedureLimits,
+        middle: Vector,
+        angle: float,
+        start: Vector,
+        swept: float | None = None,
     ) -> BodyPath:
-        """Return a path from a pose to a goal.
+        """Return a path from a pose through goals, one after the other.
 
         Args:
-            goal: to reach.
+            goals: to reach.
             limits: on the way.
-            pivot: of the needle, shape (2,) [m]; see `pose`.
+            middle: of the chord, shape (2,) [m]; see `pose`.
             angle: of the chord [rad].
             start: where the procedure began, shape (2,) [m].
-            swept: what is left to sweep of a wrap [rad]; all of it if None.
+            swept: what is left to sweep of the first goal, a wrap [rad]; all of it if None.
 
         Raises:
-            PlanningError: there is no way.
+            PlanningError: there is no way to one of them.
         """
-        target = self._lattice_goal(goal, start, swept)
         required = max(self._keep_out, limits.clearance)
         for margin in MARGINS:
-            path = self._path(target, required, margin, pivot, angle)
-            if path is not None:
-                return path
-        raise PlanningError(f"no way for the needle to {goal.GROUP} from {1e3 * pivot[0]:.1f}, {1e3 * pivot[1]:.1f} mm")
+            states, ends, at = np.empty((0, 3)), [], self._nearest_free(middle, angle, required + margin)
+            for index, goal in enumerate(goals):
+                if at is None:
+                    break
+                target = self._lattice_goal(goal, start, swept if index == 0 else None)
+                found = self._search(target, required + margin, at)
+                if not len(found):
+                    at = None
+                    break
+                states = np.vstack([states, found])
+                ends.append(len(states))
+                at = self._state_of(found[-1])
+            if at is not None and len(states):
+                # It begins where the needle is, which may be closer than what is required from then on.
+                begin = np.array([[*middle, states[0, 2] + math.remainder(angle - states[0, 2], 2.0 * math.pi)]])
+                states = np.vstack([begin, states])
+                return smooth_path(states, np.array(ends), self.lever, self.body, required, margin, self.near)
+        where = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm"
+        raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}")
 
-    def plan_all(self, procedure: Procedure, pivot: Vector, angle: float) -> tuple[BodyPath, ...]:
-        """Return a path for each goal, each from where the one before ends.
+    def plan_all(self, procedure: Procedure, middle: Vector, angle: float) -> tuple[BodyPath, ...]:
+        """Return the paths that a procedure will take, each through the goals of one `chain`.
 
         Raises:
             ConfigurationError: see `check`.
             PlanningError: there is no way to a goal.
         """
         self.check(procedure)
-        start, paths = pivot + self.ahead_of_pivot * np.array([math.cos(angle), math.sin(angle)]), []
-        for goal, limits in zip(procedure.goals, procedure.limits, strict=True):
-            paths.append(self.plan(goal, limits, pivot, angle, start))
-            pivot, angle = paths[-1].pivots[-1], float(paths[-1].angles[-1])
+        start = middle
+        paths: list[BodyPath] = []
+        index = 0
+        while index < len(procedure.goals):
+            goals = chain(procedure, index)
+            paths.append(self.plan(goals, procedure.limits[index], middle, angle, start))
+            middle, angle = paths[-1].middles[-1], float(paths[-1].angles[-1])
+            index += len(goals)
         return tuple(paths)
 
     def gaps(self, goal: PassThrough) -> list[Gap]:
@@ -203,29 +237,36 @@ class NeedlePlanner:
         turns = np.unwrap(np.arctan2(*(points - self._centre(name)).T[::-1]))
         return float(turns[-1] - turns[0])
 
-    def _path(self, goal: LatticeGoal, required: float, margin: float, pivot: Vector, angle: float) -> BodyPath | None:
-        kept = required + margin
-        start = self._nearest_free(pivot, angle, kept)
-        if start is None:
-            return None
-        states = search_lattice(
-            start, self.body, self.lever, self.ahead_of_pivot, kept, kept + PREFERRED, goal, self.near, MOVES, DIRECTIONS, MAX_STATES
+    def _search(self, goal: LatticeGoal, kept: float, start: NDArray[np.int64]) -> Points:
+        """Return x, y and direction of the states on the way to a goal, shape (k, 3); empty where there is none."""
+        return search_lattice(
+            start,
+            self.body,
+            self.lever,
+            kept,
+            kept + PREFERRED,
+            goal,
+            self.near,
+            MOVES,
+            DIRECTIONS,
+            MAX_STATES,
         )
-        if not len(states):
-            return None
-        # It begins where the needle is, which may be closer than what is required from then on.
-        begin = np.array([[*pivot, states[0, 2] + _turn(angle - states[0, 2])]])
-        return smooth_path(np.vstack([begin, states[:, :3]]), self.lever, self.body, required, margin, self.near)
 
-    def _nearest_free(self, pivot: Vector, angle: float, required: float) -> NDArray[np.int64] | None:
+    def _state_of(self, state: Vector) -> NDArray[np.int64]:
+        """Return column, row and direction of a state of the lattice."""
+        column, row = np.rint((state[:2] - self.near.origin) / self._step).astype(int)
+        return np.array([column, row, int(np.argmin(np.abs(_turn(DIRECTIONS - state[2]))))])
+
+    def _nearest_free(self, middle: Vector, angle: float, required: float) -> NDArray[np.int64] | None:
         """Return the free state of the lattice that is nearest to a pose; None where none is near."""
-        column, row = np.rint((pivot - self.near.origin) / self._step).astype(int)
+        column, row = np.rint((middle - self.near.origin) / self._step).astype(int)
         best, found = np.inf, None
         for j in range(max(0, row - 4), min(self._size, row + 5)):
             for i in range(max(0, column - 4), min(self._size, column + 5)):
-                x, y = self.near.origin + self._step * np.array([i, j])
+                x, y = self.near.origin + self._step * i, self.near.origin + self._step * j
                 for k, direction in enumerate(DIRECTIONS):
-                    off = math.hypot(x - pivot[0], y - pivot[1]) + self.lever * abs(_turn(direction - angle))
+                    turn = abs(math.remainder(direction - angle, 2.0 * math.pi))
+                    off = math.hypot(x - middle[0], y - middle[1]) + self.lever * turn
                     if off < best and body_clearance(x, y, direction, self.body, self.near) >= required:
                         best, found = off, np.array([i, j, k])
         return found
@@ -235,7 +276,9 @@ class NeedlePlanner:
         any_heading = np.ones(len(DIRECTIONS), bool)
         if isinstance(goal, Wrap):
             wanted = goal.swept if swept is None else swept
-            return LatticeGoal(everywhere, any_heading, wanted, self._centre(goal.around), nowhere)
+            return LatticeGoal(
+                self._sight_of(goal.around), everywhere, any_heading, wanted, self._centre(goal.around), nowhere
+            )
         at = self.near.origin + self._step * np.arange(self._size)
         x, y = np.meshgrid(at, at)
         if isinstance(goal, PassThrough):
@@ -246,8 +289,9 @@ class NeedlePlanner:
                 places |= (ahead >= 0.0) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * gap.width)
                 off = np.abs(_turn(DIRECTIONS - math.atan2(gap.along[1], gap.along[0])))
                 headings |= off <= GAP_HEADING
-            return LatticeGoal(places, headings, 0.0, np.zeros(2), nowhere)
-        place, tolerance, headed = start, self._step, ()
+            return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), nowhere)
+        place, tolerance = start, self._step
+        headed: tuple[float, ...] = ()
         if isinstance(goal, GoTo):
             place, tolerance, headed = np.array(goal.position), goal.tolerance, goal.heading
         elif isinstance(goal, Tighten):
@@ -257,11 +301,32 @@ class NeedlePlanner:
         # At least the nearest point of the lattice.
         places = np.hypot(x - place[0], y - place[1]) <= max(0.7 * tolerance, 0.75 * self._step)
         headings = np.abs(_turn(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
-        return LatticeGoal(places, headings, 0.0, np.zeros(2), place)
+        return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), place)
+
+    def _sight_of(self, name: str) -> NDArray[np.bool_]:
+        """Return from which points of the lattice nothing is between them and a shape's nearest point."""
+        from_shape = map_clearance(self.scene, (name,)).distance[::STRIDE, ::STRIDE]
+        others = tuple(other for other in self.scene.names if other != name)
+        blocking = (
+            map_clearance(self.scene, others).distance[::STRIDE, ::STRIDE] if others else np.full_like(from_shape, 1.0)
+        )
+        slope = np.array(np.gradient(from_shape))  # per step, rows first
+        rows, columns = np.indices(from_shape.shape)
+        free = blocking > 0.0
+        for share in np.linspace(0.1, 1.0, SIGHT_SAMPLES):
+            way = share * from_shape / self._step
+            at = [
+                np.clip(np.rint(index - way * part), 0, self._size - 1).astype(int)
+                for index, part in ((rows, slope[0] / self._step), (columns, slope[1] / self._step))
+            ]
+            free &= blocking[at[0], at[1]] > 0.0
+        return np.asarray(free)
 
     def _check_name(self, where: str, name: str) -> None:
         if name not in self.scene.names:
-            raise ConfigurationError(where, name, f"a shape of the scene: {', '.join(self.scene.names) or 'it has none'}")
+            raise ConfigurationError(
+                where, name, f"a shape of the scene: {', '.join(self.scene.names) or 'it has none'}"
+            )
 
     def _check_place(self, where: str, place: tuple[float, ...], required: float) -> None:
         x, y = place
@@ -282,6 +347,18 @@ class NeedlePlanner:
         return float(self._geometry(name).convex_hull.length)
 
 
-def _turn(angle: float | Vector) -> float | Vector:
-    """Return an angle within half a turn of 0."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+def chain(procedure: Procedure, index: int) -> tuple[Goal, ...]:
+    """Return the goals from one on that are reached on one path: up to the next at which the needle comes to rest."""
+    limits = procedure.limits[index]
+    last = index
+    while last + 1 < len(procedure.goals) and procedure.limits[last + 1] == limits:
+        # Where a tightened thread ends depends on the thread, and so does what follows.
+        if not isinstance(procedure.goals[last], PassThrough | Wrap):
+            break
+        last += 1
+    return procedure.goals[index : last + 1]
+
+
+def _turn(angles: Vector) -> Vector:
+    """Return angles within half a turn of 0."""
+    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)

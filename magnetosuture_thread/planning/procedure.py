@@ -1,5 +1,6 @@
 """Procedures: what the needle is to do, as a list of goals in a YAML file.
 
+setup: hernia_ring
 limits: {speed: 0.002, tension: 0.0005}
 goals:
   - pass_through: {between: [left_tissue, right_tissue], direction: [0.0, 1.0]}
@@ -12,11 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 from magnetosuture_thread.configuration import Configuration, from_mapping, quantity, read_yaml, suggest_names
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.resources import find_procedure_file
 
 MAX_GOALS = 100
 _PLACE: dict[str, Any] = {"unit": "m", "minimum": -0.5, "maximum": 0.5, "multiple": 2}
@@ -62,7 +63,9 @@ class PassThrough(Configuration):
     GROUP: ClassVar[str] = "pass_through"
 
     between: tuple[str, ...] = quantity((), "names of the two shapes")
-    direction: tuple[float, ...] = quantity((), "x and y of a vector along which it is passed", minimum=-1e3, maximum=1e3)
+    direction: tuple[float, ...] = quantity(
+        (), "x and y of a vector along which it is passed", minimum=-1e3, maximum=1e3
+    )
 
     def check(self) -> None:
         """Refuse anything but two shapes and a direction."""
@@ -101,7 +104,7 @@ class Tighten(Configuration):
 
     tension: float = quantity(0.0, "peak of the thread, by the model, at which it is tight; 0 for any",
                               unit="N", minimum=0.0, maximum=10.0)  # fmt: skip
-    clearance: float = quantity(0.0, "of the thread from the shape that it goes around, at which it is tight; 0 for any",
+    clearance: float = quantity(0.0, "of the thread from the shape it goes around, at which it is tight; 0 for any",
                                 unit="m", minimum=0.0, maximum=0.1)  # fmt: skip
     around: str = quantity("", "name of that shape")
     toward: tuple[float, ...] = quantity((), "x and y of the place that it is pulled to", **_PLACE)
@@ -132,7 +135,7 @@ class Withdraw(Configuration):
 
 
 Goal = GoTo | PassThrough | Wrap | Tighten | Withdraw
-GOALS: dict[str, type[Configuration]] = {kind.GROUP: kind for kind in (GoTo, PassThrough, Wrap, Tighten, Withdraw)}
+GOALS: dict[str, type[Goal]] = {kind.GROUP: kind for kind in (GoTo, PassThrough, Wrap, Tighten, Withdraw)}
 
 
 @dataclass(frozen=True)
@@ -141,11 +144,13 @@ class Procedure:
 
     Attributes:
         name: of the procedure.
+        setup: name or file of the setup that it is meant for; empty for any.
         goals: what is to be done.
         limits: while each goal is pursued.
     """
 
     name: str
+    setup: str
     goals: tuple[Goal, ...]
     limits: tuple[ProcedureLimits, ...]
 
@@ -161,14 +166,19 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
     Raises:
         ConfigurationError: it is no procedure; the message names goal and field.
     """
-    if not isinstance(content, Mapping) or not set(content) <= {"goals", "limits"} or "goals" not in content:
-        given = sorted(map(str, content)) if isinstance(content, Mapping) else type(content).__name__
-        raise ConfigurationError("procedure", given, "goals, and limits if they differ from the defaults", source)
+    if not isinstance(content, Mapping) or not set(content) <= {"setup", "goals", "limits"} or "goals" not in content:
+        given: Any = sorted(map(str, content)) if isinstance(content, Mapping) else type(content).__name__
+        expected = "goals, and setup and limits if they differ from the defaults"
+        raise ConfigurationError("procedure", given, expected, source)
+    setup = content.get("setup", "")
+    if not isinstance(setup, str):
+        raise ConfigurationError("procedure.setup", setup, "the name of a setup", source)
     goals, common = content["goals"], _mapping(content.get("limits", {}), "limits", source)
     if not isinstance(goals, list) or not 0 < len(goals) <= MAX_GOALS:
         given = len(goals) if isinstance(goals, list) else type(goals).__name__
         raise ConfigurationError("procedure.goals", given, f"a list of 1 to {MAX_GOALS} goals", source)
-    found, limits = [], []
+    found: list[Goal] = []
+    limits: list[ProcedureLimits] = []
     for index, entry in enumerate(goals):
         where = f"goals[{index}]"
         kinds = [key for key in _mapping(entry, where, source) if key != "limits"]
@@ -176,22 +186,23 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
             expected = suggest_names(str(kinds[0]), list(GOALS)) if len(kinds) == 1 else "one kind of goal"
             raise ConfigurationError(where, kinds, expected, source)
         try:
-            goal = from_mapping(GOALS[kinds[0]], _mapping(entry[kinds[0]], f"{where}.{kinds[0]}", source), source)
+            goal: Goal = from_mapping(GOALS[kinds[0]], _mapping(entry[kinds[0]], f"{where}.{kinds[0]}", source), source)
             own = {**common, **_mapping(entry.get("limits", {}), f"{where}.limits", source)}
             limits.append(from_mapping(ProcedureLimits, own, source))
         except ConfigurationError as error:
             prefix = "" if error.name.startswith("goals[") else f"{where}."
             raise ConfigurationError(f"{prefix}{error.name}", error.value, error.expectation, source) from None
         found.append(goal)
-    return Procedure(name, tuple(found), tuple(limits))  # type: ignore[arg-type]
+    return Procedure(name, setup, tuple(found), tuple(limits))
 
 
-def read_procedure(path: Path) -> Procedure:
-    """Return the procedure in a file.
+def read_procedure(name: str) -> Procedure:
+    """Return a procedure, given as a path or as the name of one that ships with the package.
 
     Raises:
-        ConfigurationError: the file cannot be read, or is no procedure.
+        ConfigurationError: there is no such file, it cannot be read, or is no procedure.
     """
+    path = find_procedure_file(name)
     return parse_procedure(read_yaml(path, "procedure"), path.stem, str(path))
 
 
