@@ -36,6 +36,11 @@ ALLOWED = {
     "safety": {*BASE, "barrier", "compiled", "geometry", "scene"},
     "coils": {*BASE, "barrier", "geometry", "safety", "scene", "shared_parameters"},
     "guidance": {*BASE, "geometry", "scene", "shared_parameters"},
+    "planning": {*BASE, "compiled", "geometry", "safety", "scene"},
+    "campaign": {
+        *BASE,
+        *("coils", "geometry", "model", "planning", "rig", "safety", "scene", "setups", "thread_observation", "vision"),
+    },
     "console": {*BASE, "geometry", "scene", "shared_parameters"},
     "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
     "bags": {*BASE, "interface", "messages"},
@@ -76,6 +81,8 @@ ALLOWED = {
         *(
             "workers",
             "interface",
+            "campaign",
+            "planning",
             "geometry",
             "scene",
             "model",

@@ -57,6 +57,7 @@ JSON_KEYS = {
     "truth_after",
     "truth_held_out",
     "most_friction",
+    "longest_rest_s",
 }
 ALLOWED = JSON_KEYS
 ENTRY_POINTS = {"main", "run", "add"}  # of programs, and of each command

@@ -5,8 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_a
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.planning.executor import ThreadCondition
-from magnetosuture_thread.rig.rig import Rig
+from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.session import TrackerSession
@@ -154,7 +153,7 @@ class ClosedLoop:
             self._reason,
         )
 
-    def _measure(self, frame: Any) -> _Measurement | None:
+    def _measure(self, frame: RigFrame) -> _Measurement | None:
         due = self.now + LATENCY
         if self._tracker is not None:
             if frame.image is None:
@@ -235,8 +234,3 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
         margins.friction.slowdown if margins is not None else 1.0,
         problem,
     )
-
-
-def varied(setup: Setup, **rig: Any) -> Setup:
-    """Return a setup with other settings of the rig."""
-    return replace(setup, rig=replace(setup.rig, **rig)).with_scene(setup.scene)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magnetosuture_thread.campaign.loop import ClosedLoop, Controller, LoopFrame
+from magnetosuture_thread.campaign.loop import ClosedLoop, Controller, LoopFrame, Vector
 from magnetosuture_thread.campaign.variation import Variation
-from magnetosuture_thread.errors import MagnetosutureError, SolverError
-from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureOutput, ProcedureState
-from magnetosuture_thread.planning.planner import NeedlePlanner
+from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
+from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
 from magnetosuture_thread.planning.procedure import Procedure, Wrap
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.safety.barriers import measure
@@ -122,8 +122,7 @@ def run_procedure(
     planner.check(procedure)
     executor = ProcedureExecutor(procedure, planner)
     rig = Rig(variation.setup.rig, setup.scene)
-    output: list[ProcedureOutput] = []
-    control = _follow(setup) if follower else _execute(executor, output)
+    control = _follow(setup) if follower else _execute(executor)
     gains = variation.coil_gains
     loop = ClosedLoop(setup, rig, control, variation.seed, camera=camera, losses=variation.losses, coil_gains=gains)
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
@@ -139,14 +138,14 @@ def run_procedure(
             record.update(frame, running)
             if math.isnan(began) and running:
                 began = frame.time
-                planned = sum(path.length for path in _plan(executor, frame))
+                planned = _planned_length(executor, frame)
             ahead = max(0.0, executor.travel - before)
             before = executor.travel
             way, weighted = way + ahead, weighted + ahead / frame.condition.slowdown
             if executor.state in (ProcedureState.DONE, ProcedureState.FAILED):
                 reason = executor.reason
                 break
-    except (SolverError, MagnetosutureError) as error:
+    except SolverError as error:
         reason = f"{type(error).__name__}: {error}"
     time = rig.time - began if math.isfinite(began) else rig.time
     slowest = min(limits.speed for limits in procedure.limits)
@@ -178,13 +177,17 @@ def run_procedure(
     )
 
 
-def _plan(executor: ProcedureExecutor, frame: LoopFrame) -> tuple:  # type: ignore[type-arg]
+def _planned_length(executor: ProcedureExecutor, frame: LoopFrame) -> float:
+    """Return the length of the paths from here to the end of the procedure; 0 where there is none [m]."""
     heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
-    return executor.plan(frame.tail, heading)
+    try:
+        return sum(path.length for path in executor.plan(frame.tail, heading))
+    except PlanningError:
+        return 0.0
 
 
-def _execute(executor: ProcedureExecutor, output: list[ProcedureOutput]) -> Controller:
-    def control(stamp, tail, heading, thread):  # type: ignore[no-untyped-def]
+def _execute(executor: ProcedureExecutor) -> Controller:
+    def control(stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
         if executor.state is ProcedureState.READY and not thread.problem:
             executor.start()
         return executor.update(stamp, tail, heading, thread).velocity

@@ -66,7 +66,11 @@ def vary(setup: Setup, seed: int) -> Variation:
     x, y, heading = rig.needle_start
     for _ in range(MAX_DRAWS):
         dx, dy = START_OFFSET * random.uniform(-1.0, 1.0, 2)
-        start = (x + float(dx), y + float(dy), math.remainder(heading + START_TURN * random.uniform(-1.0, 1.0), math.tau))
+        start = (
+            x + float(dx),
+            y + float(dy),
+            math.remainder(heading + START_TURN * random.uniform(-1.0, 1.0), math.tau),
+        )
         curvature = rig.thread_start_curvature * factor(CURVATURE)
         drawn = replace(changed, needle_start=start, thread_start_curvature=curvature)
         try:

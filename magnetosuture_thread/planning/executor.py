@@ -24,6 +24,7 @@ REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
 BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
 MAX_REPLANS = 6  # of one goal, after which it is given up
 OFF_PATH, MAX_OFF_PATH = 8e-4, 3e-3  # m; an error beyond which a new path is planned: more where there is room
+PROGRESS = 2e-3  # m; on a new path, after which those before count no more
 WRAPPED = 0.02  # rad; of a wrap may be left
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
 
@@ -100,8 +101,8 @@ class ProcedureExecutor:
     """Takes the needle through the goals of a procedure.
 
     A goal's path is planned when its turn comes, from where the needle is then. A needle that rests for `REST_TIME`
-    while it is commanded backs off, and its goal is planned anew; one that is off its path by more than `OFF_PATH` too. After
-    `MAX_REPLANS` the goal is given up, and the needle is at rest.
+    while it is commanded backs off, and its goal is planned anew; one that is off its path by more than `OFF_PATH` too.
+    After `MAX_REPLANS` without progress the goal is given up, and the needle is at rest.
 
     Pure: time comes in with the poses.
 
@@ -207,6 +208,8 @@ class ProcedureExecutor:
         assert self._tracker is not None
         if isinstance(goal, Tighten) and self._is_tight(goal, thread):
             return self._next_goal()
+        if self._tracker.travel > PROGRESS:
+            self._replans = 0
         command = self._tracker.compute_command(stamp, middle, angle, self._allowed_speed(thread), thread.slowdown)
         if command.done:
             return self._at_end(stamp, goal, middle, angle)
@@ -215,7 +218,7 @@ class ProcedureExecutor:
             self._begin_goal(self.goal + 1)
             self._reached += 1
         rests = self._rest.update(stamp, middle, angle, self.planner.lever, bool(command.velocity.any()))
-        if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.room, MAX_OFF_PATH)):
+        if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
             return self._replan(stamp, command.velocity if rests else np.zeros(2))
         return self._output(command.velocity)
 

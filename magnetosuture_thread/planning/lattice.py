@@ -50,6 +50,29 @@ class LatticeGoal(NamedTuple):
 
 
 @compiled
+def _way_to(
+    last: int, parent: NDArray[np.int32], size: int, origin: float, step: float, directions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return x, y and direction of the states that led to one, shape (k, 3)."""
+    count = len(directions)
+    cells = size * size * count
+    steps, state = 1, last
+    while parent[state] >= 0:
+        state = parent[state]
+        steps += 1
+    path = np.empty((steps, 3))
+    state = last
+    for k in range(steps - 1, -1, -1):
+        cell = state % cells
+        place = cell // count
+        path[k, 0] = origin + step * (place % size)
+        path[k, 1] = origin + step * (place // size)
+        path[k, 2] = directions[cell % count]
+        state = parent[state]
+    return path
+
+
+@compiled
 def search_lattice(
     start: NDArray[np.int64],
     body: Points,
@@ -60,7 +83,7 @@ def search_lattice(
     near: ClearanceMap,
     moves: NDArray[np.int64],
     directions: NDArray[np.float64],
-    most: int,
+    max_states: int,
 ) -> NDArray[np.float64]:
     """Return the cheapest way from a point of the lattice to the goal: x, y and direction of each state.
 
@@ -77,11 +100,11 @@ def search_lattice(
         near: distances from wall and shapes.
         moves: `MOVES`.
         directions: `DIRECTIONS`.
-        most: states to look at.
+        max_states: to look at.
 
     Returns:
         Shape (k, 3): x, y [m] and direction [rad]; empty where there is no way, or none was found
-        within `most` states.
+        within `max_states`.
     """
     count, size, step = len(directions), len(goal.places), STRIDE * near.step
     sheets = math.ceil(abs(goal.swept) / (2.0 * math.pi)) + 2 if goal.swept != 0.0 else 1
@@ -99,7 +122,7 @@ def search_lattice(
     cost[first] = 0.0
     heap = [(0.0, first)]
     looked, last = 0, -1
-    while len(heap) > 0 and looked < most:
+    while len(heap) > 0 and looked < max_states:
         _, state = heapq.heappop(heap)
         if done[state]:
             continue
@@ -160,18 +183,4 @@ def search_lattice(
                 heapq.heappush(heap, (float(onward) + rest, following))
     if last < 0:
         return np.empty((0, 3))
-    steps = 1
-    state = last
-    while parent[state] >= 0:
-        state = parent[state]
-        steps += 1
-    path = np.empty((steps, 3))
-    state = last
-    for k in range(steps - 1, -1, -1):
-        cell = state % cells
-        place = cell // count
-        path[k, 0] = near.origin + step * (place % size)
-        path[k, 1] = near.origin + step * (place // size)
-        path[k, 2] = directions[cell % count]
-        state = parent[state]
-    return path
+    return _way_to(last, parent, size, near.origin, step, directions)

@@ -31,14 +31,14 @@ class BodyPath:
         middles: of the chord, shape (m, 2) [m].
         angles: of the chord against the x axis, unwrapped, shape (m,) [rad].
         lever: half of the needle's chord [m].
-        room: by how much the body may be off each pose before it is as close as it may be, shape (m,) [m].
+        leeway: by how much the body may be off each pose before it is as close as it may be, shape (m,) [m].
         ends: ways of the tip at which the goals on the path are reached, rising, shape (g,) [m].
     """
 
     middles: Points
     angles: NDArray[np.float64]
     lever: float
-    room: NDArray[np.float64]
+    leeway: NDArray[np.float64]
     ends: NDArray[np.float64]
 
     @cached_property
@@ -57,9 +57,9 @@ class BodyPath:
         x, y = (float(np.interp(travel, self.travel, column)) for column in self.middles.T)
         return np.array([x, y]), float(np.interp(travel, self.travel, self.angles))
 
-    def room_at(self, travel: float) -> float:
-        """Return the room at a way of the tip [m]."""
-        return float(np.interp(travel, self.travel, self.room))
+    def leeway_at(self, travel: float) -> float:
+        """Return the leeway at a way of the tip [m]."""
+        return float(np.interp(travel, self.travel, self.leeway))
 
 
 def smooth_path(
@@ -93,8 +93,8 @@ def smooth_path(
     )
     _relax(dense, body, required + margin, required + margin + PREFERRED, near)
     dense = _filtered(dense, body, required + margin, near)
-    room = np.array([body_clearance(x, y, angle, body, near) for x, y, angle in dense]) - required
-    smooth = BodyPath(dense[:, :2].copy(), dense[:, 2].copy(), lever, np.maximum(room, 0.0), np.zeros(0))
+    leeway = np.array([body_clearance(x, y, angle, body, near) for x, y, angle in dense]) - required
+    smooth = BodyPath(dense[:, :2].copy(), dense[:, 2].copy(), lever, np.maximum(leeway, 0.0), np.zeros(0))
     # The poses of a goal have moved with the smoothing, but are still those with the same numbers.
     return replace(smooth, ends=np.interp(coarse.travel[ends], at, smooth.travel))
 
@@ -129,12 +129,12 @@ def _filtered(poses: Points, body: Points, required: float, near: ClearanceMap) 
     for k, (x, y, angle) in enumerate(smooth):
         if body_clearance(x, y, angle, body, near) < min(required, near_before[k]):
             smooth[k] = poses[k]
-    return smooth
+    return np.asarray(smooth)
 
 
 @compiled
 def _relax(poses: Points, body: Points, required: float, preferred: float, near: ClearanceMap) -> None:
-    """Move each pose to the middle of its neighbours, and turn it along the way, where that costs no clearance it needs.
+    """Move each pose to the middle of its neighbours, and turn it along the way, where the clearance allows.
 
     A clearance may not fall below the one that is preferred; where it is less already, it may not fall at all.
     """

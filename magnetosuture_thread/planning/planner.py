@@ -7,15 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.geometry.needle_arc import needle_points
-from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.clearance_map import CELLS, body_clearance, map_clearance
+from magnetosuture_thread.planning.clearance_map import CELLS, body_clearance, clearance_at, map_clearance
 from magnetosuture_thread.planning.lattice import DIRECTIONS, MOVES, STRIDE, LatticeGoal, search_lattice
 from magnetosuture_thread.planning.path import PREFERRED, BodyPath, smooth_path
 from magnetosuture_thread.planning.procedure import (
@@ -28,16 +26,12 @@ from magnetosuture_thread.planning.procedure import (
     Wrap,
 )
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene import Scene, SceneShape
 
 Vector = NDArray[np.float64]
 
-MARGINS = (
-    1e-4,
-    3e-5,
-    5e-6,
-)  # m; kept beyond the required clearance for errors of control, the widest that there is room for
-SIGHT_SAMPLES = 24
+MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for errors of control: the widest with a way
+VIEW_SAMPLES = 24
 MAX_STATES = 20_000_000
 HEADING_TOLERANCE = 0.3  # rad
 GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
@@ -197,12 +191,12 @@ class NeedlePlanner:
         narrow = midway & (width <= ndimage.minimum_filter(np.where(midway, width, np.inf), 9) * GAP_WIDTH_RATIO)
         labels, count = ndimage.label(narrow, np.ones((3, 3)))
         wanted = np.array(goal.direction) / math.hypot(*goal.direction)
-        slope_y, slope_x = np.gradient(first - second)
+        slope = np.asarray(np.gradient(first - second))
         found = []
         for label in range(1, count + 1):
             rows, columns = np.nonzero(labels == label)
             narrowest = float(width[rows, columns].min())
-            across = np.array([slope_x[rows, columns].mean(), slope_y[rows, columns].mean()])
+            across = np.array([slope[1][rows, columns].mean(), slope[0][rows, columns].mean()])
             if not (size := math.hypot(*across)) > 0.0:
                 continue
             along = np.array([-across[1], across[0]]) / size
@@ -219,13 +213,13 @@ class NeedlePlanner:
 
     def thread_clearance(self, name: str, thread: Points) -> float:
         """Return the greatest distance from a shape of the part of a thread that sweeps the most about it [m]."""
-        geometry, centre = self._geometry(name), self._centre(name)
+        centre = self._centre(name)
         turns = np.unwrap(np.arctan2(*(thread - centre).T[::-1]))
         sense = math.copysign(1.0, turns[-1] - turns[0])
         # The part between the least and the greatest angle.
         first, last = sorted((int(np.argmin(sense * turns)), int(np.argmax(sense * turns))))
-        line = shapely.points(thread[first : last + 1])
-        return float(np.max(shapely.distance(geometry, line)))
+        from_shape = map_clearance(self.scene, (name,))
+        return max(clearance_at(x, y, from_shape) for x, y in thread[first : last + 1].tolist())
 
     def bearing(self, name: str, point: Vector) -> float:
         """Return the direction of a point from the centre of a shape [rad]."""
@@ -254,7 +248,7 @@ class NeedlePlanner:
 
     def _state_of(self, state: Vector) -> NDArray[np.int64]:
         """Return column, row and direction of a state of the lattice."""
-        column, row = np.rint((state[:2] - self.near.origin) / self._step).astype(int)
+        column, row = np.rint((np.asarray(state[:2]) - self.near.origin) / self._step).astype(int)
         return np.array([column, row, int(np.argmin(np.abs(_turn(DIRECTIONS - state[2]))))])
 
     def _nearest_free(self, middle: Vector, angle: float, required: float) -> NDArray[np.int64] | None:
@@ -277,7 +271,7 @@ class NeedlePlanner:
         if isinstance(goal, Wrap):
             wanted = goal.swept if swept is None else swept
             return LatticeGoal(
-                self._sight_of(goal.around), everywhere, any_heading, wanted, self._centre(goal.around), nowhere
+                self._in_view_of(goal.around), everywhere, any_heading, wanted, self._centre(goal.around), nowhere
             )
         at = self.near.origin + self._step * np.arange(self._size)
         x, y = np.meshgrid(at, at)
@@ -303,7 +297,7 @@ class NeedlePlanner:
         headings = np.abs(_turn(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
         return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), place)
 
-    def _sight_of(self, name: str) -> NDArray[np.bool_]:
+    def _in_view_of(self, name: str) -> NDArray[np.bool_]:
         """Return from which points of the lattice nothing is between them and a shape's nearest point."""
         from_shape = map_clearance(self.scene, (name,)).distance[::STRIDE, ::STRIDE]
         others = tuple(other for other in self.scene.names if other != name)
@@ -313,7 +307,7 @@ class NeedlePlanner:
         slope = np.array(np.gradient(from_shape))  # per step, rows first
         rows, columns = np.indices(from_shape.shape)
         free = blocking > 0.0
-        for share in np.linspace(0.1, 1.0, SIGHT_SAMPLES):
+        for share in np.linspace(0.1, 1.0, VIEW_SAMPLES):
             way = share * from_shape / self._step
             at = [
                 np.clip(np.rint(index - way * part), 0, self._size - 1).astype(int)
@@ -334,17 +328,14 @@ class NeedlePlanner:
             expected = f"a place with {1e3 * required:.3g} mm around the needle in some direction"
             raise ConfigurationError(where, [x, y], expected)
 
-    def _geometry(self, name: str) -> shapely.Geometry:
-        shape = next(shape for shape in self.scene.shapes if shape.name == name).geometry
-        if isinstance(shape, Disc):
-            return shapely.Point(shape.centre).buffer(shape.radius, quad_segs=64)
-        return shapely.Polygon(shape.rings[0])
-
     def _centre(self, name: str) -> Vector:
-        return np.array(self._geometry(name).centroid.coords[0])
+        return np.array(self._shape(name).solid.centroid.coords[0])
 
     def _girth(self, name: str) -> float:
-        return float(self._geometry(name).convex_hull.length)
+        return float(self._shape(name).solid.convex_hull.length)
+
+    def _shape(self, name: str) -> SceneShape:
+        return next(shape for shape in self.scene.shapes if shape.name == name)
 
 
 def chain(procedure: Procedure, index: int) -> tuple[Goal, ...]:

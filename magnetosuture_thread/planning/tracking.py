@@ -65,9 +65,9 @@ class PathTracker:
         self._ends = {1.0: path.middles + along, -1.0: path.middles - along}
 
     @property
-    def room(self) -> float:
-        """Room beside the path where the setpoint is [m]."""
-        return self.path.room_at(self.travel)
+    def leeway(self) -> float:
+        """Leeway of the path where the setpoint is [m]."""
+        return self.path.leeway_at(self.travel)
 
     def compute_command(
         self, stamp: float, middle: Vector, angle: float, speed: float, slowdown: float = 1.0

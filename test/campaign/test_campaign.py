@@ -1,0 +1,110 @@
+"""The closed loop without a graph: the same by its seed, other by another, and its command's files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magnetosuture_thread.campaign.run as campaign
+from magnetosuture_thread.campaign.run import RunResult, run_procedure
+from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.cli.main import main
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
+from magnetosuture_thread.setups import Setup, read_setup
+
+SHORT = {"goals": [{"go_to": {"position": [0.008, -0.0145], "tolerance": 1e-3}}], "setup": "hernia_ring"}
+
+
+@pytest.fixture(scope="module")
+def hernia() -> Setup:
+    """Return the setup of the paper's hernia repair."""
+    return read_setup("hernia_ring")
+
+
+@pytest.fixture(scope="module")
+def short() -> Procedure:
+    """Return a procedure of one near place."""
+    return parse_procedure(SHORT, "short")
+
+
+@pytest.fixture(scope="module")
+def first(hernia: Setup, short: Procedure) -> RunResult:
+    """Return what came of it with seed 3."""
+    return run_procedure(short, hernia, vary(hernia, 3))
+
+
+def test_a_near_place_is_reached_by_the_whole_loop(first: RunResult):
+    assert (first.success, first.reason) == (True, "")
+    assert 0.0 < first.ideal_time_s < first.time_s < 1.5 * first.ideal_time_s
+    assert first.min_needle_clearance_m > 1e-3
+    assert (first.max_thread_penetration_m, first.wrap_degrees) == (0.0, 0.0)
+    assert first.max_tension_n > 0.0
+    assert first.last_frames == ()
+
+
+def test_a_seed_gives_the_same_run_and_another_seed_another(hernia: Setup, short: Procedure, first: RunResult):
+    assert run_procedure(short, hernia, vary(hernia, 3)) == first
+    assert run_procedure(short, hernia, vary(hernia, 4)).time_s != first.time_s
+
+
+def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_vary(hernia: Setup):
+    drawn = [vary(hernia, seed) for seed in range(40)]
+    factors = np.array([each.setup.rig.viscosity / hernia.rig.viscosity for each in drawn])
+    assert 0.7 <= factors.min() < 0.8 < 1.2 < factors.max() <= 1.3
+    assert {each.setup.model for each in drawn} == {hernia.model}
+    assert {each.setup.coils for each in drawn} == {hernia.coils}
+    gains = np.array([each.coil_gains for each in drawn])
+    assert np.abs(gains - 1.0).max() <= 0.05
+    assert 0.0 <= min(each.setup.rig.thread_friction for each in drawn)
+    assert max(each.setup.rig.thread_friction for each in drawn) <= 0.3
+
+
+def test_a_start_without_room_is_refused(hernia: Setup):
+    inside = replace(hernia.rig, needle_start=(0.0, 0.005, 0.0), thread_start_curvature=0.0)
+    with pytest.raises(ConfigurationError, match="a start with room around it"):
+        vary(replace(hernia, rig=inside).with_scene(hernia.scene), 0)
+
+
+def test_the_path_follower_runs_for_comparison(hernia: Setup, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(campaign, "MAX_TIME", 3.0)
+    found = run_procedure(read_procedure("hernia"), hernia, vary(hernia, 0), follower=True)
+    assert not found.success
+    assert "not done after 3 s" in found.reason
+    assert found.last_frames[-1].commanded.any()
+
+
+def test_with_the_camera_the_tracker_measures(hernia: Setup, short: Procedure, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(campaign, "MAX_TIME", 1.5)
+    found = run_procedure(short, hernia, vary(hernia, 3), camera=True)
+    moved = [frame.commanded.any() for frame in found.last_frames]
+    assert any(moved)
+    assert not moved[0]
+
+
+def test_the_command_writes_what_came_of_each_seed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = tmp_path / "short.yaml"
+    file.write_text(json.dumps(SHORT))
+    output = tmp_path / "found"
+    assert main(["campaign", str(file), "--seeds", "2", "--first-seed", "3", "--output", str(output)]) == 0
+    content = json.loads((output / "campaign.json").read_text())
+    assert content["simulated"] is True
+    assert [run["seed"] for run in content["runs"]] == [3, 4]
+    assert content["successes"] == sum(run["success"] for run in content["runs"])
+    named = {"seed", "success", "reason", "time_s", "ideal_time_s", "min_needle_clearance_m"}
+    named |= {"max_thread_penetration_m", "longest_rest_s", "wrap_degrees"}
+    assert named <= set(content["runs"][0])
+    assert "runs succeeded (simulated)" in capsys.readouterr().out
+    assert main(["campaign", str(file), "--output", str(output)]) == 1  # exists already
+
+
+def test_a_procedure_that_does_not_fit_its_setup_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = tmp_path / "odd.yaml"
+    file.write_text("setup: hernia_ring\ngoals: [{wrap: {around: nothing, angle: 1.0}}]\n")
+    assert main(["campaign", str(file), "--output", str(tmp_path / "out")]) == 2
+    assert "goals[0].wrap.around" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,183 @@
+"""Procedures on an ideal needle, and on one that is dragged aside, stopped or not known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
+from magnetosuture_thread.planning.planner import NeedlePlanner
+from magnetosuture_thread.planning.procedure import parse_procedure
+from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
+
+NEEDLE = NeedleKinematics(0.0025)
+RATE = 20.0
+POST = SceneShape("post", "instrument", Disc((0.003, 0.0), 0.002))
+KNOWN = ThreadCondition()
+
+
+def executor(*goals: dict[str, Any], **limits: Any) -> ProcedureExecutor:
+    """Return a procedure of some goals beside a post."""
+    procedure = parse_procedure({"goals": list(goals), "limits": limits}, "test")
+    return ProcedureExecutor(procedure, NeedlePlanner(Scene(Dish(), (POST,)), NEEDLE, 2.5e-4, 0.05))
+
+
+class Needle:
+    """An ideal needle: it moves as it is commanded, by a share of it, and is dragged aside while it moves."""
+
+    def __init__(self, x: float = -0.006, y: float = 0.0, angle: float = 0.0) -> None:
+        self.tail, self.heading = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])
+        self.share, self.drift, self.time, self.way = 1.0, np.zeros(2), 1.0, 0.0
+
+    def run(
+        self,
+        run: ProcedureExecutor,
+        seconds: float,
+        condition: Callable[[], ThreadCondition] = lambda: KNOWN,
+        until: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Follow the commands of a procedure for some time, or until it has ended."""
+        end = self.time + seconds
+        while self.time < end and run.state not in (ProcedureState.DONE, ProcedureState.FAILED) and not until():
+            velocity = run.update(self.time, self.tail, self.heading, condition()).velocity
+            self.way += math.hypot(*velocity) / RATE
+            moved = NEEDLE.body_velocity(self.heading, self.share * velocity)
+            self.tail, self.heading = NEEDLE.moved(self.tail, self.heading, *moved, 1.0 / RATE)
+            self.tail = self.tail + self.drift * bool(velocity.any()) / RATE
+            self.time += 1.0 / RATE
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The middle of its chord, shape (2,) [m]."""
+        return self.tail + 0.5 * NEEDLE.chord * self.heading
+
+
+@pytest.mark.parametrize("drift", [(0.0, 0.0), (1e-4, 3e-4), (-3e-4, 0.0)])
+def test_an_ideal_needle_reaches_every_goal(drift: tuple[float, float]):
+    goals = [
+        {"wrap": {"around": "post", "angle": 6.5, "sense": "counterclockwise"}},
+        {"go_to": {"position": [-0.008, 0.004], "heading": [2.5]}},
+        {"withdraw": {}},
+    ]
+    run, needle = executor(*goals), Needle()
+    needle.drift = np.array(drift)
+    run.start()
+    needle.run(run, 200.0)
+    assert (run.state, run.reason, run.goal) == (ProcedureState.DONE, "", 2)
+    assert math.dist(needle.middle, (-0.006 + 0.5 * NEEDLE.chord, 0.0)) < 1e-3
+
+
+def test_nothing_moves_before_the_start_nor_in_a_pause():
+    run, needle = executor({"go_to": {"position": [-0.01, 0.0]}}), Needle()
+    needle.run(run, 1.0)
+    assert (needle.way, run.state) == (0.0, ProcedureState.READY)
+    run.start()
+    needle.run(run, 1.0)
+    run.pause("the operator has taken over")
+    way = needle.way
+    assert way > 0.0
+    needle.run(run, 2.0)
+    assert (needle.way, run.state) == (way, ProcedureState.PAUSED)
+    run.start()
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.DONE
+
+
+def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run.start()
+    needle.run(run, 1.0)
+    way = needle.way
+    needle.run(run, 2.0, lambda: replace(KNOWN, problem="the thread has not been measured for 1.0 s"))
+    assert run.state is ProcedureState.PAUSED
+    assert "not been measured" in run.reason
+    assert needle.way == way
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.DONE
+
+
+def test_a_pause_by_a_person_outlasts_a_thread_that_is_known_again():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run.start()
+    needle.run(run, 0.5, lambda: replace(KNOWN, problem="no thread"))
+    run.pause("by the operator")  # although it is paused already
+    needle.run(run, 3.0)
+    assert run.state is ProcedureState.PAUSED
+
+
+def test_a_needle_that_rests_backs_off_and_is_given_up_in_the_end():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    needle.share = 0.0
+    run.start()
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.FAILED
+    assert "given up" in run.reason
+    assert needle.time < 30.0
+    assert not run.update(needle.time, needle.tail, needle.heading, KNOWN).velocity.any()
+
+
+def test_a_needle_that_rests_for_a_while_gets_there_all_the_same():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run.start()
+    needle.run(run, 0.5)
+    needle.share = 0.0
+    needle.run(run, 2.5)
+    needle.share = 1.0
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.DONE
+
+
+def test_a_needle_that_was_moved_away_is_planned_anew():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run.start()
+    needle.run(run, 1.0)
+    needle.tail = needle.tail + np.array([0.0, 0.006])
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.DONE
+
+
+def test_a_tightened_thread_ends_its_goal_and_one_that_stays_slack_fails():
+    goal = {"tighten": {"tension": 1e-4, "toward": [-0.012, 0.0]}}
+    run, needle = executor(goal), Needle()
+    run.start()
+    needle.run(run, 60.0, lambda: replace(KNOWN, tension=2e-4 if needle.time > 2.0 else 0.0))
+    assert run.state is ProcedureState.DONE
+    assert needle.time == pytest.approx(2.0, abs=0.2)
+    run, needle = executor(goal), Needle()
+    run.start()
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.FAILED
+    assert "not tight" in run.reason
+
+
+def test_tension_near_its_limit_slows_the_needle_down():
+    """A thread whose tension grows with the speed is pulled no harder than the limit."""
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, tension=1e-4), Needle(0.008, 0.008, math.pi)
+    run.start()
+    tensions: list[float] = []
+
+    def condition() -> ThreadCondition:
+        tensions.append(0.1 * (needle.way - before[0]) * RATE)  # 0.2 mN at the speed allowed
+        before[0] = needle.way
+        return replace(KNOWN, tension=tensions[-1])
+
+    before = [0.0]
+    needle.run(run, 120.0, condition)
+    assert run.state is ProcedureState.DONE
+    assert np.percentile(tensions, 95) < 1.1e-4
+
+
+def test_a_shape_that_closes_the_way_fails_the_procedure_with_the_reason():
+    run, needle = executor({"wrap": {"around": "post", "angle": 6.0}}), Needle()
+    run.start()
+    needle.run(run, 1.0)
+    run.set_planner(NeedlePlanner(Scene(Dish()), NEEDLE, 2.5e-4, 0.05))  # the post is gone
+    assert run.state is ProcedureState.FAILED
+    assert "a shape of the scene" in run.reason
