@@ -214,6 +214,9 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("decoy_needle", 8, 6003),
         ("rod_in_path", 11, 12001),  # a pale line grinds an end of a rod to a point
         ("decoy_needle", 97, 31001),  # a walk over bare floor reaches the thread
+        ("decoy_needle", 32, 91001),  # a faint reflection of the lamp leaves the tail
+        ("decoy_at_thread", 59, 91001),  # the thread passes beyond the tail, and touches nothing
+        ("decoy_at_thread", 9, 91001),  # a walk has one edge only, the thread's
     ],
 )
 def test_poses_that_were_reversed_once_are_not(name: str, index: int, seed: int):
