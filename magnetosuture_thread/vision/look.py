@@ -26,6 +26,7 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import certain_points, walk_from
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
 from magnetosuture_thread.vision.thread.observe import observe
+from magnetosuture_thread.vision.thread.search import Walk
 
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
@@ -263,41 +264,38 @@ def with_thread(
 ) -> tuple[MeasuredNeedle | None, np.ndarray, str]:
     """Return the needle that a thread leaves, the thread's centreline [px], and why there is none where there is none.
 
-    Args:
-        picture: the frame or a part of it.
-        view: of the dish.
-        settings: what to look for.
-        diameter: of the dish [m].
-        needles: that were found, at least one.
+    `needles` are all that were found, at least one; see `look_once`.
     """
-    walks, passes = zip(*(centreline_of(picture, view, settings, diameter, needle) for needle in needles), strict=True)
-    lengths = [float(arc_lengths(walk)[-1]) for walk in walks]
+    found = [centreline_of(picture, view, settings, diameter, needle) for needle in needles]
+    lengths = [float(arc_lengths(line)[-1]) for line, _ in found]
     best = int(np.argmax(lengths))
+    needle, (line, walk) = needles[best], found[best]
     thread = settings.thread_length / view.metres_per_pixel
-    needed = MIN_FOLLOWED * thread
-    if lengths[best] >= needed and sum(length >= needed for length in lengths) == 1:
-        return needles[best], walks[best], ""
-    if len(needles) > 1:
-        return None, walks[best], f"{len(needles)} needles in the dish"
+    followed = sum(length >= MIN_FOLLOWED * thread for length in lengths)
+    if len(needles) > 1 and followed != 1:
+        return None, line, f"{len(needles)} needles in the dish"
+    if walk is None or (followed and not walk.ridge.signed):
+        return needle, line, ""
+    # What is faint or pale, as glare, is no thread either while one that is dark beyond doubt lies elsewhere.
     wall = Wall(_local(view, picture).centre_px, 0.5 * diameter / view.metres_per_pixel)
-    if passes[0] or (needles[0].heading_known and has_loose_thread(picture, needles[0], wall, MIN_LOOSE * thread)):
-        return None, walks[0], "a needle that no thread leaves, and a thread beside it"
-    return needles[0], walks[0], ""
+    if walk.passes or has_loose_thread(picture, needle, wall, MIN_LOOSE * thread, line if followed else None):
+        return None, line, "a needle that no thread leaves, and a thread beside it"
+    return needle, line, ""
 
 
 def centreline_of(
     picture: Picture, view: DishView, settings: VisionTrackerSettings, diameter: float, needle: MeasuredNeedle
-) -> tuple[np.ndarray, bool]:
+) -> tuple[np.ndarray, Walk | None]:
     """Return the thread's centreline from a needle's tail on, in the picture's pixels; one point if none is seen.
 
-    The other value is whether a line passes the tail instead, see `joins_passing_line`.
+    The other value is the walk that gave it, None if nothing tells where the tail is.
     """
     if not needle.heading_known:
-        return needle.tail_px[None], False
+        return needle.tail_px[None], None
     wall = 0.5 * diameter / view.metres_per_pixel
     max_length = MAX_LENGTH_RATIO * settings.thread_length / view.metres_per_pixel
     walk = walk_from(picture, needle, max_length, _local(view, picture).centre_px, wall, doubted=True)
-    return certain_points(walk), walk.passes
+    return certain_points(walk), walk
 
 
 def tracked(

@@ -10,8 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
@@ -200,6 +202,33 @@ def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.C
     given = ["--setup", str(file), "--scene", "dish_35mm", "--json", str(tmp_path / "seen.json")]
     assert cli.main(["track", str(SAMPLES), *given]) == 0
     assert {row["status"] for row in json.loads((tmp_path / "seen.json").read_text())} == {"tracked"}
+
+
+def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    case, image = frame_of("distortion", 2, 31)
+    assert case.lens is not None
+    values = {"rows": 3, "cols": 3, "data": case.lens.matrix.ravel().tolist()}
+    info = {
+        "image_width": case.size[0],
+        "image_height": case.size[1],
+        "camera_matrix": values,
+        "distortion_model": case.lens.model,
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": case.lens.coefficients.tolist()},
+    }
+    frame, lens, output = tmp_path / "frame.png", tmp_path / "lens.yaml", tmp_path / "camera.yaml"
+    cv2.imwrite(str(frame), image)
+    lens.write_text(yaml.safe_dump(info))
+    straight = calibrate_camera([frame], 0.035, output, camera_info=lens).view
+    assert straight.metres_per_pixel == pytest.approx(case.view.metres_per_pixel, rel=3e-3)
+    assert calibrate_camera([frame], 0.035, output).view.metres_per_pixel != pytest.approx(
+        case.view.metres_per_pixel, rel=6e-3
+    )
+    lens.write_text(yaml.safe_dump(info | {"image_width": 1280}))
+    given = ["--dish-diameter", "0.035", "--output", str(output), "--camera-info", str(lens)]
+    assert cli.main(["calibrate-camera", str(frame), *given]) == 1
+    assert "camera_info.width" in error_of(capsys)
 
 
 def test_frames_that_show_no_dish_or_no_markers_calibrate_nothing(tmp_path: Path):

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.vision.frames import distorted, lens_with
 from magnetosuture_thread.bags.message_types import MESSAGES, make, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
@@ -21,6 +23,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import (
+    CAMERA_INFO,
     COMPRESSED_IMAGE,
     ESTIMATED_THREAD,
     GROUND_TRUTH_THREAD,
@@ -39,6 +42,7 @@ from magnetosuture_thread.model.margins import UNKNOWN, Friction, FrictionState
 from magnetosuture_thread.offline.predictions import predictions, read_observations
 from magnetosuture_thread.scene import SceneShape
 from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.vision.images import decode_image
 from test.bags.bags import changed
 
 SETUP = read_setup("petri_35mm_polyamide")
@@ -89,6 +93,30 @@ def test_sights_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_p
         assert observation.measured.shape == (64, 2)
         assert observation.ground_truth.shape == (51, 2)
         assert observation.processing > 0.0
+
+
+def test_frames_are_seen_through_the_lens_in_camera_info(short_bag: Path, tmp_path: Path):
+    lens, bend = lens_with(-0.05, (640, 480)), distorted(-0.05)
+    view = SETUP.rig.camera(SETUP.scene).view
+
+    def through_lens(told: bool, old: RecordedMessage, message: Any) -> Any:
+        if old.topic == CAMERA_INFO.recorded:
+            message.k, message.d = lens.matrix.ravel(), lens.coefficients if told else np.zeros(5)
+        elif old.topic == COMPRESSED_IMAGE.recorded:
+            message.data = cv2.imencode(".png", bend(decode_image(message.data), view))[1].ravel()
+        return message
+
+    def tails(bag: Path) -> dict[int, np.ndarray]:
+        found = read_observations(Recording(Bag(bag)), SETUP, duration=0.3)
+        return {each.stamp: each.tail for each in found if not each.reason}
+
+    plain, errors = tails(short_bag), []
+    for told in (True, False):
+        found = tails(changed(short_bag, tmp_path / f"{told}", partial(through_lens, told)))
+        assert len(found) >= len(plain) - 1  # The first frame comes before its camera_info.
+        errors.append(max(float(np.linalg.norm(tail - plain[stamp])) for stamp, tail in found.items()))
+    assert errors[0] < 5e-5
+    assert errors[1] > 2.0 * errors[0]
 
 
 def test_a_window_is_a_part_of_the_whole(pose_bag: Path):

@@ -69,6 +69,8 @@ def add(subparsers: Subparsers) -> None:
     option("--dish-diameter", type=number_argument(0.005, 0.5), required=True, metavar="D", help=diameter)
     markers = "of the ArUco markers around the dish [m] (default: by the dish's rim)"
     option("--markers", type=number_argument(1e-3, 2.0), nargs=2, metavar=("SPACING", "SIDE"), help=markers)
+    lens = "the lens, as ROS's camera_calibration_parsers writes it (YAML; default: a bag's camera_info)"
+    option("--camera-info", type=Path, metavar="FILE", help=lens)
     option("--output", type=output_file, required=True, metavar="FILE", help="parameter file to write")
 
     option = command(subparsers, "calibrate-coils", run_calibrate_coils).add_argument
@@ -134,9 +136,8 @@ def run_calibrate_camera(options: argparse.Namespace) -> int:
     """
     log = make_log(make_console())
     markers = tuple(options.markers) if options.markers else None
-    found = calibrate_camera(
-        options.frames, options.dish_diameter, options.output, markers, remap=dict(options.remap), log=log
-    )
+    given = {"remap": dict(options.remap), "camera_info": options.camera_info, "log": log}
+    found = calibrate_camera(options.frames, options.dish_diameter, options.output, markers, **given)
     u, v = found.view.centre_px
     scale, turned = found.view.metres_per_pixel * 1e3, found.view.rotation
     log(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
@@ -153,6 +154,7 @@ def calibrate_camera(
     markers: tuple[float, float] | None = None,
     *,
     remap: Mapping[str, str] | None = None,
+    camera_info: Path | None = None,
     log: Callable[[str], None] = lambda text: None,
 ) -> Calibration:
     """Calibrate from frames and write a section `vision_tracker` of a ROS 2 parameter file.
@@ -163,18 +165,21 @@ def calibrate_camera(
         output: the file to write.
         markers: spacing and side of the ArUco markers [m]; None to calibrate by the dish's rim.
         remap: new name of a bag's topic by its recorded name.
+        camera_info: file with the lens, whose distortion is undone first; None: a bag's own.
         log: called with a line for a person on what of a bag is damaged or not checked.
 
     Raises:
         BagError: there are no frames that can be read, or the file cannot be written.
-        InvalidInputError: the frames don't show what they must.
+        InvalidInputError: the frames don't show what they must, or the lens is not that of a frame.
     """
     import numpy as np
 
     from magnetosuture_thread.jobs.output import whole_file
     from magnetosuture_thread.jobs.track import FrameSource
     from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers
+    from magnetosuture_thread.vision.lens import read_lens
 
+    given = read_lens(camera_info) if camera_info is not None else None
     source = FrameSource(paths, remap=remap)
     for doubt in source.doubts:
         log(f"{paths[0]} {doubt}")
@@ -183,7 +188,12 @@ def calibrate_camera(
     for index, frame in enumerate(source):
         if index % every or frame.image is None:
             continue
-        lens = source.lens if source.lens is not None and source.lens.problem_with(frame.image.shape) is None else None
+        lens = given or source.lens
+        problem = lens.problem_with(frame.image.shape) if lens is not None else None
+        if problem is not None:
+            if given is not None:
+                raise problem
+            lens = None
         images.append(np.asarray(frame.image) if lens is None else lens.undistorted(frame.image))
     for line in source.refused:
         log(line)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.ellipse import Ellipse
 from magnetosuture_thread.vision.dish.find import RAYS, rim_points
+from magnetosuture_thread.vision.dish.rings import perspective_by_rings, second_ring
 from magnetosuture_thread.vision.dish.robust_fits import fit_rim
 
 MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
@@ -27,11 +28,18 @@ class Tilt:
         angle: between its axis and the dish's normal [rad].
         direction: in the image, along which the dish looks shortened [rad], from u towards v.
         rotation: of the dish's x axis in the image [rad]; see `DishView`.
+        nearness: ratio of the dish's radius to its distance from the camera, positive if the side in the direction is
+            nearer; 0 where nothing tells.
+        nearness_error: standard deviation of it.
+        radius_px: of the dish in the image [px].
     """
 
     angle: float
     direction: float
     rotation: float = 0.0
+    nearness: float = 0.0
+    nearness_error: float = NEAR
+    radius_px: float = 1.0
 
     @property
     def direction_in_dish(self) -> np.ndarray:
@@ -42,7 +50,7 @@ class Tilt:
     def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
         """Return what perspective leaves unknown, shape (3, 3) [m, m, rad].
 
-        An ellipse does not tell which side is nearer.
+        An ellipse alone does not tell which side is nearer; see `perspective_by_rings`.
 
         Args:
             tail: in the dish frame, shape (2,) [m].
@@ -51,7 +59,7 @@ class Tilt:
         """
         along = self.direction_in_dish
         change = perspective(tail, heading, radius)
-        either = change @ (math.tan(self.angle) * along)
+        either = change @ (self.nearness_error / NEAR * math.tan(self.angle) * along)
         return np.outer(either, either) + unseen_tilt_covariance(tail, heading, ANGLE_ERROR, radius)
 
     @property
@@ -60,14 +68,19 @@ class Tilt:
         return f"the camera is tilted by {math.degrees(self.angle):.0f} degrees"
 
     def corrected(self, image: np.ndarray, view: DishView) -> np.ndarray:
-        """Return a frame stretched about the dish's centre, so that the dish is a circle."""
+        """Return a frame as a straight camera would see it: the dish is a circle about its centre.
+
+        A point p of it, from the centre, is seen at A p / (1 - k sin t e . p / R), where A shortens along e by cos t.
+        """
         along = np.array([math.cos(self.direction), math.sin(self.direction)])
-        back = np.eye(2) + (math.cos(self.angle) - 1.0) * np.outer(along, along)
-        centre = np.array(view.centre_px)
-        inverse = np.column_stack([back, centre - back @ centre])
+        tilted = np.eye(3)
+        tilted[:2, :2] += (math.cos(self.angle) - 1.0) * np.outer(along, along)
+        tilted[2, :2] = -self.nearness * math.sin(self.angle) / self.radius_px * along
+        to_centre = np.array([[1.0, 0.0, view.centre_px[0]], [0.0, 1.0, view.centre_px[1]], [0.0, 0.0, 1.0]])
+        inverse = to_centre @ tilted @ np.linalg.inv(to_centre)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size = image.shape[1::-1]
-        return np.asarray(cv2.warpAffine(image, inverse, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
+        return np.asarray(cv2.warpPerspective(image, inverse, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
 def tilt_of(ellipse: Ellipse, rotation: float) -> Tilt | None:
@@ -136,4 +149,21 @@ def find_tilt(gray: np.ndarray, view: DishView, diameter: float) -> tuple[Tilt |
     direction = 0.5 * math.atan2(float(shape[1]), float(shape[0])) + 0.5 * math.pi
     middle = (view.centre_px[0] + float(fitted[1]), view.centre_px[1] + float(fitted[2]))
     scale = view.metres_per_pixel * float(fitted[0]) / (float(fitted[0]) + half)
-    return Tilt(angle, direction, view.rotation), DishView(middle, scale, view.rotation)
+    tilt, view = Tilt(angle, direction, view.rotation), DishView(middle, scale, view.rotation)
+    return _with_perspective(gray, fitted, tilt, view)
+
+
+def _with_perspective(gray: np.ndarray, rim: np.ndarray, tilt: Tilt, view: DishView) -> tuple[Tilt, DishView]:
+    """Return a tilt that knows its nearer side, and the view about the dish's centre, where a second ring shows it."""
+    middle = np.array(view.centre_px)
+    ring = second_ring(gray, rim, middle, RAYS)
+    if ring is None:
+        return tilt, view
+    ratio, offset = ring
+    radius, along = float(rim[0]), np.array([math.cos(tilt.direction), math.sin(tilt.direction)])
+    found = perspective_by_rings(ratio, float(offset @ along), radius, tilt.angle, NEAR)
+    if found is None:
+        return tilt, view
+    u, v = middle - radius * found[0] * math.sin(tilt.angle) * math.cos(tilt.angle) * along
+    tilt = replace(tilt, nearness=found[0], nearness_error=found[1], radius_px=radius)
+    return tilt, replace(view, centre_px=(float(u), float(v)))

@@ -6,8 +6,11 @@ the size of the pixels. A thread that leaves the end makes the step lower in som
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.needle.template import TemplateFit
 from magnetosuture_thread.vision.sampling import straighten
@@ -34,32 +37,74 @@ def tail_shift(steel: SteelMap, fit: TemplateFit) -> float | None:
     dark = np.empty((len(along), 2 * count + 1))
     axis = float(fit.arc.start[0]), float(fit.arc.start[1]), fit.arc.angle, fit.arc.curvature
     straighten(steel.dark, axis, along, SIDE_PX * np.arange(-count, count + 1), dark)
+    shift = float(_shift_of(along, dark, steel.depth))
+    return None if math.isnan(shift) else shift
+
+
+@compiled
+def _shift_of(along, dark, depth):
+    """Return the shift of `tail_shift` by the darkness at places along the lines, shape (places, lines); NaN: none."""
+    lines = dark.shape[1]
+    body, near = np.empty(lines), np.empty(lines)
+    mean, slope, ends = np.empty(lines), np.empty(lines), np.empty(lines)
     shift = 0.0
     for _ in range(2):  # The second time by levels around the end that the first one found.
-        body = dark[(along > shift + LEVEL_PX) & (along < shift + 2.0 * LEVEL_PX)].mean(axis=0)
-        outside = (along > shift - REACH_PX) & (along < shift - LEVEL_PX)
-        places = along[outside] - along[outside].mean()
-        slopes = places @ dark[outside] / (places @ places)
-        behind = dark[outside].mean(axis=0) + slopes * (shift - along[outside].mean())
-        lines = np.flatnonzero(body - behind > MIN_STEP * steel.depth)
-        if len(lines) < MIN_LINES:
-            return None
-        half = 0.5 * (body + behind)
-        ends = np.array([_crossing(along, dark[:, line], half[line]) for line in lines])
-        near = dark[(along > shift - REACH_PX) & (along < shift - BESIDE_PX)][:, lines].max(axis=0)
-        more = (near - near.min()) / (THREAD * steel.depth)
-        weights = 1.0 / (1.0 + more * more)
-        weights /= weights.sum()
-        shift = float(weights @ ends)
-        if not abs(shift) < MAX_SHIFT_PX or weights @ np.abs(ends - shift) > MAX_SPREAD_PX:
-            return None
+        body[:], near[:], mean[:], slope[:] = 0.0, -np.inf, 0.0, 0.0
+        inside, outside, middle, square = 0, 0, 0.0, 0.0
+        for row in range(len(along)):
+            s = along[row]
+            if shift + LEVEL_PX < s < shift + 2.0 * LEVEL_PX:
+                inside += 1
+                body += dark[row]
+            if shift - REACH_PX < s < shift - LEVEL_PX:
+                outside += 1
+                middle += s
+                mean += dark[row]
+            if shift - REACH_PX < s < shift - BESIDE_PX:
+                near = np.maximum(near, dark[row])
+        body /= inside
+        mean /= outside
+        middle /= outside
+        for row in range(len(along)):
+            if shift - REACH_PX < along[row] < shift - LEVEL_PX:
+                square += (along[row] - middle) ** 2
+                slope += (along[row] - middle) * dark[row]
+        behind = mean + slope / square * (shift - middle)
+        rising, thread = 0, np.inf
+        for line in range(lines):
+            ends[line] = np.nan
+            if body[line] - behind[line] > MIN_STEP * depth:
+                rising += 1
+                thread = min(thread, near[line])
+                ends[line] = _crossing(along, dark[:, line], 0.5 * (body[line] + behind[line]))
+                if math.isnan(ends[line]):
+                    return np.nan
+        if rising < MIN_LINES:
+            return np.nan
+        total, place = 0.0, 0.0
+        weights = np.zeros(lines)
+        for line in range(lines):
+            if not math.isnan(ends[line]):
+                more = (near[line] - thread) / (THREAD * depth)
+                weights[line] = 1.0 / (1.0 + more * more)
+                total += weights[line]
+                place += weights[line] * ends[line]
+        shift = place / total
+        spread = 0.0
+        for line in range(lines):
+            if weights[line] > 0.0:
+                spread += weights[line] * abs(ends[line] - shift) / total
+        if not abs(shift) < MAX_SHIFT_PX or spread > MAX_SPREAD_PX:
+            return np.nan
     return shift
 
 
-def _crossing(along: np.ndarray, dark: np.ndarray, half: float) -> float:
+@compiled
+def _crossing(along, dark, half):
     """Return the last place at which the darkness rises above a level; NaN if it does not."""
-    below = np.flatnonzero(dark[:-1] < half)
-    if not len(below) or dark[below[-1] + 1] <= half:
-        return float("nan")
-    last = below[-1]
-    return float(along[last] + STEP_PX * (half - dark[last]) / (dark[last + 1] - dark[last]))
+    for row in range(len(dark) - 2, -1, -1):
+        if dark[row] < half:
+            if dark[row + 1] <= half:
+                return np.nan
+            return along[row] + STEP_PX * (half - dark[row]) / (dark[row + 1] - dark[row])
+    return np.nan

@@ -27,6 +27,7 @@ SURE_STRENGTH = 2.0 * FAINTEST  # grey levels; of a fainter thread noise hides s
 FAINT_SHARE = 0.4  # of its usual strength, that it shows in the mean where it is visible
 SMOOTHED_PX = 9.0  # along the thread, over which its darkness is averaged
 LOCAL_PX = 4.0  # along the thread, over which its middle is averaged
+UNEVEN = 1.0  # grey levels, by which light on a thread's two sides differs
 MIN_DEVIATION_PX = 0.12  # of a middle: by pixels, compression, and the evening out of bends
 MIN_POINTS, ENOUGH_POINTS = 8, 32  # of a thread, that its look is measured on
 BEND = 0.004  # 1 / px; standard deviation of the curvature of a thread that isn't visible
@@ -61,14 +62,17 @@ class Appearance:
     def deviation(self, strength: Values) -> Values:
         """Return the standard deviation of its middle, where it is as strong as given [px].
 
-        sigma^2 = n^2 / (A^2 l sqrt(pi) / (2 s)) + sigma_0^2
+        sigma^2 = n^2 / (A^2 l sqrt(pi) / (2 s)) + (g w / (2 A))^2 + sigma_0^2
 
-        for a Gaussian profile of height A and standard deviation s = w / 2.355 in noise n for each pixel, averaged over
-        a length l of the thread (Cramer-Rao bound), and `MIN_DEVIATION_PX`.
+        for a Gaussian profile of height A, width w and standard deviation s = w / 2.355 in noise n for each pixel,
+        averaged over a length l of the thread (Cramer-Rao bound); light that differs by g = `UNEVEN` on its two sides,
+        as by its shadow; and `MIN_DEVIATION_PX`.
         """
         spread = self.width_px / 2.355
-        ratio = self.noise / np.maximum(strength, FAINTEST)
-        return np.asarray(np.sqrt(ratio**2 * 2.0 * spread / (LOCAL_PX * math.sqrt(math.pi)) + MIN_DEVIATION_PX**2))
+        height = np.maximum(strength, FAINTEST)
+        noise, uneven = self.noise / height, 0.5 * UNEVEN * self.width_px / height
+        variance = noise**2 * 2.0 * spread / (LOCAL_PX * math.sqrt(math.pi)) + uneven**2 + MIN_DEVIATION_PX**2
+        return np.asarray(np.sqrt(variance))
 
 
 def tangents_of(points: Points) -> Points:

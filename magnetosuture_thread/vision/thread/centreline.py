@@ -11,6 +11,7 @@ from magnetosuture_thread.vision.images import Picture
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.search import (
     ENOUGH,
+    FAINT,
     MIN_CENTRED,
     SCALES,
     SURE_SHARE,
@@ -25,6 +26,7 @@ WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the midd
 MIN_CONFIDENCE = 0.9  # of a crossing, that the thread is followed beyond
 FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
 MIN_BEGINNING, MIN_EVIDENCE = 2.5, 5.0  # mean evidence where a thread comes out and of all of it: more than noise shows
+MIN_EDGE = 0.15  # share of the evidence, that a thread's fainter edge has: less, and it is the border of something else
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,12 @@ def walk_from(
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
             centred = search.centred(wide)[0]
             best = centred if centred.shown > SURE_SHARE * wide.shown else wide  # a rope's edges are too far apart
-    return search.resolved(search.without_passing_line(best) if doubted else best)
+    if doubted:
+        own = search.without_passing_line(best)
+        # A faint line that passes, as the border of tissue, does not speak against a thread that is dark beyond doubt.
+        instead = own.passes and best is not dark and dark.strength > FAINT
+        best = search.without_passing_line(dark) if instead else own
+    return search.resolved(best)
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
@@ -142,7 +149,7 @@ def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
             if walk.shown < FAINT_SHARE * enough:
                 continue
             centred, section = search.centred(walk)
-            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE:
+            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE or section.fainter_edge < MIN_EDGE:
                 continue
             # At half the size a thread and its shadow are one: what is as clear at full size is taken from there.
             total = section.mean * centred.shown

@@ -28,6 +28,7 @@ COLOUR_VERTICES = 20  # the same of the thread's colour
 BEND_PRICE = 1.0  # of a change of the shift by one step from vertex to vertex, in units of the log-likelihood
 MAX_CHANGE = 3  # steps, by which the shift may change from vertex to vertex
 WINDOW = 4  # vertices to both sides of a stretch, in which floor has to be the better explanation for a thread to end
+BEGINNING = 2 * WINDOW + 1  # vertices where a thread comes out
 MIN_FLOOR = 1.0  # mean evidence against a thread in a stretch, where it ends
 SHADOW = 0.5  # of a thread's usual contrast, that its shadow may show, whose edges are no sharp ones
 EVEN = 2  # vertices to both sides, over which shifts are averaged
@@ -48,17 +49,19 @@ class CrossSection:
         half_width: of the thread [px].
         evidence: log-likelihood ratio of a thread against bare floor at each vertex, 0 where it is hidden, shape (m,).
         visible: which are not hidden, shape (m,).
+        edges: of the two edges what each adds to c . D, shape (m, 2), see `centred_between_edges`.
     """
 
     points: Points
     half_width: float
     evidence: Values
     visible: NDArray[np.bool_]
+    edges: Values
 
     @property
     def beginning(self) -> float:
         """Mean evidence where the thread comes out."""
-        return _mean_of(self.evidence[self.visible][: 2 * WINDOW + 1])
+        return _mean_of(self.evidence[self.visible][:BEGINNING])
 
     @property
     def mean(self) -> float:
@@ -69,6 +72,18 @@ class CrossSection:
     def weakest(self) -> float:
         """The least mean evidence of a stretch."""
         return float(_mean(self.evidence[self.visible][:, None], WINDOW).min()) if self.visible.any() else 0.0
+
+    @property
+    def fainter_edge(self) -> float:
+        """The share of c . D that the fainter edge has, where the thread comes out and of all of it, whichever is less.
+
+        It is a half of an even thread, and 0 along the border of something else.
+        """
+        shares = []
+        for edges in (self.edges[self.visible][:BEGINNING], self.edges[self.visible]):
+            sums = edges.sum(axis=0)
+            shares.append(float(sums.min() / max(sums.sum(), 1e-9)))
+        return min(shares)
 
     def up_to_its_end(self) -> CrossSection:
         """Return the part up to where the thread ends.
@@ -82,7 +97,13 @@ class CrossSection:
         count = int(np.argmax(np.cumsum(searched))) + 1
         strong = np.flatnonzero(stretches[:count] > SHADOW**2 * float(np.median(stretches[:count])))
         count = int(strong[-1]) + 1 if len(strong) else 1
-        return CrossSection(self.points[:count], self.half_width, self.evidence[:count], self.visible[:count])
+        return CrossSection(
+            self.points[:count],
+            self.half_width,
+            self.evidence[:count],
+            self.visible[:count],
+            self.edges[:count],
+        )
 
 
 def centred_between_edges(
@@ -132,11 +153,12 @@ def centred_between_edges(
     own = _mean(found, COLOUR_VERTICES)
     visible = ~(hidden(points) | on_needle[:, np.abs(aside) <= half_width].any(axis=1))
     evidence = np.where(visible, (found * own).sum(axis=1) - 0.5 * (own**2).sum(axis=1), 0.0)
+    each = np.einsum("iec,ic->ie", _edges_at(white, half_width, shifts), own)
     exact = shifts + _vertex(likeness, shifts) - difference.shape[1] // 2
     shift = cv2.blur(exact * STEP_PX, (1, 2 * EVEN + 1), borderType=cv2.BORDER_REPLICATE)
     along = tangents_of(points)
     points = points + shift.reshape(-1, 1) * np.column_stack([-along[:, 1], along[:, 0]])
-    return CrossSection(points, half_width, evidence, visible)
+    return CrossSection(points, half_width, evidence, visible, each)
 
 
 def _white_edges(
@@ -178,6 +200,13 @@ def _differences(white: Values, half_width: float) -> Values:
     most = round(ASIDE * half_width / STEP_PX)
     first, last = centre - most, centre + most + 1
     return np.asarray(white[:, first - half : last - half] - white[:, first + half : last + half])
+
+
+def _edges_at(white: Values, half_width: float, shifts: NDArray[np.int64]) -> Values:
+    """Return the two edges whose sum is `_differences` at a shift in each row, shape (m, 2, colours)."""
+    half = round(half_width / STEP_PX)
+    middle_at = white.shape[1] // 2 - round(ASIDE * half_width / STEP_PX) + shifts
+    return np.stack([_at(white, middle_at - half), -_at(white, middle_at + half)], axis=1)
 
 
 def _mean(values: Values, half: int) -> Values:

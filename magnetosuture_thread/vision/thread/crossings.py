@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.vision.thread.appearance import runs, sampled
+from magnetosuture_thread.vision.sampling import within
+from magnetosuture_thread.vision.thread.appearance import runs
 from magnetosuture_thread.vision.thread.arms import (
     RADIUS_PX,
     SHOWN,
@@ -122,23 +125,56 @@ def resolve_crossings(
 
 def _meetings(ridge: Ridge, path: NDArray[np.float64], begin: int) -> list[tuple[int, int]]:
     """Return first vertex and the one after the last of each place from a vertex on where strands meet a path."""
-    turns = 2.0 * np.pi * np.arange(RING) / RING
-    ring = path[begin:, None, :2] + RADIUS_PX * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-    if not len(ring):
+    meets = np.zeros(max(0, len(path) - begin), np.bool_)
+    if not len(meets):
         return []
-    values = sampled(ridge.strength, ring) - ridge.noise
-    around = np.pad(values, ((0, 0), (2, 2)), mode="wrap")
-    peaks = values > np.maximum(SHOWN * path[begin:, 4, None], ridge.faintest)
-    peaks &= (values > around[:, :-4]) & (values > around[:, 1:-3])
-    peaks &= (values >= around[:, 3:-1]) & (values >= around[:, 4:])
-    rows, columns = ridge.hidden.shape
-    small = np.floor(ring + 0.5).astype(int) // ridge.factor
-    hidden = ridge.hidden[np.clip(small[..., 1], 0, rows - 1), np.clip(small[..., 0], 0, columns - 1)] > 0
-    meets = (peaks.sum(axis=1) > 2) & ~hidden.any(axis=1)
+    strands_meet(ridge.strength, ridge.hidden, ridge.factor, ridge.noise, ridge.faintest, path[begin:], meets)
     for first, last in runs(~meets):
         if first > 0 and last < len(meets) and last - first <= MAX_GAP:
             meets[first:last] = True
     return [(begin + first, begin + last) for first, last in runs(meets)]
+
+
+@compiled
+def strands_meet(strength, hidden, factor, noise, faintest, path, meets):
+    """Fill in at which vertices of a path more than two strands cross a ring around them, of which nothing is hidden.
+
+    Args:
+        strength: of the ridge, uint8.
+        hidden: where nothing can be seen, not 0 there, `factor` times smaller.
+        factor: see `hidden`.
+        noise: strength where nothing is.
+        faintest: a strength above noise that is no noise.
+        path: shape (m, 6), see `walk_on`.
+        meets: filled, shape (m,).
+    """
+    rows, columns = hidden.shape
+    values, ways = np.empty(RING), np.empty((RING, 2))
+    for place in range(RING):
+        ways[place, 0] = RADIUS_PX * math.cos(2.0 * math.pi * place / RING)
+        ways[place, 1] = RADIUS_PX * math.sin(2.0 * math.pi * place / RING)
+    for index in range(len(path)):
+        meets[index] = False
+        is_covered = False
+        for place in range(RING):
+            u, v = path[index, 0] + ways[place, 0], path[index, 1] + ways[place, 1]
+            column = min(max(int(u + 0.5) // factor, 0), columns - 1)
+            row = min(max(int(v + 0.5) // factor, 0), rows - 1)
+            if hidden[row, column] != 0:
+                is_covered = True
+                break
+            values[place] = within(strength, u, v) - noise
+        if is_covered:
+            continue
+        bound, peaks = max(SHOWN * path[index, 4], faintest), 0
+        for place in range(RING):
+            value = values[place]
+            if value <= bound:
+                continue
+            before = value > values[place - 1] and value > values[place - 2]
+            after = value >= values[(place + 1) % RING] and value >= values[(place + 2) % RING]
+            peaks += before and after
+        meets[index] = peaks > 2
 
 
 def _turn(path: NDArray[np.float64], strong: NDArray[np.bool_], at: int, entry: Arm, out: Arm) -> tuple[int, int]:

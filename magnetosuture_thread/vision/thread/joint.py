@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import arc_lengths
+from magnetosuture_thread.vision.sampling import middle, sample
 from magnetosuture_thread.vision.thread.ridge import Ridge
 
 TAIL_PX = 3.0  # from the tail, up to which its own edge shows
@@ -39,49 +44,121 @@ def joins_passing_line(points: np.ndarray, ridge: Ridge, origin: tuple[int, int]
     if along[-1] < JOINT_PX + ridge.scale * AHEAD_PX:
         return False
     at = np.arange(TAIL_PX, min(NEXT_PX, float(along[-1])), 1.0)
-    strengths = _strengths(ridge, points_at(points, at), origin)
+    near = _Near.around(points[0], ridge, origin)
+    strengths = near.strengths(_points_at(points, along, at))
     start, following = (part[~np.isnan(part)] for part in np.split(strengths, [int(START_PX)]))
     if not len(following):
         return False
-    usual = float(np.median(following))
+    usual = middle(following)
     if len(start) and np.mean(start < START_SHARE * usual) > MAX_FAINT:
         return True
-    return _goes_back(points, float(along[-1]), ridge, origin, usual)
-
-
-def _goes_back(points: np.ndarray, length: float, ridge: Ridge, origin: tuple[int, int], usual: float) -> bool:
-    """Say whether a line goes on backwards from one of the first places of a walk, off the walk itself."""
     scale = float(ridge.scale)
     joints = np.arange(0.0, JOINT_PX, STEP_PX)
-    begin, ahead = points_at(points, joints), points_at(points, joints + scale * AHEAD_PX)
-    angles = np.arctan2(*(begin - ahead).T[::-1])
-    back = np.arange(BACK_FIRST_PX, BACK_LAST_PX, STEP_PX)
-    # Arcs from each joint, shape (joints, turns, bends, points).
-    turned = angles[:, None, None, None] + _TURNS[:, None, None] + 0.5 * _BENDS[:, None] * back
-    way = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
-    arcs = begin[:, None, None, None] + scale * back[:, None] * way
-    strengths = _strengths(ridge, arcs.reshape(-1, 2), origin).reshape(arcs.shape[:-1])
-    visible = np.nan_to_num(strengths, nan=-np.inf).min(axis=-1) > BACK_SHARE * usual
-    if not visible.any():
-        return False
-    # The walk may turn round and come back on the line that it joined: only its way there, and later ones, are its own.
-    at = np.arange(0.0, length, STEP_PX)
-    own = points_at(points, at)
-    ends = arcs[visible][:, len(back) // 2 :]
-    others = (at > joints[np.nonzero(visible)[0]][:, None]) & (at < RETURN_PX)
-    apart = np.linalg.norm(ends[:, :, None] - own, axis=-1).min(axis=1)
-    apart[others] = np.inf
-    return bool((apart.min(axis=1) > scale * APART_PX).any())
+    begin, ahead = (_points_at(points, along, joints + beyond) for beyond in (0.0, scale * AHEAD_PX))
+    own = np.arange(0.0, float(along[-1]), STEP_PX)
+    return bool(_goes_back(*near.arrays, usual, joints, begin, ahead, own, _points_at(points, along, own)))
 
 
-def _strengths(ridge: Ridge, points: np.ndarray, origin: tuple[int, int]) -> np.ndarray:
-    """Return how strong a ridge is around points of the picture; NaN where it is hidden."""
-    at = (points - origin - 0.5 * (ridge.scale - 1)) / ridge.scale
-    u, v = at.astype(np.float32).T
-    near = cv2.dilate(ridge.strength, np.ones((3, 3), np.uint8))
-    strengths = cv2.remap(near, u[None], v[None], cv2.INTER_LINEAR)[0].astype(float) - ridge.noise
-    rows, columns = ridge.hidden.shape
-    column, row = (np.round(each).astype(int) // ridge.factor for each in (u, v))
-    hidden = ridge.hidden[row.clip(0, rows - 1), column.clip(0, columns - 1)] > 0
-    strengths[hidden] = np.nan
-    return strengths
+def _points_at(points: np.ndarray, along: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Return the points at lengths of a polyline whose vertices lie at known ones; see `points_at`."""
+    return np.column_stack([np.interp(lengths, along, each) for each in points.T])
+
+
+@dataclass(frozen=True)
+class _Near:
+    """How strong a ridge is around each pixel near the tail.
+
+    Attributes:
+        strength: the greatest within a pixel, shape (rows, columns), uint8.
+        hidden: see `Ridge`.
+        geometry: the first pixel's column and row in the ridge; its scale and the origin in the picture, the factor of
+            what is hidden, and the strength where nothing is, shape (7,).
+    """
+
+    strength: np.ndarray
+    hidden: np.ndarray
+    geometry: np.ndarray
+
+    @classmethod
+    def around(cls, tail: np.ndarray, ridge: Ridge, origin: tuple[int, int]) -> _Near:
+        """Return the part of a ridge that is looked at around a tail [px]."""
+        scale = ridge.scale
+        reach = round((NEXT_PX + JOINT_PX) / scale + BACK_LAST_PX + AHEAD_PX)
+        at = np.round((tail - origin - 0.5 * (scale - 1)) / scale).astype(int)
+        rows, columns = ridge.strength.shape
+        left, top = (max(0, min(int(low) - reach, side - 2)) for low, side in zip(at, (columns, rows), strict=True))
+        right, bottom = (max(2, int(high) + reach) for high in at)
+        part = cv2.dilate(ridge.strength[top:bottom, left:right], np.ones((3, 3), np.uint8))
+        geometry = np.array([left, top, scale, *origin, ridge.factor, ridge.noise], np.float64)
+        return cls(np.asarray(part), ridge.hidden, geometry)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What compiled code takes."""
+        return self.strength, self.hidden, self.geometry
+
+    def strengths(self, points: np.ndarray) -> np.ndarray:
+        """Return how strong the ridge is around points of the picture; NaN where it is hidden."""
+        values = np.empty(len(points))
+        _strengths(*self.arrays, points, values)
+        return values
+
+
+@compiled
+def _strength(strength, hidden, geometry, u, v):
+    """Return how strong a ridge is around a point of the picture; NaN where it is hidden."""
+    scale, factor = geometry[2], int(geometry[5])
+    u, v = (u - geometry[3] - 0.5 * (scale - 1.0)) / scale, (v - geometry[4] - 0.5 * (scale - 1.0)) / scale
+    column = min(max(int(np.floor(u + 0.5)) // factor, 0), hidden.shape[1] - 1)
+    row = min(max(int(np.floor(v + 0.5)) // factor, 0), hidden.shape[0] - 1)
+    if hidden[row, column] != 0:
+        return np.nan
+    return sample(strength, u - geometry[0], v - geometry[1]) - geometry[6]
+
+
+@compiled
+def _strengths(strength, hidden, geometry, points, values):
+    """Fill in how strong a ridge is around points of the picture; NaN where it is hidden."""
+    for index in range(len(points)):
+        values[index] = _strength(strength, hidden, geometry, points[index, 0], points[index, 1])
+
+
+@compiled
+def _goes_back(strength, hidden, geometry, usual, joints, begin, ahead, along, points):
+    """Say whether a line goes on backwards from one of the first places of a walk, off the walk itself.
+
+    Arcs are tried from each joint, at `begin`, away from the walk's direction there, towards `ahead`. The walk may turn
+    round and come back on the line that it joined: only its way there, and later ones, are its own; `points` are those
+    of the walk at the lengths `along`.
+    """
+    scale = geometry[2]
+    count = round((BACK_LAST_PX - BACK_FIRST_PX) / STEP_PX)
+    arc = np.empty((count, 2))
+    for joint in range(len(joints)):
+        u, v = begin[joint, 0], begin[joint, 1]
+        angle = math.atan2(v - ahead[joint, 1], u - ahead[joint, 0])
+        for turn in _TURNS:
+            for bend in _BENDS:
+                visible = True
+                for index in range(count):
+                    back = BACK_FIRST_PX + STEP_PX * index
+                    turned = angle + turn + 0.5 * bend * back
+                    arc[index, 0], arc[index, 1] = (
+                        u + scale * back * math.cos(turned),
+                        v + scale * back * math.sin(turned),
+                    )
+                    if not _strength(strength, hidden, geometry, arc[index, 0], arc[index, 1]) > BACK_SHARE * usual:
+                        visible = False  # also where it is hidden
+                        break
+                if not visible:
+                    continue
+                nearest = np.inf
+                for place in range(len(along)):
+                    if along[place] > joints[joint] and along[place] < RETURN_PX:
+                        continue
+                    for index in range(count // 2, count):
+                        x, y = arc[index, 0] - points[place, 0], arc[index, 1] - points[place, 1]
+                        nearest = min(nearest, x * x + y * y)
+                if nearest > (scale * APART_PX) ** 2:
+                    return True
+    return False

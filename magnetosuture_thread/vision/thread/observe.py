@@ -89,10 +89,10 @@ def observe(
     gone = gaps_of(line.visible, GAP_PX, begin)
     parts = parts_without(line, gone)
     in_dish = _Dish(view, thread, scale_known)
-    ends_bare = is_bare_beyond(picture, gray, thread, parts[0], needle)
     plain = strengths(gray, walk, thread, two_sided=True) > max(FAINTEST, MIN_SHARE * thread.strength)
     gapless = not gone.any() and not gaps_of(plain | below, OBJECT_GAP_PX, begin).any()
     if gapless and _is_whole(line, length):  # Nothing is left of the thread to look for.
+        ends_bare = is_bare_beyond(picture, gray, thread, parts[0], needle)
         end = PieceEnd.FREE if ends_bare else PieceEnd.UNKNOWN
         whole = in_dish.piece(line, PieceEnd.TAIL, end, (0.0, 0.0), 1.0)
         return ThreadObservation((whole,), complete=ends_bare, hidden=(_outline(needle, view),))

@@ -42,15 +42,14 @@ def is_hidden(hidden, factor, u, v):
 def arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, scores):
     """Fill in the strength of the ridge along each of many arcs ahead, as a share of the usual, less its price."""
     u, v, angle, bend = state
+    ahead, beside = STEP_PX * math.cos(angle), STEP_PX * math.sin(angle)
     for index in range(len(bends)):
         tried = bends[index]
-        # The arc as chords: each is the last one turned by the same angle.
+        # The arc as chords: each is the last one turned by the same angle, the first by half of it.
         x, y = u, v
-        across, down = (
-            STEP_PX * math.cos(angle + 0.5 * tried * STEP_PX),
-            STEP_PX * math.sin(angle + 0.5 * tried * STEP_PX),
-        )
-        cosine, sine = math.cos(tried * STEP_PX), math.sin(tried * STEP_PX)
+        half, half_sine = math.cos(0.5 * tried * STEP_PX), math.sin(0.5 * tried * STEP_PX)
+        across, down = ahead * half - beside * half_sine, beside * half + ahead * half_sine
+        cosine, sine = 1.0 - 2.0 * half_sine * half_sine, 2.0 * half * half_sine
         score, weight = 0.0, 0.0
         for step in range(AHEAD):
             x, y = x + across, y + down
