@@ -87,6 +87,10 @@ class Barrier(ABC):
     def set_time(self, time: float) -> None:  # noqa: B027 - most barriers do not move
         """Set the time of the next evaluation [s]; a barrier that moves overrides this."""
 
+    def rows_after(self, before: Points, positions: Points) -> BarrierRows:
+        """Return all rows at positions to which the nodes moved from `before`, for barriers whose side that decides."""
+        return self.rows(positions)
+
     @abstractmethod
     def value(self, positions: Points) -> NDArray[np.float64]:
         """Return h of each row, shape (m,)."""
