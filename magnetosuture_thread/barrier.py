@@ -67,7 +67,7 @@ class Barrier(ABC):
         h(y) + grad h(y)' (x + dt u - y) >= (1 - min(gain, 1 / dt) dt) h(x)
 
     over the velocities u of the nodes, until it holds at the end of the step. A row that depends on nodes of which
-    the first and the last are at most two apart keeps the program banded; any other is solved by a general solver.
+    the first and the last are at most two apart keeps the program banded; any other costs a substitution more.
 
     `positions` are those of all nodes of a thread, shape (n + 1, d) [m], node 0 at the needle's tail; for a
     `NeedleSafetyFilter` those of points along the needle, from tail to tip.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import shapely
 
-from benchmarks.self_contact import move_at_random, random_path
+from benchmarks.self_contact import move_model, random_path, start_nodes
 from magnetosuture_thread import ConfigurationError, InvalidInputError, NeedlePose, Scene, ThreadPredictor
 from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.thread import Attachment, Medium, Thread
@@ -86,13 +86,13 @@ def test_a_node_that_passed_through_a_segment_is_on_its_wrong_side():
 @pytest.mark.parametrize("seed", range(6))
 def test_no_random_motion_takes_a_thread_through_itself(seed: int):
     """`python -m benchmarks contact` does a thousand of them."""
-    done = move_at_random(seed, True, 200)
+    done = move_model(seed, True, 200)
     assert done.crossed == 0
     assert done.unconverged + done.refused <= 0.1 * done.steps
 
 
 def test_random_motions_cross_where_they_may():
-    done = [move_at_random(seed, False, 200) for seed in range(6)]
+    done = [move_model(seed, False, 200) for seed in range(6)]
     assert sum(each.crossed for each in done) > 50
 
 
@@ -125,11 +125,10 @@ def test_a_loop_closes_and_opens_again():
 def test_forces_of_self_contact_are_equal_and_opposite():
     """Where the node at the needle's tail, which the needle holds, is not in contact itself."""
     predictor = predictor_of(True)
-    nodes = loop_behind(0.0195, 1.2e-3)
-    predictor.start(NeedlePose(0.0, nodes[0], EAST), nodes)
+    predictor.start(NeedlePose(0.0, np.zeros(2), EAST), start_nodes())
     touches, barrier = 0, SelfContact(predictor.thread)
-    for k, (tail, heading) in enumerate(random_path(1, 300, 8e-3), 1):
-        prediction = predictor.step(NeedlePose(k / RATE, tail, heading))
+    for k, (tail, angle) in enumerate(random_path(1, 300), 1):
+        prediction = predictor.step(NeedlePose(k / RATE, tail, np.array([math.cos(angle), math.sin(angle)])))
         rows = barrier.rows(prediction.positions)
         near = rows.nodes[rows.value < 1e-5]
         if not prediction.converged or not len(near) or (near == 0).any():
