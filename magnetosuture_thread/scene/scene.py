@@ -110,7 +110,7 @@ class Dish:
             if not (is_number(value) and low <= value <= high):
                 raise scene_error(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
         _check_friction("dish.wall_friction", self.wall_friction)
-        if self.self_contact not in (None, True, False):
+        if not (self.self_contact is None or isinstance(self.self_contact, bool)):
             raise scene_error("dish.self_contact", self.self_contact, "true, false, or nothing: by the depth")
 
     def has_self_contact(self, thread_diameter: float) -> bool:

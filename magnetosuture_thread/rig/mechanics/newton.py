@@ -56,7 +56,7 @@ class NewtonBuffers(NamedTuple):
     slip: NDArray[np.float64]
     pairs: NDArray[np.float64]
     second: NDArray[np.float64]
-    count: NDArray[np.int64]
+    paired: NDArray[np.int64]
 
 
 def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
@@ -77,7 +77,7 @@ def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
         slip=np.zeros(1),
         pairs=np.zeros((PAIRS_PER_NODE * (segments + 1), 6)),
         second=np.zeros(PAIRS_PER_NODE * (segments + 1)),
-        count=np.zeros(1, dtype=np.int64),
+        paired=np.zeros(1, dtype=np.int64),
     )
 
 
@@ -104,8 +104,8 @@ def assemble_energy(
     energy += add_contact(q, rod, shapes, buffers.rows, g, band, convex)
     energy += add_friction(q, buffers.begin, buffers.slip[0], buffers.friction, g, band)
     energy += add_clamp(q, needle, rod.segment, g, band, convex)
-    if buffers.count[0] > 0:
-        pairs, second = buffers.pairs[: buffers.count[0]], buffers.second[: buffers.count[0]]
+    if buffers.paired[0] > 0:
+        pairs, second = buffers.pairs[: buffers.paired[0]], buffers.second[: buffers.paired[0]]
         energy += add_pairs(q, buffers.begin, buffers.slip[0], 2.0 * rod.radius, shapes.stiffness, pairs, second, g)
     if not driven:
         rest, turned, rows = buffers.rest, buffers.turned, buffers.rows
@@ -163,8 +163,8 @@ def _minimise(
         for i in range(size):
             buffers.step[i] = -buffers.gradient[i]
         back_substitute(buffers.chol, buffers.step)
-        if buffers.count[0] > 0:
-            pairs, second = buffers.pairs[: buffers.count[0]], buffers.second[: buffers.count[0]]
+        if buffers.paired[0] > 0:
+            pairs, second = buffers.pairs[: buffers.paired[0]], buffers.second[: buffers.paired[0]]
             couple(buffers.chol, pairs, second, 3 if driven else 0, buffers.step)
         slope = 0.0
         move = abs(buffers.step[0]) * arm
@@ -244,8 +244,8 @@ def advance(
     turn_resistance(needle, trial[0], 1.0 / (beta * dt), buffers.turned)
     find_friction(q, rod, shapes, buffers.rows, buffers.friction)
     buffers.begin[:], buffers.slip[0] = q, SLIP_SPEED * dt
-    buffers.count[0] = find_pairs(q, rod, shapes, buffers.pairs) if shapes.self_contact else 0
-    if buffers.count[0] < 0:
+    buffers.paired[0] = find_pairs(q, rod, shapes, buffers.pairs) if shapes.self_contact else 0
+    if buffers.paired[0] < 0:
         return -1, np.inf, np.inf
     start = trial.copy()
     done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, False)
