@@ -3,7 +3,7 @@
 The thread model first steers its needle, a point, as `magnetosuture reproduce hernia` does. Then the rig's rod, of
 springs and with many more segments, is driven along the same way, and the model, with several n, is compared with it.
 The same with friction, of the rig's own code and the model's; then friction alone: capstans, a thread that is held, and
-the time of a step.
+the time of a step. Last, random motions in which the thread may not pass through itself.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.friction import friction_table, measure_friction
+from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli.terminal import make_log
@@ -40,11 +41,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     option = parser.add_argument
     option("--bag", type=Path, default=STEERING, metavar="BAG", help="steering to repeat (default: the example)")
+    option("--motions", type=int, default=1000, metavar="N", help="random motions of a thread that touches itself")
     option("--segments", type=int, nargs="+", default=[40, 80], metavar="N", help="of the model (default: 40 80)")
 
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
-    """Measure; return the figures, and whether no chord is too deep and every step converged."""
+    """Measure; return the figures, and whether no chord is too deep, all steps converged and nothing passed through."""
     log = make_log(console)
     setup = read_setup("hernia_ring")
     log("the thread model steers its needle")
@@ -81,8 +83,12 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     log("friction by itself")
     friction = measure_friction()
     console.print(friction_table(friction))
+    log(f"a thread that touches itself: {options.motions} random motions")
+    selves = measure_self_contact(options.motions)
+    console.print(self_contact_table(selves))
     passed = all(row["deepest_m"] <= MAX_DEPTH and row["not_converged"] == 0 for row in rows)
-    return {"cases": rows, "friction": friction}, passed
+    passed = passed and selves["model"]["crossed"] == selves["rig"]["crossed"] == 0
+    return {"cases": rows, "friction": friction, "self_contact": selves}, passed
 
 
 def _with_friction(setup: Setup, friction: float) -> Setup:

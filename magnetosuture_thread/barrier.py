@@ -67,7 +67,7 @@ class Barrier(ABC):
         h(y) + grad h(y)' (x + dt u - y) >= (1 - min(gain, 1 / dt) dt) h(x)
 
     over the velocities u of the nodes, until it holds at the end of the step. A row that depends on nodes of which
-    the first and the last are at most two apart keeps the program banded; any other is solved by a general solver.
+    the first and the last are at most two apart keeps the program banded; any other costs a substitution more.
 
     `positions` are those of all nodes of a thread, shape (n + 1, d) [m], node 0 at the needle's tail; for a
     `NeedleSafetyFilter` those of points along the needle, from tail to tip.
@@ -86,6 +86,10 @@ class Barrier(ABC):
 
     def set_time(self, time: float) -> None:  # noqa: B027 - most barriers do not move
         """Set the time of the next evaluation [s]; a barrier that moves overrides this."""
+
+    def rows_after(self, before: Points, positions: Points) -> BarrierRows:
+        """Return all rows at positions to which the nodes moved from `before`, for barriers whose side that decides."""
+        return self.rows(positions)
 
     @abstractmethod
     def value(self, positions: Points) -> NDArray[np.float64]:

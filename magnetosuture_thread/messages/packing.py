@@ -116,15 +116,17 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
         step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
     """
     vertices, forces = prediction.positions, prediction.forces
-    tension, contact, pull, moment = np.empty(0), np.empty((0, 2)), (0.0, 0.0), 0.0
+    tension, contact, pull, moment, states, use = np.empty(0), np.empty((0, 2)), (0.0, 0.0), 0.0, b"", np.empty(0)
     if forces is not None:
         tension, contact = forces.tension, forces.contact
         pull, moment = forces.needle_force.tolist(), forces.needle_moment
+        if forces.friction_use.any():
+            states, use = bytes(forces.friction_states), forces.friction_use
     nodes = np.flatnonzero(contact.any(axis=1))
     words = (prediction.formulation, prediction.scene_version, material, prediction.solver, prediction.status)
     formulation, scene, thread, solver, status = map(text, words)
     sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.strain), solver[0], status[0])
-    return BEGIN + _prediction_form(*sizes, len(tension), len(nodes)).pack(
+    return BEGIN + _prediction_form(*sizes, len(tension), len(nodes), len(use)).pack(
         *time,
         *DISH,
         *formulation,
@@ -143,6 +145,10 @@ def packed_prediction(time: Time, prediction: Prediction, material: str, *, step
         *pull,
         0.0,
         moment,
+        len(states),
+        states,
+        len(use),
+        numbers(use, REAL),
         *solver,
         *status,
         prediction.residual,
@@ -269,12 +275,14 @@ def _prediction_form(
     status: int,
     tensions: int,
     contacts: int,
+    rubbed: int,
 ) -> struct.Struct:
     """Return the format of a PredictedThread with texts of these lengths, and so many vertices, segments and forces."""
     begin = (*HEADER, *text_codes(formulation), *text_codes(scene), *text_codes(material))
     arrays = (*array_codes(vertices, "d", 3), *array_codes(segments, "d"), *array_codes(tensions, "d"))
     pushes = (*array_codes(contacts, "I"), *array_codes(contacts, "d", 3), *"dddd")
-    return form(*begin, *arrays, *pushes, *text_codes(solver), *text_codes(status), "d", "d", "I", "d")
+    friction = (*array_codes(rubbed, "B"), *array_codes(rubbed, "d"))
+    return form(*begin, *arrays, *pushes, *friction, *text_codes(solver), *text_codes(status), "d", "d", "I", "d")
 
 
 @lru_cache(KEPT)

@@ -19,6 +19,8 @@ from magnetosuture_thread.scene.scene import (
     SceneShape,
 )
 
+SELF_CONTACT = {None: 0, True: 1, False: 2}  # as in Scene.msg
+
 
 def scene_fields(scene: Scene) -> dict[str, Any]:
     """Return the fields of a scene message as built-in values by name, without the header.
@@ -31,6 +33,7 @@ def scene_fields(scene: Scene) -> dict[str, Any]:
         "dish_diameter": scene.dish.diameter,
         "dish_depth": scene.dish.depth,
         "wall_friction": scene.dish.wall_friction,
+        "self_contact": SELF_CONTACT[scene.dish.self_contact],
         "shapes": [_shape_fields(shape) for shape in scene.shapes],
     }
 
@@ -51,7 +54,8 @@ def parse_scene_message(message: Any) -> Scene:
     _require_bounds(message)
     try:
         wall_friction = float(getattr(message, "wall_friction", 0.0))  # not in messages of before
-        dish = Dish(float(message.dish_diameter), float(message.dish_depth), wall_friction)
+        self_contact = _self_contact(int(getattr(message, "self_contact", 0)))
+        dish = Dish(float(message.dish_diameter), float(message.dish_depth), wall_friction, self_contact)
         scene = Scene(dish, tuple(_shape_of(shape) for shape in message.shapes))
     except ConfigurationError as error:
         raise InvalidInputError(f"{SCENE.name}.{error.name}", repr(error.value), error.expectation) from None
@@ -59,6 +63,13 @@ def parse_scene_message(message: Any) -> Scene:
         given = repr(message.version[: 2 * VERSION_CHARS])
         raise InvalidInputError(f"{SCENE.name}.version", given, f"{scene.version!r}, the hash of the content")
     return scene
+
+
+def _self_contact(value: int) -> bool | None:
+    for setting, number in SELF_CONTACT.items():
+        if number == value:
+            return setting
+    raise ConfigurationError("self_contact", value, "0, 1 or 2, see the message's constants")
 
 
 def _shape_fields(shape: SceneShape) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -18,6 +18,7 @@ from magnetosuture_thread.model.formulations import (
     Formulation,
     PaperOptions,
     PrescribedMotion,
+    RodFormulation,
     StepResult,
     ThreadState,
     make_formulation,
@@ -25,11 +26,13 @@ from magnetosuture_thread.model.formulations import (
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
 from magnetosuture_thread.model.program import SOLVED, Residuals
+from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.solvers import make_solver
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread, check_scene, direction_between
 from magnetosuture_thread.scene import Scene
 
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
+MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
 
 
 class ThreadPredictor:
@@ -98,6 +101,8 @@ class ThreadPredictor:
                 wall_friction=scene.dish.wall_friction,
             )
             self.scene_version = scene.version
+            if formulation == RodFormulation.name and scene.dish.has_self_contact(thread.diameter):
+                barriers = (*barriers, SelfContact(thread))
         if isinstance(formulation, str):
             chosen = make_solver(solver, residual_tolerance)
             formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
@@ -213,8 +218,8 @@ class ThreadPredictor:
             vertices: all nodes, shape (n + 1, d) [m].
 
         Raises:
-            InvalidInputError: the pose or a node is not finite, there are not n + 1 nodes, or the first is
-                farther than a segment from the tail.
+            InvalidInputError: the pose or a node is not finite, there are not n + 1 nodes, the first is
+                farther than a segment from the tail, or segments cross where the scene does not allow it.
         """
         check_pose(pose)
         wanted = (self.thread.segments + 1, len(pose.tail))
@@ -224,6 +229,7 @@ class ThreadPredictor:
         if gap > self.thread.segment_length:
             nearest = f"at most {self.thread.segment_length:.2e} m"
             raise InvalidInputError("thread's first node", f"{gap:.2e} m from the needle's tail", nearest)
+        self.formulation.check_start(vertices)
         self.state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
         self.pose = pose
         return self._prediction(pose, 0.0, 0, None, None, Residuals(0.0, 0.0, 0.0), True)
@@ -272,19 +278,46 @@ class ThreadPredictor:
         wanted = max(interval / self._longest_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
         substeps = min(self._most_substeps, math.ceil(wanted - 1e-9))
         residuals, done, worst, converged = Residuals(0.0, 0.0, 0.0), None, None, True
-        for index in range(1, substeps + 1):
-            part = index / substeps
+
+        def drive(part: float) -> PrescribedMotion:
             heading = direction_between(last.heading, pose.heading, part)
-            done = self.formulation.step(
-                state,
-                PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval),
-                interval / substeps,
-            )
-            state, residuals = done.state, residuals.or_worse(done.residuals)
-            converged = converged and done.converged
-            worst = done if worst is None or worst.status == SOLVED else worst
+            return PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval)
+
+        steps, taken = ((index / substeps, interval / substeps) for index in range(1, substeps + 1)), 0
+        for part, duration in steps:
+            for done in self._follow(state, drive, part, duration, interval):
+                state, residuals = done.state, residuals.or_worse(done.residuals)
+                converged, taken = converged and done.converged, taken + 1
+                worst = done if worst is None or worst.status == SOLVED else worst
+        substeps = taken
         self.pose, self.state = pose, state
         return self._prediction(pose, interval, substeps, done, worst, residuals, converged)
+
+    def _follow(
+        self,
+        state: ThreadState,
+        drive: Callable[[float], PrescribedMotion],
+        part: float,
+        duration: float,
+        interval: float,
+        halvings: int = 0,
+    ) -> Iterator[StepResult]:
+        """Yield the sub-step that ends at a part of the interval, or more of them where the thread would pass itself.
+
+        Raises:
+            SolverError: it would do so in the shortest of them, or see `step`.
+        """
+        done = self.formulation.step(state, drive(part), duration)
+        if not done.passed:
+            yield done
+            return
+        if halvings == MAX_HALVINGS:
+            self.formulation.forget()
+            raise SolverError(done.solver, "the thread would pass through itself", math.inf, 0.0)
+        for end in (part - 0.5 * duration / interval, part):
+            for done in self._follow(state, drive, end, 0.5 * duration, interval, halvings + 1):
+                state = done.state
+                yield done
 
     def _prediction(
         self,

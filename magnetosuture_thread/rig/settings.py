@@ -109,7 +109,7 @@ class RigSettings(Configuration):
     thread_drag_along: float = quantity(0.487, "the same along it", unit="Pa s", minimum=1e-6, maximum=1e3)
     thread_friction: float = quantity(
         0.0,
-        "coefficient of friction of the thread on shapes and wall, whatever the scene says",
+        "coefficient of friction of the thread on shapes, wall and itself, whatever the scene says",
         minimum=0.0,
         maximum=2.0,
     )
@@ -148,13 +148,18 @@ class RigSettings(Configuration):
 
         Raises:
             ConfigurationError: needle or thread would start in the wall or in a shape, or the looks are those of
-                another number of shapes.
+                another number of shapes, or the thread would start on itself where the scene does not allow it.
         """
         count = len(scene.shapes)
         if self.obstacle_looks and len(self.obstacle_looks) != count:
             expectation = f"one for each of the scene's {count} shapes, or none"
             raise ConfigurationError(f"{self.GROUP}.obstacle_looks", list(self.obstacle_looks), expectation)
         at = np.linspace(0.0, 1.0, 100)
+        turn = abs(self.thread_start_curvature) * self.thread_length
+        if turn >= 2.0 * math.pi and scene.dish.has_self_contact(self.thread_diameter):
+            curvature, most = self.thread_start_curvature, 2.0 * math.pi / self.thread_length
+            expectation = f"less than {most:.4g} 1/m to either side: the thread would lie on itself"
+            raise ConfigurationError(f"{self.GROUP}.thread_start_curvature", curvature, expectation)
         x, y, heading = self.needle_start
         needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
         for name, points in {"a needle": needle, "a thread": self.thread_at_start(at)}.items():
@@ -226,6 +231,7 @@ class RigSettings(Configuration):
             polygons=tuple(o.rings[0] for o in scene.obstacles if isinstance(o, Polygon)),
             wall_radius=scene.dish.radius,
             friction=self.thread_friction,
+            self_contact=scene.dish.has_self_contact(self.thread_diameter),
         )
 
     def dynamics(self, scene: Scene) -> RigDynamics:

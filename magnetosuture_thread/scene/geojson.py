@@ -17,7 +17,13 @@ import shapely.geometry
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.mapping import dish_from_mapping, dish_to_mapping, make_scene, shape_from_mapping
+from magnetosuture_thread.scene.mapping import (
+    DISH_FIELDS,
+    dish_from_mapping,
+    dish_to_mapping,
+    make_scene,
+    shape_from_mapping,
+)
 from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, scene_error
 
 DISH = "dish"  # kind of the feature that is the dish
@@ -31,6 +37,7 @@ PROPERTIES = (
     "diameter",
     "depth",
     "wall_friction",
+    "self_contact",
     "definition",
 )
 
@@ -136,7 +143,7 @@ class _FeatureReader:
         if self._type != "Point" or _planar(self._coordinates) != [0.0, 0.0]:
             raise self._error("geometry", [self._type, self._coordinates], "a Point at 0, 0, the dish's centre")
         given = self.properties
-        fields = {name: given[name] for name in ("diameter", "depth", "wall_friction") if given.get(name) is not None}
+        fields = {name: given[name] for name in DISH_FIELDS if given.get(name) is not None}
         if "diameter" not in fields and "radius" in given:
             raise self._error("properties.radius", given["radius"], "diameter, for a dish")
         return dish_from_mapping(fields, self._source)

@@ -20,6 +20,7 @@ from magnetosuture_thread.scene.scene import (
 )
 from magnetosuture_thread.scene.shapes import ROUNDABLE, SHAPES, ShapeFields
 
+DISH_FIELDS = ("diameter", "depth", "wall_friction", "self_contact")
 MAX_CORNER_RADIUS = 0.1  # m
 
 
@@ -85,7 +86,7 @@ def _to_builtin(value: Any) -> Any:
 
 
 def dish_from_mapping(values: Any, source: str = "") -> Dish:
-    """Return a dish from its fields, diameter and depth [m] and the wall's friction; all but the first may be left out.
+    """Return a dish from its fields; all but the diameter may be left out.
 
     Raises:
         ConfigurationError: a field is missing, unknown or out of its bounds.
@@ -93,22 +94,28 @@ def dish_from_mapping(values: Any, source: str = "") -> Dish:
     if not isinstance(values, Mapping) or "diameter" not in values:
         raise scene_error("dish", values, "diameter and depth [m]", source)
     for field in values:
-        if field not in ("diameter", "depth", "wall_friction"):
-            raise scene_error(f"dish.{field}", values[field], "one of diameter, depth, wall_friction", source)
-    for field, value in values.items():
+        if field not in DISH_FIELDS:
+            raise scene_error(f"dish.{field}", values[field], f"one of {', '.join(DISH_FIELDS)}", source)
+    numbers = {field: value for field, value in values.items() if field != "self_contact"}
+    for field, value in numbers.items():
         if not is_number(value):
             unit = "" if field == "wall_friction" else " [m]"
             raise scene_error(f"dish.{field}", value, f"a number{unit}", source)
     try:
-        return Dish(**{field: float(value) for field, value in values.items()})
+        given = {field: float(value) for field, value in numbers.items()}
+        return Dish(**given, self_contact=values.get("self_contact"))
     except ConfigurationError as error:
         raise ConfigurationError(error.name, error.value, error.expectation, source) from None
 
 
-def dish_to_mapping(dish: Dish) -> dict[str, float]:
+def dish_to_mapping(dish: Dish) -> dict[str, float | bool]:
     """Return a dish as a scene file describes it."""
-    fields = {"diameter": dish.diameter, "depth": dish.depth}
-    return {**fields, "wall_friction": dish.wall_friction} if dish.wall_friction else fields
+    fields: dict[str, float | bool] = {"diameter": dish.diameter, "depth": dish.depth}
+    if dish.wall_friction:
+        fields["wall_friction"] = dish.wall_friction
+    if dish.self_contact is not None:
+        fields["self_contact"] = dish.self_contact
+    return fields
 
 
 def make_scene(dish: Dish, shapes: tuple[SceneShape, ...], source: str = "") -> Scene:

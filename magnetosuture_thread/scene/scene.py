@@ -64,6 +64,7 @@ MAX_HOLES = 100  # of a polygon: each is compared with each
 MAX_NAME_CHARS = 64
 MAX_COORDINATE = 1.0  # m; anything larger is in another unit
 MIN_RADIUS = 1e-6  # m
+CROSSING_DEPTH = 2.0  # diameters of a thread, in a liquid of which it can pass over itself
 VERSION_CHARS = 16
 
 
@@ -90,6 +91,8 @@ class Dish:
         diameter: inner diameter [m].
         depth: of the liquid in it [m].
         wall_friction: Coulomb's coefficient of the thread on the wall.
+        self_contact: whether a thread touches itself where it would cross itself; None where the depth decides, see
+            `has_self_contact`.
 
     Raises:
         ConfigurationError: a value is not finite or not within its bounds.
@@ -98,6 +101,7 @@ class Dish:
     diameter: float = 0.035
     depth: float = 0.003
     wall_friction: float = 0.0
+    self_contact: bool | None = None
 
     def __post_init__(self) -> None:
         """Check the bounds."""
@@ -106,6 +110,20 @@ class Dish:
             if not (is_number(value) and low <= value <= high):
                 raise scene_error(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
         _check_friction("dish.wall_friction", self.wall_friction)
+        if not (self.self_contact is None or isinstance(self.self_contact, bool)):
+            raise scene_error("dish.self_contact", self.self_contact, "true, false, or nothing: by the depth")
+
+    def has_self_contact(self, thread_diameter: float) -> bool:
+        """Return whether a thread touches itself where it would cross itself.
+
+        It passes over itself where the liquid is two diameters deep or more, unless `self_contact` is set.
+
+        Args:
+            thread_diameter: [m].
+        """
+        if self.self_contact is not None:
+            return self.self_contact
+        return self.depth < CROSSING_DEPTH * thread_diameter
 
     @property
     def radius(self) -> float:
@@ -247,7 +265,7 @@ class Scene:
     def version(self) -> str:
         """Hash of the content: equal for scenes with the same dish, names, kinds, geometry and friction, bit for bit.
 
-        A scene without friction has the version that it had before there was any.
+        A scene without friction, and where the depth decides on self-contact, has the version of before there was any.
         """
         digest = hashlib.sha256(struct.pack("<2d", self.dish.diameter, self.dish.depth))
         for shape in self.shapes:
@@ -262,6 +280,8 @@ class Scene:
         coefficients = (self.dish.wall_friction, *self.friction)
         if any(coefficients):
             digest.update(struct.pack(f"<B{len(coefficients)}d", 2, *coefficients))
+        if self.dish.self_contact is not None:
+            digest.update(struct.pack("<B?", 3, self.dish.self_contact))
         return digest.hexdigest()[:VERSION_CHARS]
 
     @property

@@ -95,7 +95,12 @@ def test_a_prediction_is_packed_as_rclpy_makes_it(touching: tuple[int, ...] | No
         contact = np.zeros((segments + 1, 2))
         nodes = [node for node in touching if node <= segments]
         contact[nodes] = random.normal(size=(len(nodes), 2))
-        forces = ThreadForces(1e-6 * tension, contact, np.array([1e-6, -2e-6]), 3e-9, *np.zeros((2, segments + 1)))
+        use = np.linspace(0.0, 1.0, segments + 1) if len(touching) == 1 else np.zeros(segments + 1)
+        forces = ThreadForces(1e-6 * tension, contact, np.array([1e-6, -2e-6]), 3e-9, 1e-7 * use, use)
+        if use.any():
+            free, sliding = PredictedThread.FRICTION_FREE, PredictedThread.FRICTION_SLIDING
+            expected.friction_states = [free, *[PredictedThread.FRICTION_STUCK] * (segments - 1), sliding]
+            expected.friction_use = use.tolist()
         expected.tension, expected.contact_nodes = (1e-6 * tension).tolist(), nodes
         expected.contact_forces = [Vector3(x=x, y=y) for x, y in contact[nodes].tolist()]
         expected.needle_force, expected.needle_moment = Vector3(x=1e-6, y=-2e-6), 3e-9

@@ -69,6 +69,15 @@ def test_a_dish_alone_is_a_scene(tmp_path: Path):
         assert scene_to_mapping(scene) == {"dish": {"diameter": 0.035, "depth": 0.003}, "shapes": {}}
 
 
+@pytest.mark.parametrize("ending", [".yaml", ".geojson"])
+@pytest.mark.parametrize("self_contact", [True, False])
+def test_self_contact_is_written_where_the_depth_does_not_decide(tmp_path: Path, ending: str, self_contact: bool):
+    scene = Scene(Dish(self_contact=self_contact))
+    write_scene(scene, tmp_path / f"a{ending}")
+    assert read_scene(str(tmp_path / f"a{ending}")) == scene
+    assert len({scene.version, Scene().version, Scene(Dish(self_contact=not self_contact)).version}) == 3
+
+
 def test_numbers_are_read_as_ros_reads_them(tmp_path: Path):
     (tmp_path / "a.yaml").write_text(
         "dish: {diameter: 35e-3}\nshapes: {a: {disc: {center: [0, 1e-3], radius: +1.e-3}}}\n"
@@ -88,6 +97,8 @@ BAD = [
     ("dish: {diameter: .nan}", "dish.diameter: got nan, expected a number"),
     ("dish: {diameter: .inf}", "dish.diameter: got inf, expected a number"),
     ("dish: {diameter: true}", "dish.diameter: got True, expected a number [m]"),
+    ("dish: {diameter: 0.035, self_contact: 1}", "dish.self_contact: got 1, expected true, false, or nothing"),
+    ("dish: {diameter: 0.035, self_contact: 'yes'}", "dish.self_contact: got 'yes', expected true, false, or nothing"),
     ("dish: {diameter: 0.035, radius: 0.01}", "dish.radius: got 0.01, expected one of diameter, depth"),
     ("dish: {diameter: 1" + 400 * "0" + "}", "dish.diameter: got 1000000"),
     (f"{DISH}shapes: [post]", "shapes: got ['post'], expected shapes by name"),

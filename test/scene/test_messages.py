@@ -27,6 +27,8 @@ SCENES = {
     "every shape": every_shape(),
     "hernia_ring": read_scene("hernia_ring"),
     "empty": Scene(),
+    "touching": Scene(Dish(self_contact=True)),
+    "crossing": Scene(Dish(depth=1e-4, self_contact=False)),
     "large": Scene(Dish(), (SceneShape("large", "tissue", LARGE),)),
 }
 
@@ -107,6 +109,8 @@ DAMAGE: list[tuple[Callable[[Any], None], str]] = [
     (of_one("version", "x" * 10_000), "scene.version: got 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx', expected '"),
     (of_one("dish_diameter", 0.051), "scene.version: got '"),
     (of_one("dish_diameter", 50.0), "scene.dish.diameter: got 50.0, expected a number from 0.005 to 0.5 m"),
+    (of_one("self_contact", 1), "scene.version: got '"),
+    (of_one("self_contact", 3), "scene.self_contact: got 3, expected 0, 1 or 2"),
     (of_one("dish_diameter", float("nan")), "scene.dish.diameter: got nan, expected a number"),
     (of_one("header.frame_id", "map"), "scene.header.frame_id: got 'map', expected 'dish'"),
     (of_one("shapes.0.kind", "bone"), "scene.post.kind: got 'bone', expected one of tissue"),

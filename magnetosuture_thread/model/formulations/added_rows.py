@@ -38,9 +38,8 @@ class LinearRows:
     def joined(self, program: ChainProgram) -> tuple[ChainProgram, WideRows | None]:
         """Return a program with the rows that fit into its band at its end, and the others."""
         count, nodes = len(self.lower), len(program.linear)
-        low, high = self.nodes.min(axis=1, initial=nodes), self.nodes.max(axis=1, initial=0)
-        narrow = high - low < SPAN
-        first = np.minimum(low, nodes - SPAN)[narrow]
+        narrow = self._narrow()
+        first = np.minimum(self.nodes.min(axis=1, initial=nodes), nodes - SPAN)[narrow]
         gradient = np.zeros((len(first), SPAN, program.linear.shape[1]))
         row = np.arange(len(first))[:, None]
         np.add.at(gradient, (row, self.nodes[narrow] - first[:, None]), self.gradient[narrow])
@@ -57,6 +56,17 @@ class LinearRows:
         rest = ~narrow
         return program, WideRows(self.nodes[rest], self.gradient[rest], self.lower[rest], self.compliance[rest])
 
+    def force(self, multipliers: Vector, shape: tuple[int, ...]) -> Points:
+        """Return sum_r a_r lambda_r, shape (n + 1, d), with the multipliers in the order of `joined`."""
+        order, force = np.argsort(~self._narrow(), kind="stable"), np.zeros(shape)
+        np.add.at(force, self.nodes[order], self.gradient[order] * multipliers[:, None, None])
+        return force
+
+    def _narrow(self) -> NDArray[np.bool_]:
+        """Return which rows fit into the band."""
+        low, high = self.nodes.min(axis=1, initial=np.iinfo(np.int64).max), self.nodes.max(axis=1, initial=0)
+        return np.asarray(high - low < SPAN)
+
 
 class AddedBarriers:
     """The barriers that a user has added to a formulation, over one step after the other.
@@ -69,10 +79,16 @@ class AddedBarriers:
     def __init__(self, barriers: Sequence[Barrier], segment_length: float) -> None:
         self._barriers, self._unit = tuple(barriers), segment_length
         self._before: list[Vector | None] = [None] * len(self._barriers)
+        self._start = np.empty((0, 0))
 
     def __bool__(self) -> bool:
         """Return whether there are any."""
         return bool(self._barriers)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the barriers, in their order."""
+        return tuple(barrier.name for barrier in self._barriers)
 
     def rows(self, positions: Points) -> list[BarrierRows]:
         """Return the rows of each barrier at positions of shape (n + 1, d) [m]."""
@@ -91,6 +107,7 @@ class AddedBarriers:
             time: at the end of the step [s].
             interval: dt [s].
         """
+        self._start = positions
         self.set_time(time - interval)
         for index, barrier in enumerate(self._barriers):
             slow = barrier.gain * interval < 1.0
@@ -111,6 +128,8 @@ class AddedBarriers:
             interval: dt [s].
         """
         found = [self._of(barrier, before, about, start, known, interval) for barrier, before in self._pairs()]
+        if len(found) == 1:
+            return found[0]
         width = max((rows.nodes.shape[1] for rows in found), default=1)
         padded = [np.pad(rows.nodes, ((0, 0), (0, width - rows.nodes.shape[1])), mode="edge") for rows in found]
         zeros = [np.pad(rows.gradient, ((0, 0), (0, width - rows.nodes.shape[1]), (0, 0))) for rows in found]
@@ -134,7 +153,7 @@ class AddedBarriers:
         known: NDArray[np.bool_],
         interval: float,
     ) -> LinearRows:
-        rows = barrier.rows(about * self._unit)
+        rows = barrier.rows_after(self._start, about * self._unit)
         gradient = np.where(known[rows.nodes][:, :, None], 0.0, rows.gradient)
         slope = np.sqrt(np.einsum("rkd,rkd->r", gradient, gradient))
         free = slope > 0.0

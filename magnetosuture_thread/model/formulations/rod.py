@@ -34,7 +34,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from magnetosuture_thread.barrier import Barrier, CompiledBarrier
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.obstacles.chords import chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
@@ -60,6 +60,7 @@ from magnetosuture_thread.model.formulations.step import (
     ThreadState,
 )
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
+from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, banded
 from magnetosuture_thread.model.thread import Attachment, Medium, Thread
 
@@ -107,7 +108,10 @@ class RodFormulation(Formulation):
             self._flow(medium),
         )
         self._axes, (self._banded, self._accepted) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
-        if self.added:  # compiled code knows nothing of their rows, and leaves every solve to `step`
+        selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
+        self._self_contact = selves[0] if selves else None
+        self._waits = len(barriers) == len(selves)  # there are no added rows until the thread touches itself
+        if not self._waits:  # compiled code knows nothing of their rows, and leaves every solve to `step`
             self._banded = BandedSolver(iterations=0)
         self._rubs = knows_friction(self._near.data)
         self._motion = MotionBuffers.of(thread.segments + 1, dimension)
@@ -140,6 +144,14 @@ class RodFormulation(Formulation):
         flow[: len(medium.flow)] = medium.flow
         return flow
 
+    def check_start(self, positions: Points) -> None:
+        """Refuse a thread that crosses itself where it cannot; see `Formulation`."""
+        crossings = self._self_contact.crossings(positions) if self._self_contact is not None else []
+        if crossings:
+            places = " and ".join(f"{1e3 * self._thread.segment_length * (i + 0.5):.1f}" for i in crossings[0])
+            given = f"{len(crossings)} crossings, the first at {places} mm along it"
+            raise InvalidInputError("thread's nodes", given, "a thread that does not cross itself, as the scene has it")
+
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""
         unit, motion = self._thread.segment_length, self._motion
@@ -151,6 +163,7 @@ class RodFormulation(Formulation):
         nodes, ends = drive.arrays()
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
         added: LinearRows | None = None
+        takes_rows, max_solves, solver_buffers = not self._waits, MAX_SOLVES, self._solver_buffers
         if self.added:
             self.added.begin(positions, drive.time, interval)
         while True:
@@ -159,7 +172,7 @@ class RodFormulation(Formulation):
                 self._rod,
                 self._buffers,
                 self._near.data,
-                self._solver_buffers,
+                solver_buffers,
                 motion,
                 positions,
                 velocities,
@@ -169,22 +182,31 @@ class RodFormulation(Formulation):
                 interval,
                 state.interval,
                 self._accepted,
-                MAX_SOLVES,
+                max_solves,
                 solves,
                 added.off if added is not None else 0.0,
             )
             worst, status = worst.or_worse(Residuals(*residuals)), status if status != SOLVED else banded.STATUS[number]
             if code == ENDED:
+                if self.added and not takes_rows:
+                    added = self.added.linearised(motion.about, motion.start, motion.known, interval)
+                    if added.off > 1.0:  # it is solved again, with the rows of where it would touch itself
+                        takes_rows, max_solves = True, solves + MAX_SOLVES
+                        solver_buffers = self._solver_buffers._replace(iterations=0)
+                        continue
                 break
             if code == NO_ROOM:
                 self._use(self._buffers.enlarged())
+                solver_buffers = self._solver_buffers._replace(iterations=solver_buffers.iterations)
                 continue
-            if self.added:
+            if takes_rows:
                 added = added or self.added.linearised(motion.about, motion.start, motion.known, interval)
             solution = self._solve(contacts, motion.known, motion.velocities, added)
-            multipliers = solution.multipliers[: self._rows + contacts]
-            accept_step(self._buffers, self._near.data, motion, solution.velocities, multipliers, interval)
-            if self.added:
+            own = solution.multipliers[: self._rows + contacts]
+            accept_step(self._buffers, self._near.data, motion, solution.velocities, own, interval)
+            if added is not None:
+                pushes = solution.multipliers[self._rows + contacts :] if self._waits else np.zeros(len(added.lower))
+                self._buffers.contact_force[:] += added.force(pushes, motion.about.shape)
                 added = self.added.linearised(motion.about, motion.start, motion.known, interval)
             worst, solves = worst.or_worse(solution.residuals), solves + 1
             if status == SOLVED:
@@ -192,9 +214,10 @@ class RodFormulation(Formulation):
         end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
-        pushes = self._buffers.multipliers[: self._rows].copy(), self._buffers.contact_force.copy()
+        multipliers = self._buffers.multipliers[: self._rows].copy(), self._buffers.contact_force.copy()
         grip = self._buffers.grip.copy() if self._rubs else None
-        return StepResult(end, solver, status, worst, solves, converged=off <= 1.0, multipliers=pushes, grip=grip)
+        passed = off > 1.0 and self._self_contact is not None and self._self_contact.passed(positions, end.positions)
+        return StepResult(end, solver, status, worst, solves, off <= 1.0, multipliers, grip, passed)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""

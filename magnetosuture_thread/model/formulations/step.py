@@ -25,6 +25,7 @@ from magnetosuture_thread.model.program import (
     Solution,
     Solver,
     Vector,
+    WideRows,
     residuals_of,
 )
 from magnetosuture_thread.model.thread import Thread
@@ -108,6 +109,7 @@ class StepResult:
         multipliers: of the segments, shape (n,), and of contacts as forces on the nodes, shape (n + 1, d), in the
             program's units; None where these are of no mechanics.
         grip: of friction, as in `StepBuffers`; None where no shape has any.
+        passed: whether the thread has passed through itself where it may not; then the step must not be taken.
     """
 
     state: ThreadState
@@ -118,6 +120,7 @@ class StepResult:
     converged: bool
     multipliers: tuple[Vector, Points] | None = field(default=None, compare=False)
     grip: NDArray[np.float64] | None = field(default=None, compare=False)
+    passed: bool = False
 
 
 WarmStart = tuple[Vector, Vector, NDArray[np.int64], NDArray[np.float64]]
@@ -308,6 +311,10 @@ class Formulation(ABC):
         program = program_of(self._buffers, np.zeros(nodes, dtype=np.bool_), self._rows)
         solution = self._solver.solve(program, np.zeros((nodes, self.dimension)), np.zeros(self._rows))
         residuals_of(program, solution.velocities, solution.multipliers)
+        if self.added:
+            ends, one = np.array([[0, nodes - 1]]), np.zeros(1)
+            wide = WideRows(ends, np.zeros((1, 2, self.dimension)), one - 1.0, one)
+            self._solver.solve(program, solution.velocities, np.zeros(self._rows + 1), wide)
         self._buffers.forget()
 
     @property
@@ -330,6 +337,17 @@ class Formulation(ABC):
         self._buffers.multipliers[: self._rows] = warm_start[0]
         self._buffers.push[:] = warm_start[1]
         self._buffers.grip_shape[:], self._buffers.grip[:] = warm_start[2:]
+
+    def forget(self) -> None:
+        """Forget the last solve; see `StepBuffers.forget`."""
+        self._buffers.forget()
+
+    def check_start(self, positions: Points) -> None:  # noqa: B027 - most know nothing against a shape
+        """Refuse a shape that the thread cannot start from, shape (n + 1, d) [m].
+
+        Raises:
+            InvalidInputError: it is such a one.
+        """
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""

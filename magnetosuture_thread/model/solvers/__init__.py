@@ -10,8 +10,9 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector, WideRows
 from magnetosuture_thread.model.solvers.banded import BandedSolver
 from magnetosuture_thread.model.solvers.general import OsqpSolver, QpsolversSolver
+from magnetosuture_thread.model.solvers.low_rank import LowRankSolver
 
-__all__ = ["SOLVERS", "BandedSolver", "FallbackSolver", "OsqpSolver", "QpsolversSolver", "make_solver"]
+__all__ = ["SOLVERS", "BandedSolver", "FallbackSolver", "LowRankSolver", "OsqpSolver", "QpsolversSolver", "make_solver"]
 
 SOLVERS = (BandedSolver.name, OsqpSolver.name)
 """Those that need no other package; besides, any that qpsolvers knows."""
@@ -39,8 +40,12 @@ class FallbackSolver:
     def solve(
         self, program: ChainProgram, velocities: Points, multipliers: Vector, wide: WideRows | None = None
     ) -> Solution:
-        """Return the first solution that passes, else the best; see `Solver`. Wide rows are left to the others."""
-        solvers = [s for s in self._solvers if wide is None or not isinstance(s, BandedSolver)]
+        """Return the first solution that passes, else the best; see `Solver`.
+
+        Wide rows are nothing for the banded solver, and without them there is nothing of low rank.
+        """
+        apart = LowRankSolver if wide is None else BandedSolver
+        solvers = [solver for solver in self._solvers if not isinstance(solver, apart)]
         solution = solvers[0].solve(program, velocities, multipliers, wide)
         if solution.residuals.largest <= self.tolerance:
             return solution
@@ -65,5 +70,5 @@ def make_solver(name: str, tolerance: float) -> Solver:
         ConfigurationError: there is no solver of this name.
     """
     if name == BandedSolver.name:
-        return FallbackSolver((BandedSolver(), OsqpSolver()), tolerance)
+        return FallbackSolver((BandedSolver(), LowRankSolver(), OsqpSolver()), tolerance)
     return FallbackSolver((OsqpSolver() if name == OsqpSolver.name else QpsolversSolver(name),), tolerance)

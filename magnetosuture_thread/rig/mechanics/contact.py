@@ -39,6 +39,7 @@ class Shapes(NamedTuple):
         wall: radius of the dish's wall around the origin, infinite if there is none [m].
         stiffness: k of every contact [N/m].
         friction: mu, of the thread on everything; the needle has none.
+        self_contact: whether the thread touches itself; else it passes over itself.
     """
 
     discs: NDArray[np.float64]
@@ -53,6 +54,7 @@ class Shapes(NamedTuple):
     wall: float
     stiffness: float
     friction: float
+    self_contact: bool
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class Surface:
         skin: how far outside a contact begins, so that up to k times this nothing gets in at all [m]. A harder
             contact without it costs more: nodes that slide then leave and meet the surface at every step.
         friction: Coulomb's coefficient of the thread on all of it; the needle has no friction.
+        self_contact: whether the thread touches itself, with the same friction; else it passes over itself.
 
     Raises:
         ConfigurationError: a value is not finite, or out of bounds.
@@ -78,6 +81,7 @@ class Surface:
     stiffness: float = 500.0
     skin: float = 1.5e-6
     friction: float = 0.0
+    self_contact: bool = False
 
     def packed(self) -> Shapes:
         """Return the arrays that kernels read."""
@@ -111,7 +115,9 @@ class Surface:
             grid = np.array([*low, float(max(high - low)) / GRID])
             cells = np.full(np.ceil((high - low)[::-1] / grid[2]).astype(int), np.inf)
         numbers = float(wall), float(self.stiffness), float(self.friction)
-        shapes = Shapes(discs, corners, starts, boxes, edges, first_runs, grid, cells, convex, *numbers)
+        shapes = Shapes(
+            discs, corners, starts, boxes, edges, first_runs, grid, cells, convex, *numbers, bool(self.self_contact)
+        )
         _find_clearances(shapes)
         return shapes
 

@@ -23,8 +23,10 @@ from magnetosuture_thread.rig.mechanics.rod import (
     drag_matrices,
     factor,
 )
+from magnetosuture_thread.rig.mechanics.self_contact import add_pairs, couple, crosses_anew, find_pairs
 
 MAX_ITERATIONS = 60
+PAIRS_PER_NODE = 16  # rows of contact with itself
 MAX_FULL_STEPS = 12  # without a line search
 MIN_LINE_SEARCH = 1e-6
 DESCENT = 1e-4  # of the decrease that the slope promises
@@ -36,7 +38,8 @@ FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere els
 class NewtonBuffers(NamedTuple):
     """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows.
 
-    Of friction: what rubs, the state that slip is measured from, and the slip that smooths it.
+    Of friction: what rubs, the state that slip is measured from, and the slip that smooths it. Of the thread's contact
+    with itself: the rows of `find_pairs`, their second derivatives, and how many there are.
     """
 
     trial: NDArray[np.float64]
@@ -51,6 +54,9 @@ class NewtonBuffers(NamedTuple):
     friction: NDArray[np.float64]
     begin: NDArray[np.float64]
     slip: NDArray[np.float64]
+    pairs: NDArray[np.float64]
+    second: NDArray[np.float64]
+    paired: NDArray[np.int64]
 
 
 def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
@@ -69,6 +75,9 @@ def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
         friction=np.zeros((4 * segments + 1, 5)),
         begin=np.zeros(size),
         slip=np.zeros(1),
+        pairs=np.zeros((PAIRS_PER_NODE * (segments + 1), 6)),
+        second=np.zeros(PAIRS_PER_NODE * (segments + 1)),
+        paired=np.zeros(1, dtype=np.int64),
     )
 
 
@@ -95,6 +104,9 @@ def assemble_energy(
     energy += add_contact(q, rod, shapes, buffers.rows, g, band, convex)
     energy += add_friction(q, buffers.begin, buffers.slip[0], buffers.friction, g, band)
     energy += add_clamp(q, needle, rod.segment, g, band, convex)
+    if buffers.paired[0] > 0:
+        pairs, second = buffers.pairs[: buffers.paired[0]], buffers.second[: buffers.paired[0]]
+        energy += add_pairs(q, buffers.begin, buffers.slip[0], 2.0 * rod.radius, shapes.stiffness, pairs, second, g)
     if not driven:
         rest, turned, rows = buffers.rest, buffers.turned, buffers.rows
         energy += add_needle(q, field, needle, shapes, rest, turned, rows, g, band, convex)
@@ -151,6 +163,9 @@ def _minimise(
         for i in range(size):
             buffers.step[i] = -buffers.gradient[i]
         back_substitute(buffers.chol, buffers.step)
+        if buffers.paired[0] > 0:
+            pairs, second = buffers.pairs[: buffers.paired[0]], buffers.second[: buffers.paired[0]]
+            couple(buffers.chol, pairs, second, 3 if driven else 0, buffers.step)
         slope = 0.0
         move = abs(buffers.step[0]) * arm
         for i in range(size):
@@ -229,10 +244,15 @@ def advance(
     turn_resistance(needle, trial[0], 1.0 / (beta * dt), buffers.turned)
     find_friction(q, rod, shapes, buffers.rows, buffers.friction)
     buffers.begin[:], buffers.slip[0] = q, SLIP_SPEED * dt
+    buffers.paired[0] = find_pairs(q, rod, shapes, buffers.pairs) if shapes.self_contact else 0
+    if buffers.paired[0] < 0:
+        return -1, np.inf, np.inf
     start = trial.copy()
     done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, False)
     if done < 0:
         done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, True)
+    if done > 0 and shapes.self_contact and crosses_anew(q, trial):
+        done = -1
     if done > 0:
         q[:] = trial
     return done, move, force

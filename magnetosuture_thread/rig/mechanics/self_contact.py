@@ -1,0 +1,202 @@
+"""Contact of the thread with itself in the plane, as in a film of liquid too thin for it to pass over itself.
+
+A node near a segment of the same thread is kept on its side by the gap
+
+    g(q) = n . (x_k - (1 - s) x_j - s x_{j+1}) - diameter,    energy k / 2 g^2 below 0
+
+whose place s and normal n are those of the start of a step, as the node is not far from there at its end: so g is
+linear. With friction, the slip of the two along the tangent adds what `friction` has for other contacts. These terms
+couple nodes far apart, which is beyond the band of second derivatives: Newton's step is corrected for them by solving
+for their forces first, as many unknowns as there are contacts.
+
+Source: Sherman and Morrison 1950, Woodbury 1950. Deviation: none.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.rig.mechanics.contact import Shapes
+from magnetosuture_thread.rig.mechanics.rod import Rod, back_substitute
+
+NEAR = 0.5  # segments; a node farther than this from touching has no gap in a step
+NORMAL = -1.0  # in place of a limit of friction, of a row that is a gap
+MIN_ARC = 0.5 * math.pi  # diameters between places that can touch
+
+
+@compiled
+def _side(q: NDArray[np.float64], a: int, b: int, c: int) -> float:
+    """Return twice the area of the triangle of three nodes, by their first unknowns, positive counter-clockwise."""
+    return float((q[b] - q[a]) * (q[c + 1] - q[a + 1]) - (q[b + 1] - q[a + 1]) * (q[c] - q[a]))
+
+
+@compiled
+def _cross(q: NDArray[np.float64], a: int, b: int) -> bool:
+    """Return whether the segments from two nodes on cross, by the nodes' first unknowns; one that is none does not."""
+    if min(a, b) < 1 or max(a, b) + 3 >= q.shape[0] or abs(a - b) < 4:
+        return False
+    return bool(
+        _side(q, a, a + 2, b) * _side(q, a, a + 2, b + 2) < 0.0
+        and _side(q, b, b + 2, a) * _side(q, b, b + 2, a + 2) < 0.0
+    )
+
+
+@compiled
+def crosses_anew(start: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+    """Return whether two segments cross at the end of a step that did not at its start."""
+    for a in range(1, end.shape[0] - 6, 2):
+        for b in range(a + 4, end.shape[0] - 2, 2):
+            if max(end[a], end[a + 2]) < min(end[b], end[b + 2]) or max(end[b], end[b + 2]) < min(end[a], end[a + 2]):
+                continue
+            if _cross(end, a, b) and not _cross(start, a, b):
+                return True
+    return False
+
+
+@compiled
+def find_pairs(q: NDArray[np.float64], rod: Rod, shapes: Shapes, pairs: NDArray[np.float64]) -> int:
+    """Write what of the thread is near itself at the start of a step.
+
+    What crosses itself already is free to move apart.
+
+    Args:
+        q: state at the start, shape (N,) [rad, m].
+        rod: the thread.
+        shapes: stiffness and friction.
+        pairs: gets the first unknown of the node and of the segment, place on it, direction, and `NORMAL` or the
+            limit of friction [N], shape (p, 6).
+
+    Returns:
+        How many there are, -1 if there is no room.
+    """
+    count, size, diameter = 0, q.shape[0], 2.0 * rod.radius
+    for a in range(1, size - 1, 2):
+        for b in range(1, size - 3, 2):
+            between = min(abs(a - b), abs(a - b - 2)) // 2
+            if a == b or a == b + 2 or between * rod.segment <= MIN_ARC * diameter:
+                continue
+            ex, ey, dx, dy = q[b + 2] - q[b], q[b + 3] - q[b + 1], q[a] - q[b], q[a + 1] - q[b + 1]
+            square = ex * ex + ey * ey
+            s = min(max((dx * ex + dy * ey) / square, 0.0), 1.0)
+            nx, ny = dx - s * ex, dy - s * ey
+            gap = math.sqrt(nx * nx + ny * ny)
+            if not 0.0 < gap < diameter + NEAR * rod.segment or _cross(q, a, b) or _cross(q, a - 2, b):
+                continue
+            if count + 2 > pairs.shape[0]:
+                return -1
+            nx, ny = nx / gap, ny / gap
+            _write(pairs[count], a, b, s, nx, ny, NORMAL)
+            count += 1
+            if gap < diameter and shapes.friction > 0.0:
+                _write(pairs[count], a, b, s, -ny, nx, shapes.friction * shapes.stiffness * (diameter - gap))
+                count += 1
+    return count
+
+
+@compiled
+def _write(row: NDArray[np.float64], a: int, b: int, s: float, x: float, y: float, limit: float) -> None:
+    row[0], row[1], row[2], row[3], row[4], row[5] = a, b, s, x, y, limit
+
+
+@compiled
+def _places(row: NDArray[np.float64], places: NDArray[np.int64], weights: NDArray[np.float64]) -> None:
+    """Write the six unknowns of a row and the derivative of its gap or slip by each."""
+    a, b, s = int(row[0]), int(row[1]), row[2]
+    for d in range(2):
+        places[d], places[2 + d], places[4 + d] = a + d, b + d, b + 2 + d
+        weights[d], weights[2 + d], weights[4 + d] = row[3 + d], -(1.0 - s) * row[3 + d], -s * row[3 + d]
+
+
+@compiled
+def add_pairs(
+    q: NDArray[np.float64],
+    start: NDArray[np.float64],
+    slip: float,
+    diameter: float,
+    stiffness: float,
+    pairs: NDArray[np.float64],
+    second: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+) -> float:
+    """Add energy and gradient of all rows, and write the second derivative of each by its gap or slip.
+
+    Args:
+        q: state, shape (N,).
+        start: at the start of the step.
+        slip: that smooths friction [m].
+        diameter: of the thread [m].
+        stiffness: k [N/m].
+        pairs: of `find_pairs`, shape (p, 6).
+        second: written, shape (p,).
+        gradient: added to, shape (N,).
+    """
+    energy, places, weights = 0.0, np.empty(6, dtype=np.int64), np.empty(6)
+    for row in range(pairs.shape[0]):
+        _places(pairs[row], places, weights)
+        along, limit = 0.0, pairs[row, 5]
+        for r in range(6):
+            along += weights[r] * (q[places[r]] - (start[places[r]] if limit != NORMAL else 0.0))
+        if limit == NORMAL:
+            depth = max(diameter - along, 0.0)
+            energy += 0.5 * stiffness * depth * depth
+            force, second[row] = -stiffness * depth, stiffness if depth > 0.0 else 0.0
+        else:
+            root = math.sqrt(along * along + slip * slip)
+            energy += limit * (root - slip)
+            force, second[row] = limit * along / root, limit * slip * slip / root**3
+        if force != 0.0:
+            for r in range(6):
+                gradient[places[r]] += force * weights[r]
+    return energy
+
+
+@compiled
+def couple(
+    chol: NDArray[np.float64],
+    pairs: NDArray[np.float64],
+    second: NDArray[np.float64],
+    first_free: int,
+    step: NDArray[np.float64],
+) -> None:
+    """Correct a step, found with the factor of the band alone, for the rows' second derivatives.
+
+    Args:
+        chol: the factor.
+        pairs: of `find_pairs`.
+        second: of `add_pairs`.
+        first_free: the first unknown; those before are given.
+        step: corrected, shape (N,).
+    """
+    rows = np.flatnonzero(second > 0.0)
+    size, places, weights = len(rows), np.empty(6, dtype=np.int64), np.empty(6)
+    columns, matrix, force = np.zeros((size, step.shape[0])), np.zeros((size, size)), np.zeros(size)
+    for i in range(size):
+        _places(pairs[rows[i]], places, weights)
+        for r in range(6):
+            if places[r] >= first_free:
+                columns[i, places[r]] += weights[r]
+        back_substitute(chol, columns[i])
+    for i in range(size):
+        _places(pairs[rows[i]], places, weights)
+        matrix[i, i] = 1.0 / second[rows[i]]
+        for r in range(6):
+            if places[r] >= first_free:
+                force[i] += weights[r] * step[places[r]]
+                for j in range(size):
+                    matrix[i, j] += weights[r] * columns[j, places[r]]
+    for i in range(size):  # Gauss's elimination; symmetric and positive definite, so that no pivot is sought
+        for j in range(i + 1, size):
+            factor = matrix[j, i] / matrix[i, i]
+            force[j] -= factor * force[i]
+            for k in range(i + 1, size):
+                matrix[j, k] -= factor * matrix[i, k]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            force[i] -= matrix[i, k] * force[k]
+        force[i] /= matrix[i, i]
+        for r in range(step.shape[0]):
+            step[r] -= force[i] * columns[i, r]
