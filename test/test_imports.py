@@ -34,6 +34,7 @@ ALLOWED = {
     "model": {*BASE, "barrier", "compiled", "geometry", "scene", "shared_parameters", "thread_observation"},
     "vision": {*BASE, "compiled", "geometry", "scene", "shared_parameters", "thread_observation"},
     "safety": {*BASE, "barrier", "compiled", "geometry", "scene"},
+    "forecast": {"compiled", "errors", "geometry", "model", "safety", "scene"},
     "coils": {*BASE, "barrier", "geometry", "safety", "scene", "shared_parameters"},
     "guidance": {*BASE, "geometry", "scene", "shared_parameters"},
     "console": {*BASE, "geometry", "scene", "shared_parameters"},
@@ -60,7 +61,7 @@ ALLOWED = {
     "nodes": {
         *BASE,
         *("interface", "messages", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
-        *("parameter_files", "thread_observation"),
+        *("parameter_files", "thread_observation", "forecast"),
     },
     "offline": {
         *BASE,
