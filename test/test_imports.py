@@ -41,7 +41,7 @@ ALLOWED = {
     "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
     "bags": {*BASE, "interface", "messages"},
     "messages": {
-        *("barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils"),
+        *("barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils", "forecast"),
         "thread_observation",
     },
     "evaluation": {

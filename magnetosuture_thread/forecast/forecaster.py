@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.forecast.drag import NeedleDrag
 from magnetosuture_thread.forecast.forecast import WALL_NAME, Forecast
 from magnetosuture_thread.forecast.rollout import roll_out
 from magnetosuture_thread.forecast.rollout_data import (
@@ -55,11 +56,11 @@ class ThreadForecaster:
         forecast.first_contact, forecast.minima["obstacle"].value, forecast.rest_time
 
     A step is what the loop does in one of its periods: the commanded velocity is slowed by the thread's friction and
-    filtered by the needle's safety filter at its pose, the needle follows the filtered velocity exactly, and the thread
-    follows the needle by one step of the formulation `rod`, divided as `ThreadPredictor` divides it. So a forecast is
-    equal to stepping `NeedleSafetyFilter`, `NeedleKinematics` and `ThreadPredictor` by hand, but for rounding; it is
-    compiled from end to end. Where the structured solver does not get on with a step, the forecast ends there and says
-    so, as no general solver is tried.
+    filtered by the needle's safety filter at its pose, the needle follows the filtered velocity, exactly unless its
+    drag is given, and the thread follows the needle by one step of the formulation `rod`, divided as `ThreadPredictor`
+    divides it. So a forecast equals stepping `NeedleSafetyFilter`, `NeedleKinematics` and `ThreadPredictor` by hand,
+    but for rounding; it is compiled from end to end. Where the structured solver does not get on with a step, the
+    forecast ends there and says so, as no general solver is tried.
 
     Args:
         thread: the thread.
@@ -68,6 +69,8 @@ class ThreadForecaster:
         law: the friction law that slows the needle; None for none.
         friction_averaging: time over which the nodes' speeds are averaged for it [s].
         attachment_offset: where the thread is fixed, along the heading and to its left of the needle's tail [m].
+        drag: of the needle, by which the thread's pull moves it; None for one that follows the filtered velocity
+            exactly.
         step: duration of a step [s].
         margin_range: margins are computed of nodes that are closer to a shape or the wall than this [m].
         contact_tolerance: a node this close to a shape or the wall touches it [m].
@@ -95,6 +98,7 @@ class ThreadForecaster:
         law: FrictionLaw | None = None,
         friction_averaging: float = 0.0,
         attachment_offset: Sequence[float] = (),
+        drag: NeedleDrag | None = None,
         step: float = 1.0 / 66.0,
         margin_range: float = 2e-3,
         contact_tolerance: float = 2e-6,
@@ -146,6 +150,7 @@ class ThreadForecaster:
             max_substeps=int(max_substeps),
             contact_tolerance=float(contact_tolerance),
             friction=friction,
+            drag=np.zeros(5) if drag is None else drag.numbers(thread),
         )
         self._workers = max(1, os.cpu_count() or 1) if workers is None else max(1, workers)
         self._room = 2 * (thread.segments + 1)  # for contacts
@@ -240,6 +245,7 @@ class ThreadForecaster:
     def _held(self, start: ForecastStart, commands: Points, steps: int, buffers: RolloutBuffers) -> Forecast:
         while True:
             state, record = self._begin(start, buffers), self._record(steps)
+            self._set_force(start, record)
             code, done = roll_out(self._model, buffers, state, commands, self.step, 0, steps, record)
             if code != NO_ROOM:
                 return self._result(start, record, commands, code, done)
@@ -250,6 +256,7 @@ class ThreadForecaster:
         self, start: ForecastStart, controller: Controller, steps: int, buffers: RolloutBuffers
     ) -> Forecast:
         state, record, commands = self._begin(start, buffers), self._record(steps), np.zeros((steps, 2))
+        self._set_force(start, record)
         code, done = ENDED, 0
         while done < steps and code == ENDED:
             tail, heading = state.pose[:2].copy(), state.pose[2:].copy()
@@ -287,6 +294,7 @@ class ThreadForecaster:
         vertices = np.array(start.vertices, np.float64, order="C")
         velocities = np.zeros_like(vertices) if start.velocities is None else np.array(start.velocities, np.float64)
         heading = np.asarray(start.pose.heading, np.float64)
+        pulled = self._model.drag[0] > 0.0 and start.needle_force is not None
         x, y = (math.nan, math.nan) if start.tip_velocity is None else np.asarray(start.tip_velocity).tolist()
         return RolloutState(
             vertices,
@@ -294,7 +302,12 @@ class ThreadForecaster:
             np.zeros_like(vertices),
             np.concatenate([np.asarray(start.pose.tail, np.float64), heading / np.linalg.norm(heading)]),
             np.array([x, y, start.interval]),
+            np.full(3, math.nan if pulled else 0.0),  # what is no number is worked out from the force
         )
+
+    def _set_force(self, start: ForecastStart, record: RolloutRecord) -> None:
+        if start.needle_force is not None:
+            record.pull[0] = start.needle_force
 
     def _record(self, steps: int) -> RolloutRecord:
         return RolloutRecord.of(steps, self.thread.segments + 1, len(self.scene.shapes))
@@ -349,9 +362,9 @@ class ThreadForecaster:
             raise InvalidInputError("thread's first node", f"{gap:.2e} m from where it is fixed", wanted)
         if not (math.isfinite(start.interval) and start.interval >= 0.0):
             raise InvalidInputError("interval of the start", start.interval, "a time of at least 0 s")
-        tip = start.tip_velocity
-        if tip is not None and not (np.shape(tip) == (2,) and np.isfinite(tip).all()):
-            raise InvalidInputError("tip velocity of the start", np.asarray(tip).tolist(), "two finite numbers [m/s]")
+        for name, pair in (("tip velocity", start.tip_velocity), ("needle force", start.needle_force)):
+            if pair is not None and not (np.shape(pair) == (2,) and np.isfinite(pair).all()):
+                raise InvalidInputError(f"{name} of the start", np.asarray(pair).tolist(), "two finite numbers")
         clearance = self.safety.clearance(pose.tail, pose.heading)
         if clearance <= 0.0:
             raise InvalidInputError("needle pose", f"{-clearance:.2e} m inside of a shape or the wall", "one outside")

@@ -158,8 +158,9 @@ def record_margins(
                 near[i] = some = True
     for i in range(nodes):
         record.rubbed[k, i] = close[i] >= 2
-    chords, heading = np.empty(nodes - 1), state.pose[2:]
-    mechanics.chord_lengths(positions / rod.unit, heading, rod.clamped, chords)
+    chords = buffers.step.chords  # of where the thread is: of the last linearisation, that showed that it is there
+    if k == 0:
+        mechanics.chord_lengths(positions / rod.unit, state.pose[2:], rod.clamped, chords)
     for i in range(nodes - 1):
         length = math.hypot(positions[i + 1, 0] - positions[i, 0], positions[i + 1, 1] - positions[i, 1])
         for kind in (CONNECTIVITY_MARGIN, COMPRESSION_MARGIN):
@@ -185,6 +186,38 @@ def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: NDArray[
             count += 1
             fastest = max(fastest, math.hypot(state.averaged[i, 0], state.averaged[i, 1]))
     return float(model.friction[1] ** count) if count > 0 and fastest > model.friction[2] else 1.0
+
+
+@compiled
+def add_pull(
+    model: RolloutModel,
+    state: RolloutState,
+    needle: PosedNeedle,
+    velocity: tuple[float, float],
+    commanded: float,
+    pull: Points,
+) -> None:
+    """Approach the motion that the thread's pull adds to that of a tip velocity [m/s]; see `NeedleDrag`.
+
+        c <- c + (c*(F) - c) / (1 + r)
+
+    with the ratio r of the drag that the whole thread would have broadside to the needle's: so the pull of the last
+    step, which falls with the needle's velocity, does not make the two swing. The result is bounded by the share of the
+    commanded speed [m/s] that the velocity is.
+    """
+    drag, added, lever = model.drag, state.added, 0.5 * model.needle.body.chord
+    ex, ey = needle.chord_x, needle.chord_y
+    speed = math.hypot(velocity[0], velocity[1])
+    speed *= min(1.0, speed / commanded) if commanded > 0.0 else 0.0
+    along, across = pull[0] * ex + pull[1] * ey, pull[1] * ex - pull[0] * ey
+    forwards = velocity[0] * ex + velocity[1] * ey
+    full = ((drag[0] * forwards + along) / drag[1] - forwards, across / drag[2], -lever * across / drag[3])
+    ratio = (drag[4] / drag[1], drag[4] / drag[2], lever * lever * drag[4] / drag[3])
+    begins = np.isnan(added[0])
+    for k in range(3):
+        added[k] = full[k] if begins else added[k] + (full[k] - added[k]) / (1.0 + ratio[k])
+        limit = speed if k < 2 else (speed / lever if lever > 0.0 else 0.0)
+        added[k] = max(-limit, min(limit, added[k]))
 
 
 @compiled
@@ -259,9 +292,10 @@ def roll_out(
         )
         record.filtered[k, 0], record.filtered[k, 1] = x, y
         before = pose.copy()
-        pose[0], pose[1], pose[2], pose[3] = moved_needle(
-            model.needle, pose[0], pose[1], pose[2], pose[3], (x, y), interval
-        )
+        if model.drag[0] > 0.0 and (k > 0 or np.isnan(state.added[0])):  # at the start where the pull is known
+            commanded = min(math.hypot(commands[k, 0], commands[k, 1]), model.needle.max_speed)
+            add_pull(model, state, needle, (x, y), commanded, record.pull[k])
+        moved_needle(model.needle, pose, (x, y), state.added, interval)
         state.last[0], state.last[1], limited = x, y, True
         code, converged = follow_needle(model, buffers, state, before, interval)
         if code != ENDED:

@@ -38,6 +38,8 @@ class RolloutModel(NamedTuple):
         contact_tolerance: a node this close to a shape or the wall touches it [m].
         friction: threshold [m], slowdown of a node, and speed of a node that is stuck [m/s], as of `FrictionLaw`; and
             the time over which the speeds are averaged [s]; shape (4,).
+        drag: of the needle, see `NeedleDrag`: along with the thread's and without it, across, turning, and that of the
+            whole thread broadside; zeros where the needle follows the filtered velocity exactly, shape (5,).
     """
 
     rod: RodProperties
@@ -52,6 +54,7 @@ class RolloutModel(NamedTuple):
     max_substeps: int
     contact_tolerance: float
     friction: NDArray[np.float64]
+    drag: NDArray[np.float64]
 
 
 class RolloutState(NamedTuple):
@@ -64,6 +67,7 @@ class RolloutState(NamedTuple):
         pose: the needle's tail [m] and heading, shape (4,).
         last: velocity of the tip over the last step [m/s], and duration of the thread's last step, 0 for none [s],
             shape (3,).
+        added: motion that the thread's pull adds to the needle's; see `moved_needle`, shape (3,).
     """
 
     positions: Points
@@ -71,6 +75,7 @@ class RolloutState(NamedTuple):
     averaged: Points
     pose: NDArray[np.float64]
     last: NDArray[np.float64]
+    added: NDArray[np.float64]
 
 
 class MarginBuffers(NamedTuple):

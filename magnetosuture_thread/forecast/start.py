@@ -27,6 +27,8 @@ class ForecastStart:
         interval: duration of that step; 0 if there was none [s].
         tip_velocity: filtered velocity of the tip before the start, shape (2,) [m/s], from which the acceleration is
             limited; None if it is not known, and then the first change is not limited.
+        needle_force: of the thread upon the needle, shape (2,) [N], from which a needle with drag goes on; None if it
+            is not known.
         warm_start: of the formulation, which brings friction that holds already; None for none.
     """
 
@@ -36,10 +38,15 @@ class ForecastStart:
     interval: float = 0.0
     tip_velocity: Vector | None = None
     warm_start: WarmStart | None = None
+    needle_force: Vector | None = None
 
     @classmethod
     def of_predictor(
-        cls, predictor: ThreadPredictor, pose: NeedlePose | None = None, tip_velocity: Vector | None = None
+        cls,
+        predictor: ThreadPredictor,
+        pose: NeedlePose | None = None,
+        tip_velocity: Vector | None = None,
+        needle_force: Vector | None = None,
     ) -> ForecastStart:
         """Return the start from where a predictor is.
 
@@ -47,6 +54,7 @@ class ForecastStart:
             predictor: that has started.
             pose: of the needle's tail, where the thread is not fixed to that.
             tip_velocity: see the attributes.
+            needle_force: see the attributes.
 
         Raises:
             InvalidInputError: it has not started.
@@ -56,4 +64,4 @@ class ForecastStart:
         state = predictor.state
         warm_start = predictor.formulation.warm_start() if state.interval > 0.0 else None
         own = predictor.pose if pose is None else pose
-        return cls(own, state.positions, state.velocities, state.interval, tip_velocity, warm_start)
+        return cls(own, state.positions, state.velocities, state.interval, tip_velocity, warm_start, needle_force)

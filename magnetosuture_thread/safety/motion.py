@@ -170,23 +170,38 @@ def filter_velocity(
 
 @compiled
 def moved_needle(
-    data: FilterData, x: float, y: float, heading_x: float, heading_y: float, velocity: Pair, duration: float
-) -> tuple[float, float, float, float]:
-    """Return tail (2) [m] and heading (2) after a tip velocity [m/s] was held, as the needle has it, for a time [s]."""
+    data: FilterData, pose: NDArray[np.float64], velocity: Pair, added: NDArray[np.float64], duration: float
+) -> None:
+    """Move the needle by a tip velocity that is held, as the needle has it, for a time.
+
+    Args:
+        data: of the filter.
+        pose: tail [m] and heading, written, shape (4,).
+        velocity: of the tip [m/s].
+        added: to the motion that the velocity gives: velocity of the chord's middle along it and to its left [m/s], and
+            rate of turning [rad/s], shape (3,); a needle that is a point does not turn.
+        duration: [s].
+    """
     body = data.body
+    x, y, heading_x, heading_y = pose[0], pose[1], pose[2], pose[3]
     ex = body.chord_x * heading_x - body.chord_y * heading_y
     ey = body.chord_x * heading_y + body.chord_y * heading_x
     if body.chord == 0.0:
-        return x + duration * velocity[0], y + duration * velocity[1], heading_x, heading_y
+        pose[0] = x + duration * (velocity[0] + added[0] * ex - added[1] * ey)
+        pose[1] = y + duration * (velocity[1] + added[0] * ey + added[1] * ex)
+        return
     along, across = ex * velocity[0] + ey * velocity[1], ex * velocity[1] - ey * velocity[0]
     lever = 0.5 * body.chord
-    half = 0.5 * across / lever * duration
-    reach = along * duration * (math.sin(half) / half if half != 0.0 else 1.0)
+    half = 0.5 * (across / lever + added[2]) * duration
+    reach = duration * (math.sin(half) / half if half != 0.0 else 1.0)
+    forwards, left = reach * (along + added[0]), reach * added[1]
     c, s = math.cos(half), math.sin(half)
-    middle_x, middle_y = x + lever * ex + reach * (c * ex - s * ey), y + lever * ey + reach * (s * ex + c * ey)
+    ux, uy = c * ex - s * ey, s * ex + c * ey
+    middle_x = x + lever * ex + forwards * ux - left * uy
+    middle_y = y + lever * ey + forwards * uy + left * ux
     c, s = c * c - s * s, 2.0 * c * s
     hx, hy = c * heading_x - s * heading_y, s * heading_x + c * heading_y
     size = math.hypot(hx, hy)
     hx, hy = hx / size, hy / size
     ex, ey = body.chord_x * hx - body.chord_y * hy, body.chord_x * hy + body.chord_y * hx
-    return middle_x - lever * ex, middle_y - lever * ey, hx, hy
+    pose[0], pose[1], pose[2], pose[3] = middle_x - lever * ex, middle_y - lever * ey, hx, hy
