@@ -18,7 +18,7 @@ from magnetosuture_thread import ForecastStart, NeedlePose, ThreadForecaster
 from magnetosuture_thread.coils.bridge import NEEDLE, CoilBridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.forecast import NeedleDrag
+from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import Setup, read_setup
@@ -47,18 +47,10 @@ class Moment:
 
 def forecaster_of(setup: Setup) -> ThreadForecaster:
     """Return the forecaster of a setup, with a step for each of its frames."""
-    return ThreadForecaster(
-        setup.model.thread(),
-        setup.scene,
-        setup.coils.safety_filter(setup.scene),
-        law=setup.model.friction_law(),
-        friction_averaging=setup.model.friction_averaging,
-        attachment_offset=setup.model.attachment_offset,
-        margin_range=setup.model.margin_range,
-        contact_tolerance=setup.model.contact_tolerance,
-        max_step=setup.model.max_step,
-        drag=NeedleDrag(setup.coils.needle_drag, setup.coils.needle_drag_across, setup.coils.needle_turning_drag),
-        step=1.0 / setup.rig.frame_rate,
+    coils = setup.coils
+    drag = NeedleDrag(coils.needle_drag, coils.needle_drag_across, coils.needle_turning_drag)
+    return make_forecaster(
+        setup.model, setup.scene, coils.safety_filter(setup.scene), drag=drag, step=1.0 / setup.rig.frame_rate
     )
 
 

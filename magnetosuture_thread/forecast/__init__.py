@@ -3,6 +3,15 @@
 from magnetosuture_thread.forecast.drag import NeedleDrag
 from magnetosuture_thread.forecast.forecast import Forecast, ForecastContact, ForecastMargin
 from magnetosuture_thread.forecast.forecaster import ThreadForecaster
+from magnetosuture_thread.forecast.making import make_forecaster
 from magnetosuture_thread.forecast.start import ForecastStart
 
-__all__ = ["Forecast", "ForecastContact", "ForecastMargin", "ForecastStart", "NeedleDrag", "ThreadForecaster"]
+__all__ = [
+    "Forecast",
+    "ForecastContact",
+    "ForecastMargin",
+    "ForecastStart",
+    "NeedleDrag",
+    "ThreadForecaster",
+    "make_forecaster",
+]

@@ -10,10 +10,10 @@ from magnetosuture_thread import (
     InvalidInputError,
     MagnetosutureError,
     NeedlePose,
-    NeedleSafetyFilter,
     Scene,
     ThreadForecaster,
 )
+from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_message
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
@@ -89,27 +89,7 @@ class ThreadForecasts:
             return self._made[2]
         self._made, forecaster = (settings, scene, None), None
         if scene is not None:
-            safety = NeedleSafetyFilter(
-                scene,
-                keep_out=settings.forecast_keep_out,
-                needle_length=settings.needle_length,
-                needle_curvature=settings.needle_curvature,
-            )
-            forecaster = ThreadForecaster(
-                settings.thread(),
-                scene,
-                safety,
-                law=settings.friction_law(),
-                friction_averaging=settings.friction_averaging,
-                attachment_offset=settings.attachment_offset,
-                step=settings.forecast_step,
-                margin_range=settings.margin_range,
-                contact_tolerance=settings.contact_tolerance,
-                residual_tolerance=settings.residual_tolerance,
-                max_step=settings.max_step,
-                fixed_nodes=settings.fixed_nodes,
-                workers=1,
-            )
+            forecaster = make_forecaster(settings, scene, workers=1)
             forecaster.warm_up()
         self._made = settings, scene, forecaster
         return forecaster

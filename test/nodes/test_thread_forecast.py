@@ -15,7 +15,8 @@ from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_m
 from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp, whole
+from test.model.estimator.threads import whole
+from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp
 
 HORIZON = 0.6
 
