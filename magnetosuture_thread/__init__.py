@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magnetosuture_thread.barrier import Barrier, Gradient
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
+    from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
     from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
     from magnetosuture_thread.jobs.calibrate import calibrate_bags
     from magnetosuture_thread.jobs.replay_offline import replay_offline
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _HOME = {
     "barrier": ("Barrier", "Gradient"),
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
+    "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
     "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
     "jobs.calibrate": ("calibrate_bags",),
     "jobs.replay_offline": ("replay_offline",),
@@ -49,6 +51,8 @@ __all__ = [
     "EstimatorOptions",
     "EstimatorSession",
     "FilteredCommand",
+    "Forecast",
+    "ForecastStart",
     "Gradient",
     "InvalidInputError",
     "MagnetosutureError",
@@ -66,6 +70,7 @@ __all__ = [
     "Thread",
     "ThreadEstimate",
     "ThreadEstimator",
+    "ThreadForecaster",
     "ThreadPredictor",
     "Workspace",
     "calibrate_bags",

@@ -54,6 +54,7 @@ MEASURED_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
 THREAD_OBSERVATION = Channel("thread/observation", "magnetosuture_msgs/msg/ThreadObservation")
 PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
 ESTIMATED_THREAD = Channel("thread/estimated", "magnetosuture_msgs/msg/EstimatedThread")
+FORECAST = Channel("thread/forecast", "magnetosuture_msgs/msg/ThreadForecast")
 MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
 THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
 SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene")  # dish and shapes from now on

@@ -300,6 +300,10 @@ def test_python_examples_run(page: Path, code: str, capsys: pytest.CaptureFixtur
     names: dict[str, Any] = {}
     exec(compile(code, str(page), "exec"), names)
     assert capsys.readouterr().out
+    if "forecast" in names:
+        assert names["forecast"].converged
+        assert not names["forecast"].problem
+        return
     prediction: Any = names.get("estimate", names.get("prediction"))
     assert prediction.converged
     assert prediction.residual < 1e-6

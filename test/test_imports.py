@@ -34,6 +34,7 @@ ALLOWED = {
     "model": {*BASE, "barrier", "compiled", "geometry", "scene", "shared_parameters", "thread_observation"},
     "vision": {*BASE, "compiled", "geometry", "scene", "shared_parameters", "thread_observation"},
     "safety": {*BASE, "barrier", "compiled", "geometry", "scene"},
+    "forecast": {"compiled", "errors", "geometry", "model", "safety", "scene"},
     "coils": {*BASE, "barrier", "geometry", "safety", "scene", "shared_parameters"},
     "guidance": {*BASE, "geometry", "scene", "shared_parameters"},
     "planning": {*BASE, "compiled", "geometry", "safety", "scene"},
@@ -45,7 +46,7 @@ ALLOWED = {
     "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},
     "bags": {*BASE, "interface", "messages"},
     "messages": {
-        *("barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils"),
+        *("barrier", "errors", "interface", "geometry", "scene", "model", "vision", "coils", "forecast"),
         "thread_observation",
     },
     "evaluation": {
@@ -65,7 +66,7 @@ ALLOWED = {
     "nodes": {
         *BASE,
         *("interface", "messages", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
-        *("parameter_files", "thread_observation"),
+        *("parameter_files", "thread_observation", "forecast"),
     },
     "offline": {
         *BASE,

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import CLOCK, DISH_FRAME, MARGINS, MEASURED_THREAD, NEEDLE_POSE, THREAD_OBSERVATION
+from magnetosuture_thread.interface import (
+    CLOCK,
+    DISH_FRAME,
+    FILTER_STATE,
+    MARGINS,
+    MEASURED_THREAD,
+    NEEDLE_POSE,
+    THREAD_OBSERVATION,
+)
 from magnetosuture_thread.messages.building import IN_PLANE
 from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
 from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
@@ -129,6 +137,19 @@ def pose_covariance(message: Any) -> NDArray[np.float64] | None:
         diagonal = np.diag(covariance).tolist()
         raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", diagonal, "finite variances of at least 0")
     return np.asarray(covariance)
+
+
+def filtered_command(message: Any) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
+    """Return the stamp [ns], the commanded and the filtered velocity, shapes (2,) [m/s], of a FilterState.
+
+    Raises:
+        InvalidInputError: a velocity is not finite, or the stamp no time.
+    """
+    stamp = checked_nanoseconds(message.header.stamp, f"{FILTER_STATE.name}.header.stamp")
+    commanded, filtered = np.array([[v.x, v.y] for v in (message.commanded, message.filtered)])
+    if not (np.isfinite(commanded).all() and np.isfinite(filtered).all()):
+        raise InvalidInputError(FILTER_STATE.name, [*commanded, *filtered], "finite velocities [m/s]")
+    return stamp, commanded, filtered
 
 
 def margins_of(message: Any) -> Margins:

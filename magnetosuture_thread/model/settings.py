@@ -13,6 +13,7 @@ from magnetosuture_thread.configuration import configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimator
 from magnetosuture_thread.model.estimator_settings import EstimatorSettings
+from magnetosuture_thread.model.forecast_settings import ForecastSettings
 from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.prediction import NeedlePose
@@ -38,11 +39,12 @@ FIXED = {  # why a node cannot change it
     "solver": "what is compiled when it starts",
     "barriers": "what is imported when it starts",
     "scene": "what it starts with; the topic scene changes it",
+    "forecast_horizon": "what is compiled when it starts",
 }
 
 
 @dataclass(frozen=True)
-class ThreadModelSettings(EstimatorSettings):
+class ThreadModelSettings(EstimatorSettings, ForecastSettings):
     """Parameters of the thread model: thread, liquid and numerical settings; the scene is given apart."""
 
     GROUP: ClassVar[str] = "thread_model"
@@ -220,6 +222,8 @@ class ThreadModelSettings(EstimatorSettings):
             if other != self.medium and getattr(self, about.name) != about.default:
                 words = f"{about.default}, its default: it counts for medium: {other} only"
                 raise self.refused(about.name, words)
+        if 0.0 < self.forecast_horizon < self.forecast_step:
+            raise self.refused("forecast_horizon", f"0, or at least forecast_step, {self.forecast_step:g} s")
         for node in self.fixed_nodes:
             if node > segments:
                 raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {segments}")

@@ -24,6 +24,7 @@ from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
 from magnetosuture_thread.nodes.thread_health import ThreadHealth
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -51,6 +52,7 @@ class ThreadModelNode(PackageNode):
         self._estimated = topics.ESTIMATED_THREAD.publisher(self)
         self._margins = topics.MARGINS.publisher(self)
         self._markers = topics.THREAD_MARKERS.publisher(self)
+        self._forecasts = ThreadForecasts(self, self._session) if settings.forecast_horizon > 0.0 else None
         self._observed = False
         self._last_margins = 0  # stamp of those that were published [ns]
         if listens:
@@ -90,7 +92,10 @@ class ThreadModelNode(PackageNode):
         result = self._session.predict(reading.nanoseconds(stamp), read)
         step_time = time.perf_counter() - began
         self._publish_prediction(result, step_time)  # at once, as it is waited for
-        self._report(self._session.estimate(result, read), step_time)
+        result = self._session.estimate(result, read)
+        self._report(result, step_time)
+        if self._forecasts is not None:
+            self._forecasts.publish(result, read)
 
     def on_measured_thread_message(self, data: bytes) -> None:
         """Take a centreline, where no tracker tells whether it is all of the thread, as in older bags.

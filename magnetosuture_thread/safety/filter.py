@@ -15,6 +15,7 @@ from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, AddedRows, measure, nearest_clear
 from magnetosuture_thread.safety.certificate import NOTHING, PosedNeedle, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import BodyData, FilterData
 from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
 
@@ -141,6 +142,22 @@ class NeedleSafetyFilter:
         middle, east = np.array([-0.5 * chord, 0.0]), np.array([1.0, 0.0])
         self.nearest_clear(np.array([1e-3, 0.0]), middle, east)
         self.safe_share(np.array([1e-3, 0.0]), middle, east)
+
+    def compiled_data(self) -> FilterData:
+        """Return the filter for compiled loops.
+
+        Raises:
+            ConfigurationError: it has barriers of a user, which compiled code does not know.
+        """
+        if self._barriers:
+            raise ConfigurationError(
+                "barriers of the safety filter", self._names[-2], "none: compiled code has its own"
+            )
+        x, y = self.kinematics.chord_direction(np.array([1.0, 0.0])).tolist()
+        body = BodyData(self._points, self._turning, self._straight, self.kinematics.chord, x, y, float(self._turn))
+        keep, rate = (self._keep, self._keep_wall, float(self.keep_out)), float(self._rate)
+        limits = min(float(self._max_speed), MAX_SPEED), float(self._max_acceleration), STUCK
+        return FilterData(body, float(self.hold_time), *keep, rate, BAND, *limits, self._packed, NO_ROWS)
 
     def filter(
         self,

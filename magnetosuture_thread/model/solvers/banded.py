@@ -42,6 +42,7 @@ from magnetosuture_thread.model.program import (
     WideRows,
     compiled_residuals,
 )
+from magnetosuture_thread.model.solvers.multipliers import is_active, multiplier_of, search, update
 
 Axes = tuple[int, ...]
 
@@ -117,7 +118,6 @@ def substitute(axes: Axes, band: NDArray[np.float64], x: Vector) -> None:
 
 
 MAX_WEIGHT = 1e7  # w_max over the scale of P: the least compliance that is exact at once
-MAX_LINE_SEARCHES = 50  # of the line search
 MAX_STALLS = 3  # Newton steps without a gain: rounding allows for no more
 ROUNDING_RESIDUAL = 1e-6  # scaled imbalance that is a solution where rounding allows for no less
 STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "stalled")
@@ -212,20 +212,6 @@ def images(axes: Axes, program: ChainProgram, u: Points, image: Vector) -> None:
 
 
 @compiled
-def multiplier_of(program: ChainProgram, r: int, image: float, weight: float, centre: float) -> float:
-    """Return lambda_r(u) for a row's image a_r' u."""
-    pull = (1.0 / weight - program.compliance[r]) * centre - image
-    multiplier = weight * (max(program.lower[r] + pull, 0.0) + min(program.upper[r] + pull, 0.0))
-    return float(max(min(multiplier, program.limit[r]), -program.limit[r]))
-
-
-@compiled
-def is_active(program: ChainProgram, r: int, multiplier: float) -> bool:
-    """Return whether a row's multiplier changes with its image."""
-    return multiplier != 0.0 and abs(multiplier) < program.limit[r]
-
-
-@compiled
 def forces(
     axes: Axes, program: ChainProgram, smooth: Vector, multipliers: Vector, force: Vector
 ) -> tuple[float, float]:
@@ -251,63 +237,6 @@ def forces(
 
 
 @compiled
-def update(
-    program: ChainProgram,
-    image: Vector,
-    centre: Vector,
-    weights: Vector,
-    multipliers: Vector,
-    active: NDArray[np.bool_],
-) -> tuple[int, float]:
-    """Write every multiplier; return how many rows began or ceased to be active, and how far they are from bounds."""
-    changes, gap = 0, 0.0
-    for r in range(len(program.first)):
-        multiplier = multiplier_of(program, r, image[r], weights[r], centre[r])
-        now = is_active(program, r, multiplier)
-        if now != active[r]:
-            changes += 1
-            active[r] = now
-        multipliers[r] = multiplier
-        hard = 1.0 / weights[r] - program.compliance[r]
-        if hard > 0.0:
-            gap = max(gap, abs(multiplier - centre[r]) * hard / max(1.0, abs(image[r])))
-    return changes, gap
-
-
-@compiled
-def search(
-    program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
-) -> float:
-    """Return where along Newton's step the balance along it is zero, at most 1.
-
-    It is piecewise linear and increasing in the part t taken; `start` and `end` are its smooth part
-    at 0 and 1. A Newton's method of its own, kept within a bracket, finds the zero exactly.
-    """
-    low, high, part = 0.0, 1.0, 1.0
-    for _ in range(MAX_LINE_SEARCHES):
-        value, slope = start + part * (end - start), end - start
-        for r in range(len(program.first)):
-            change = after[r] - before[r]
-            push = multiplier_of(program, r, before[r] + part * change, weights[r], centre[r])
-            value -= push * change
-            if is_active(program, r, push):
-                slope += weights[r] * change * change
-        if part == 1.0 and value <= 0.0:
-            return 1.0
-        if value > 0.0:
-            high = part
-        else:
-            low = part
-        following = part - value / slope
-        if not low < following < high:
-            following = 0.5 * (low + high)
-        if abs(following - part) <= 1e-12:
-            return following
-        part = following
-    return part
-
-
-@compiled
 def solve(
     axes: Axes,
     program: ChainProgram,
@@ -321,6 +250,7 @@ def solve(
     nodes, rows, unknowns = len(program.linear), len(program.first), program.linear.size
     step, force, smooth = vectors[0], vectors[1, :unknowns], vectors[2, :unknowns]
     weights, centre, image, before = vectors[3], vectors[4], vectors[5], vectors[6]
+    lower, upper, compliance, limit = program.lower, program.upper, program.compliance, program.limit
     stiffness = 0.0
     for i in range(nodes):
         for a in range(d):
@@ -331,16 +261,16 @@ def solve(
     balance(axes, program, u, smooth)
     images(axes, program, u, image)
     for r in range(rows):
-        weights[r] = 1.0 / max(program.compliance[r], 1.0 / stiffest)
+        weights[r] = 1.0 / max(compliance[r], 1.0 / stiffest)
         centre[r] = multipliers[r]
-        multipliers[r] = multiplier_of(program, r, image[r], weights[r], centre[r])
+        multipliers[r] = multiplier_of(lower[r], upper[r], compliance[r], limit[r], image[r], weights[r], centre[r])
         # The first guess: what pushed before pushes again, though it may seem to pull.
         if multipliers[r] == 0.0 and centre[r] != 0.0 and program.limit[r] == np.inf:
             bound = program.lower[r] if centre[r] > 0.0 else program.upper[r]
             if np.isfinite(bound):
                 hard = 1.0 / weights[r] - program.compliance[r]
                 multipliers[r] = weights[r] * (bound - image[r] + hard * centre[r])
-        active[r] = is_active(program, r, multipliers[r])
+        active[r] = is_active(limit[r], multipliers[r])
     forces(axes, program, smooth, multipliers, force)
     changes, stalled, least = 1, 0, np.inf
     for iteration in range(1, iterations + 1):

@@ -1,0 +1,1 @@
+"""Forecasts: how long they take, and how they compare with what then happened."""

@@ -1,0 +1,58 @@
+"""Time forecasts, and compare them with what then happened on the simulated rig in closed loop.
+
+Times: one forecast of 3 s in steps at 66 Hz of a thread of 81 segments among three posts, on one core; the same by
+stepping filter and predictor from Python; and a batch of 64 of 40 segments, on all cores. Errors: of forecasts from
+random moments of the loop of path follower, coil bridge and rig, under the commands that were then sent, in per cent of
+the thread's length; most of it is the needle, which does not follow the filtered velocity exactly.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.forecast.closed_loop import measure_accuracy
+from benchmarks.forecast.timing import measure_times
+from magnetosuture_thread.cli.terminal import make_log
+
+SETUPS = ("petri_35mm_polyamide_post", "hernia_ring")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    option = parser.add_argument
+    option("--repeats", type=int, default=50, metavar="N", help="of each time (default: 50)")
+    option("--forecasts", type=int, default=250, metavar="N", help="at random moments of each loop (default: 250)")
+    option("--seed", type=int, default=0, metavar="N", help="of the moments (default: 0)")
+    option("--setups", nargs="*", default=SETUPS, metavar="SETUP", help=f"of the loops (default: {' '.join(SETUPS)})")
+
+
+def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+    """Measure; return the figures."""
+    log = make_log(console)
+    times = measure_times(options.repeats)
+    table = Table(title="time of 3 s in steps at 66 Hz [ms]")
+    for name in ("", "median", "minimum", "processor time, all cores"):
+        table.add_column(name, justify="left" if not name else "right")
+    for key, text in (
+        ("single_ms", "one forecast, n = 81, one core"),
+        ("by_hand_ms", "the same stepped from Python"),
+        ("batch_ms", f"{times['batch_size']} forecasts, n = 40, {times['cores']} cores"),
+    ):
+        table.add_row(text, *(f"{times[key][name]:.1f}" for name in ("median", "minimum", "processor")))
+    console.print(table)
+    loops = []
+    for name in options.setups:
+        log(f"the loop of {name}, and {options.forecasts} forecasts from it")
+        loops.append(measure_accuracy(name, options.forecasts, 3.0, options.seed))
+    table = Table(title="forecasts 3 s ahead against the simulated rig, in % of the length")
+    for name in ("setup", "error, mean", "95 %", "of the needle, mean", "the thread moved, mean"):
+        table.add_column(name, justify="left" if name == "setup" else "right")
+    for loop in loops:
+        keys = ("error_mean_percent", "error_p95_percent", "needle_error_mean_percent", "moved_mean_percent")
+        table.add_row(loop["setup"], *(f"{loop[key]:.2f}" for key in keys))
+    console.print(table)
+    return {"times": times, "loops": loops}, True

@@ -1,0 +1,89 @@
+"""Forecasts in a graph: with each estimate, under the command that the bridge follows, and none unless asked for."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Vector3
+from magnetosuture_msgs.msg import FilterState
+
+from magnetosuture_thread import Disc, ForecastStart, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadForecaster
+from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_message, forecast_text
+from magnetosuture_thread.model.thread import MATERIALS, Attachment
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
+from test.model.estimator.threads import whole
+from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp
+
+HORIZON = 0.6
+
+
+def filter_state(k: int, x: float, y: float) -> FilterState:
+    return FilterState(header=MESSAGES.header(stamp(k)), commanded=Vector3(x=x, y=y), filtered=Vector3(x=x, y=y))
+
+
+def test_every_estimate_has_a_forecast_under_the_present_command(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
+    forecasts, markers = graph.listen(topics.FORECAST), graph.listen(topics.THREAD_MARKERS)
+    bench.show(0)
+    graph.wait(lambda: len(forecasts) == 1, "a forecast")
+    (first,) = forecasts
+    assert first.header.stamp == stamp(0)
+    assert (first.commanded.x, first.commanded.y) == (0.0, 0.0)  # nobody commands the needle
+    assert (first.tail[-1].x, first.tail[-1].y) == (first.tail[0].x, first.tail[0].y)
+    heading = WAY[1].heading
+    x, y = (0.004 * heading).tolist()
+    graph.publish(topics.FILTER_STATE, filter_state(1, x, y))
+    graph.wait(lambda: forecast_after(bench, forecasts).commanded.x == x, "a forecast under the command")
+    message = forecasts[-1]
+    assert message.horizon == pytest.approx(HORIZON)
+    assert message.converged
+    assert not message.problem
+    count = len(message.time)
+    assert len(message.tail) == len(message.heading) == count
+    assert len(message.positions) == 26 * count
+    moved = math.hypot(message.tail[-1].x - message.tail[0].x, message.tail[-1].y - message.tail[0].y)
+    assert moved == pytest.approx(0.004 * HORIZON, rel=0.05)
+    assert list(message.margin_names) == ["obstacle", "wall", "connectivity", "compression", "needle"]
+    assert math.isnan(message.contact_time)
+    assert math.isnan(message.rest_time)
+    assert message.peak_tension > 0.0
+    graph.wait(lambda: any(marker.ns == "forecast" for each in markers for marker in each.markers), "markers")
+
+
+def forecast_after(bench: Any, forecasts: list[Any]) -> Any:
+    """Show the next frame and return the forecast from it."""
+    before = len(forecasts)
+    bench.show(before, whole(NODES[before], before))
+    bench.graph.wait(lambda: len(forecasts) > before, "a forecast")
+    return forecasts[-1]
+
+
+def test_without_a_horizon_nothing_is_forecast(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, scene="dish_150mm")
+    bench.show(0)
+    assert not bench.node.get_publishers_info_by_topic(bench.node.resolve_topic_name(topics.FORECAST.name))
+
+
+def test_message_and_markers_say_what_happens_when():
+    where = Scene.create(shapes={"post": Disc((-0.004, 0.002), 0.001)})
+    thread = Thread.of(MATERIALS["polyamide_7_0"], length=0.012, segments=40, attachment=Attachment.PINNED)
+    forecaster = ThreadForecaster(thread, where, NeedleSafetyFilter(where))
+    start = forecaster.straight(NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0])))
+    forecast = forecaster.forecast(ForecastStart(start.pose, start.vertices), np.array([0.0, 0.003]), 2.0)
+    message = forecast_message(MESSAGES, stamp(0), forecast)
+    contact = forecast.first_contact
+    assert contact is not None
+    assert (message.contact_time, message.contact_shape, message.contact_node) == (contact.time, "post", contact.node)
+    assert message.clearance[0] == forecast.minima["obstacle"].value
+    assert message.clearance_shape[0] == "post"
+    assert forecast_text(forecast).startswith(f"touches post in {contact.time:.1f} s")
+    ghosts = forecast_markers(MESSAGES, stamp(0), forecast).markers
+    assert [len(marker.points) for marker in ghosts] == [41, 41, 41, 0]
+    assert ghosts[-1].text == forecast_text(forecast)
+    still = forecaster.forecast(start, np.zeros(2), 0.1)
+    assert not forecast_text(still)
+    assert math.isnan(forecast_message(MESSAGES, stamp(0), still).contact_time)
