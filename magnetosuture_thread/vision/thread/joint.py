@@ -17,19 +17,21 @@ TAIL_PX = 3.0  # from the tail, up to which its own edge shows
 START_PX = 12.0  # from there on, in which a thread that leaves the tail is visible
 NEXT_PX = 50.0  # from the tail, up to which it is compared with
 START_SHARE, MAX_FAINT = 0.3, 0.4  # of the strength there; share of the start that may be fainter
+MIN_VISIBLE = 10  # places there that are not hidden, by which the two are compared
 JOINT_PX = 24.0  # from the tail, up to which a walk may join a line
 # In pixels of the ridge, which is shrunk where the thread is wide:
 AHEAD_PX = 8.0  # of the walk beyond a joint, that give the line's direction
 BACK_FIRST_PX, BACK_LAST_PX = 4.0, 22.0  # from a joint, between which the line is looked for the other way
 BACK_SHARE = 0.6  # of the usual strength, that it has at each of its points
 APART_PX = 4.0  # from the walk, at which the far end of it is another line
+BESIDE_PX = 2.5  # beyond a thread's edge, from where on it is another line
 RETURN_PX = 100.0  # from the tail, after which a walk may pass it again as a thread does
 STEP_PX = 2.0
 _BENDS = np.linspace(-0.045, 0.045, 7)  # 1/px, of a thread of 250 / m and a little more
 _TURNS = np.linspace(-0.25, 0.25, 5)  # rad, that the line's direction may differ from the walk's
 
 
-def joins_passing_line(points: np.ndarray, ridge: Ridge, origin: tuple[int, int]) -> bool:
+def joins_passing_line(points: np.ndarray, ridge: Ridge, origin: tuple[int, int], half_width: float = 0.0) -> bool:
     """Say whether a walk follows a line that does not begin at the tail.
 
     A thread that leaves the tail is visible from there on as well as later, and does not go on the other way. So a line
@@ -39,6 +41,7 @@ def joins_passing_line(points: np.ndarray, ridge: Ridge, origin: tuple[int, int]
         points: vertices of the walk from the tail on, shape (m, 2) [px].
         ridge: that was followed.
         origin: of the ridge in the picture [px].
+        half_width: of the thread, as far as it is known [px].
     """
     along = arc_lengths(points)
     if along[-1] < JOINT_PX + ridge.scale * AHEAD_PX:
@@ -47,7 +50,7 @@ def joins_passing_line(points: np.ndarray, ridge: Ridge, origin: tuple[int, int]
     near = _Near.around(points[0], ridge, origin)
     strengths = near.strengths(_points_at(points, along, at))
     start, following = (part[~np.isnan(part)] for part in np.split(strengths, [int(START_PX)]))
-    if not len(following):
+    if len(following) < MIN_VISIBLE:  # as of a pale thread, which looks like the lamp's reflection
         return False
     usual = middle(following)
     if len(start) and np.mean(start < START_SHARE * usual) > MAX_FAINT:
@@ -56,7 +59,8 @@ def joins_passing_line(points: np.ndarray, ridge: Ridge, origin: tuple[int, int]
     joints = np.arange(0.0, JOINT_PX, STEP_PX)
     begin, ahead = (_points_at(points, along, joints + beyond) for beyond in (0.0, scale * AHEAD_PX))
     own = np.arange(0.0, float(along[-1]), STEP_PX)
-    return bool(_goes_back(*near.arrays, usual, joints, begin, ahead, own, _points_at(points, along, own)))
+    apart = max(scale * APART_PX, half_width + BESIDE_PX)  # Within a wide thread's edges all is its own.
+    return bool(_goes_back(*near.arrays, usual, apart, joints, begin, ahead, own, _points_at(points, along, own)))
 
 
 def _points_at(points: np.ndarray, along: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -124,12 +128,12 @@ def _strengths(strength, hidden, geometry, points, values):
 
 
 @compiled
-def _goes_back(strength, hidden, geometry, usual, joints, begin, ahead, along, points):
+def _goes_back(strength, hidden, geometry, usual, apart, joints, begin, ahead, along, points):
     """Say whether a line goes on backwards from one of the first places of a walk, off the walk itself.
 
     Arcs are tried from each joint, at `begin`, away from the walk's direction there, towards `ahead`. The walk may turn
     round and come back on the line that it joined: only its way there, and later ones, are its own; `points` are those
-    of the walk at the lengths `along`.
+    of the walk at the lengths `along`. What is no farther than `apart` from these [px] is the walk's own.
     """
     scale = geometry[2]
     count = round((BACK_LAST_PX - BACK_FIRST_PX) / STEP_PX)
@@ -159,6 +163,6 @@ def _goes_back(strength, hidden, geometry, usual, joints, begin, ahead, along, p
                     for index in range(count // 2, count):
                         x, y = arc[index, 0] - points[place, 0], arc[index, 1] - points[place, 1]
                         nearest = min(nearest, x * x + y * y)
-                if nearest > (scale * APART_PX) ** 2:
+                if nearest > apart * apart:
                     return True
     return False

@@ -70,6 +70,7 @@ class Walk:
         strong: whether the thread is visible at each vertex of the path.
         crossings: where it could have gone on along another strand; see `ThreadSearch.resolved`.
         passes: whether a line passes the tail, and was not followed; see `joins_passing_line`.
+        half_width: of the thread, where it was measured; else 0 [px].
     """
 
     points: np.ndarray
@@ -80,6 +81,7 @@ class Walk:
     strong: np.ndarray
     crossings: tuple[Crossing, ...] = ()
     passes: bool = False
+    half_width: float = 0.0
 
 
 def is_strong(dark: Walk, enough: float) -> bool:
@@ -190,14 +192,16 @@ class ThreadSearch:
         share = len(found.points) / len(whole.points)
         kept = max(1, round(share * len(walk.path)))
         path, strong, shown = walk.path[:kept], walk.strong[:kept], share * walk.shown
-        return replace(walk, points=found.points, shown=shown, path=path, strong=strong), found
+        half = found.half_width
+        return replace(walk, points=found.points, shown=shown, path=path, strong=strong, half_width=half), found
 
     def without_passing_line(self, walk: Walk) -> Walk:
         """Return a walk, or its first vertex alone if it follows a line that passes the tail.
 
         Among pixels as large as those that a wide thread is followed in, needle and thread run into each other.
         """
-        if walk.ridge.scale == COARSE or not joins_passing_line(walk.points, walk.ridge, self._origin):
+        ridge = walk.ridge
+        if ridge.scale == COARSE or not joins_passing_line(walk.points, ridge, self._origin, walk.half_width):
             return walk
         return replace(walk, points=walk.points[:1], path=walk.path[:1], strong=walk.strong[:1], shown=0.0, passes=True)
 
