@@ -162,7 +162,7 @@ def stiff_capstan(friction: float, stiffness: float, free: int = 250) -> StiffCa
             for part, end in ((before, first), (behind, last))
         )
         gain = math.exp(friction * theta)
-        ratio = (high - DRAG * SPEED * radius * (gain - 1.0) / friction) / low
+        ratio = float((high - DRAG * SPEED * radius * (gain - 1.0) / friction) / low)
         bent = predictor.thread.bending_stiffness / (low * radius**2)
         found.append((ratio, elastica_ratio(friction, float(theta), float(bent)), gain))
     return StiffCapstan(*np.mean(found, axis=0).tolist())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
@@ -58,7 +59,7 @@ class RecordingSolver:
         self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector, wide: WideRows | None = None
     ) -> Solution:
         solution = self._solver.solve(program, velocities, multipliers, wide)
-        self.solved.append((type(program)(*(np.copy(part) for part in program)), solution))
+        self.solved.append((copy.deepcopy(program), solution))
         return solution
 
 

@@ -61,7 +61,7 @@ class Needle:
 
 @pytest.mark.parametrize("drift", [(0.0, 0.0), (1e-4, 3e-4), (-3e-4, 0.0)])
 def test_an_ideal_needle_reaches_every_goal(drift: tuple[float, float]):
-    goals = [
+    goals: list[dict[str, Any]] = [
         {"wrap": {"around": "post", "angle": 6.5, "sense": "counterclockwise"}},
         {"go_to": {"position": [-0.008, 0.004], "heading": [2.5]}},
         {"withdraw": {}},
@@ -96,9 +96,8 @@ def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
     needle.run(run, 1.0)
     way = needle.way
     needle.run(run, 2.0, lambda: replace(KNOWN, problem="the thread has not been measured for 1.0 s"))
-    assert run.state is ProcedureState.PAUSED
+    assert (run.state, needle.way) == (ProcedureState.PAUSED, way)
     assert "not been measured" in run.reason
-    assert needle.way == way
     needle.run(run, 60.0)
     assert run.state is ProcedureState.DONE
 

@@ -38,12 +38,9 @@ from magnetosuture_thread.model.solvers.banded import (
     balance,
     factorise,
     images,
-    is_active,
-    multiplier_of,
-    search,
     substitute,
-    update,
 )
+from magnetosuture_thread.model.solvers.multipliers import is_active, multiplier_of, search, update
 
 
 @compiled
@@ -175,6 +172,7 @@ def solve_wide(
     d, rows, unknowns = len(axes), len(program.first), program.linear.size
     step, force, smooth = vectors[0, : len(band)], vectors[1, :unknowns], vectors[2, :unknowns]
     weights, centre, image, before = vectors[3, :rows], vectors[4, :rows], vectors[5, :rows], vectors[6, :rows]
+    lower, upper, compliance, limit = program.lower, program.upper, program.compliance, program.limit
     stiffness = 0.0
     for i in range(len(u)):
         for a in range(d):
@@ -186,10 +184,10 @@ def solve_wide(
     images(axes, program, u, image)
     _wide_images(nodes, gradient, u, image)
     for r in range(rows):
-        weights[r] = 1.0 / max(program.compliance[r], 1.0 / stiffest)
+        weights[r] = 1.0 / max(compliance[r], 1.0 / stiffest)
         centre[r] = multipliers[r]
-        multipliers[r] = multiplier_of(program, r, image[r], weights[r], centre[r])
-        active[r] = is_active(program, r, multipliers[r])
+        multipliers[r] = multiplier_of(lower[r], upper[r], compliance[r], limit[r], image[r], weights[r], centre[r])
+        active[r] = is_active(limit[r], multipliers[r])
     _all_forces(axes, program, nodes, gradient, smooth, multipliers, force)
     stalled, minimum = 0, np.inf
     for iteration in range(1, iterations + 1):
