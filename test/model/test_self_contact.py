@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import shapely
 
-from benchmarks.self_contact import move_model, random_path, start_nodes
+from benchmarks.self_contact import move_model
 from magnetosuture_thread import ConfigurationError, InvalidInputError, NeedlePose, Scene, ThreadPredictor
 from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.thread import Attachment, Medium, Thread
@@ -123,22 +123,28 @@ def test_a_loop_closes_and_opens_again():
 
 
 def test_forces_of_self_contact_are_equal_and_opposite():
-    """Where the node at the needle's tail, which the needle holds, is not in contact itself."""
-    predictor = predictor_of(True)
-    predictor.start(NeedlePose(0.0, np.zeros(2), EAST), start_nodes())
+    """The needle lays the middle of a lead across the thread's end, which comes round below it."""
+    radius, turn = 1.8e-3, np.linspace(0.0, 1.5 * math.pi, 300)
+    lead = np.column_stack([np.linspace(0.0, -5e-3, 100), np.zeros(100)])
+    arc = np.column_stack([-5e-3 - radius * np.sin(turn), radius * (np.cos(turn) - 1.0)])
+    nodes = np.vstack([lead, arc[1:], arc[-1] + (0.0, 1.65e-3)])
+    length = float(np.linalg.norm(np.diff(nodes, axis=0), axis=1).sum())
+    predictor = predictor_of(True, soft(40, length))
+    predictor.start(NeedlePose(0.0, nodes[0], EAST), nodes)
     touches, barrier = 0, SelfContact(predictor.thread)
-    for k, (tail, angle) in enumerate(random_path(1, 300), 1):
-        prediction = predictor.step(NeedlePose(k / RATE, tail, np.array([math.cos(angle), math.sin(angle)])))
+    for k in range(1, 121):
+        prediction = predictor.step(NeedlePose(k / RATE, nodes[0] - (0.0, 4e-5 * k), EAST))
         rows = barrier.rows(prediction.positions)
-        near = rows.nodes[rows.value < 1e-5]
-        if not prediction.converged or not len(near) or (near == 0).any():
+        near, forces = rows.nodes[rows.value < 1e-5], prediction.forces
+        if not len(near):
             continue
-        forces = prediction.forces
+        assert prediction.converged
+        assert not (near == 0).any()
         assert forces is not None
         strongest = float(np.linalg.norm(forces.contact, axis=1).max())
         touches += strongest > 1e-7
         assert np.linalg.norm(forces.contact.sum(axis=0)) <= 1e-9 * strongest
-    assert touches > 5
+    assert touches > 50
 
 
 def test_a_thread_pushed_into_a_heap_stays_beside_itself():
