@@ -39,7 +39,7 @@ def test_check_shows_dish_version_and_shapes(capsys: pytest.CaptureFixture[str],
     found = json.loads((tmp_path / "a.json").read_text())
     assert (found["version"], found["dish"]) == (
         scene.version,
-        {"diameter": 0.05, "depth": 0.003, "wall_friction": 0.0},
+        {"diameter": 0.05, "depth": 0.003, "wall_friction": 0.0, "self_contact": None},
     )
     assert [shape["name"] for shape in found["shapes"]] == list(scene.names)
     ring = found["shapes"][0]
