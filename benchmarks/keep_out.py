@@ -270,7 +270,7 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
             _, stamp, (tail, heading) = poses.popleft()
             number += 1
             try:
-                bridge.extrapolator.update(tail, heading, stamp, number, now, now)
+                bridge.on_pose(tail, heading, stamp, number, now, now)
             except InvalidInputError as error:
                 if "publishers" in str(error) or "finite" in str(error):
                     raise

@@ -90,7 +90,7 @@ def run_loop(setup: Setup, duration: float) -> list[Moment]:
             if command.progress >= 1.0:
                 break
             velocity = command.velocity
-            bridge.extrapolator.update(pose.tail, heading, now, count, now, now)
+            bridge.on_pose(pose.tail, heading, now, count, now, now)
             bridge.on_margins(now, True, friction.slowdown, scene.version, now)
             bridge.command(NEEDLE, velocity, now, count, now, now)
         output = bridge.step(now, now, READY)

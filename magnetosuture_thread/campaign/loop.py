@@ -190,7 +190,7 @@ class ClosedLoop:
         self._count += 1
         stamp, now = measured.stamp, self.now
         try:
-            self.bridge.extrapolator.update(
+            self.bridge.on_pose(
                 measured.tail, measured.heading, stamp, self._count, now, now, measured.covariance
             )
         except InvalidInputError:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from magnetosuture_thread.coils.field import CoilModel
+from magnetosuture_thread.coils.motion_observer import Disturbance
 from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
@@ -22,6 +23,9 @@ ALIGN_WEIGHT = 0.1
 DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
+UNDISTURBED = Disturbance()
+
+MAX_COIL_FIELD = 1.5  # of the aligning field, by each coil at most, where that makes the needle drift
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
 
@@ -74,15 +78,19 @@ class Allocation:
         currents: of each coil, shape (m,) [A].
         velocity: of the tip with these currents by the bridge's model, shape (2,) [m/s].
         saturated: whether a current limit keeps the needle from the commanded velocity.
+        drift: velocity of the needle's middle across the chord, to its left, by the currents' force [m/s].
     """
 
     currents: Vector
     velocity: Vector
     saturated: bool
+    drift: float = 0.0
 
     def scaled(self, share: float) -> Allocation:
         """Return the allocation scaled by a factor; the velocity is linear in the currents."""
-        return self if share == 1.0 else Allocation(share * self.currents, share * self.velocity, self.saturated)
+        if share == 1.0:
+            return self
+        return Allocation(share * self.currents, share * self.velocity, self.saturated, share * self.drift)
 
 
 class CoilAllocation:
@@ -96,8 +104,8 @@ class CoilAllocation:
         v . n = F . n / drag_across + omega l / 2             omega = q l B . n / turning_drag
 
     with the mean field B of both ends. They are the bounded least-squares solution of: both velocities;
-    a field B_0 along the needle, which holds its direction; little force across, which exists in most
-    places since the field grows towards the coils, and causes drift; and little current. The needle turns
+    a field B_0 along the needle, which holds its direction; the wanted drift by force across, none or what
+    compensates the needle's slip; and little current. The needle turns
     against the remaining drift until it moves at a constant angle to its path. A zero velocity gives zero currents.
 
     Source: none.
@@ -116,6 +124,10 @@ class CoilAllocation:
         self._field = aligning_field
         self._max_current = max_current
 
+    def chord_direction(self, heading: Vector) -> Vector:
+        """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
+        return self._needle.chord_direction(heading)
+
     def zero(self) -> Allocation:
         """Return zero currents."""
         return Allocation(np.zeros(len(self.names)), np.zeros(2), False)
@@ -127,6 +139,7 @@ class CoilAllocation:
         heading: Vector,
         previous: Vector | None = None,
         max_change: float = math.inf,
+        disturbance: Disturbance = UNDISTURBED,
     ) -> Allocation:
         """Return the currents for a tip velocity.
 
@@ -136,6 +149,8 @@ class CoilAllocation:
             heading: unit vector along the needle at its tail, shape (2,).
             previous: currents of the last step, shape (m,) [A]; no limit on change if None.
             max_change: maximum change of each current [A]; not applied to a zero velocity.
+            disturbance: of which the currents shall give the opposite of the drift, and turn the field by the opposite of
+                the angle; `velocity` is to hold the rest.
         """
         if not np.any(velocity):
             return self.zero()
@@ -143,12 +158,14 @@ class CoilAllocation:
         e = needle.chord_direction(heading)
         n = np.array([-e[1], e[0]])
         lever = 0.5 * needle.chord
+        c, s = math.cos(disturbance.angle), math.sin(disturbance.angle)
+        field_e, field_n = c * e - s * n, c * n + s * e  # to which the field is to be set
         at_tail, at_tip = self._coils.per_current(tail), self._coils.per_current(tail + needle.chord * e)
         mean = 0.5 * (at_tail + at_tip)
         pull = needle.pole * (at_tip - at_tail)
         along = e @ pull / needle.drag
-        drift = n @ pull / needle.drag_across
-        turning = lever * needle.pole * needle.chord / needle.turning_drag * (n @ mean)
+        drifting = n @ pull / needle.drag_across
+        turning = lever * needle.pole * needle.chord / needle.turning_drag * (field_n @ mean)
         # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
         sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n)))
@@ -156,9 +173,9 @@ class CoilAllocation:
         system = np.vstack(
             [
                 DRIVE_WEIGHT / reference_speed * along,
-                TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drift),
-                ALIGN_WEIGHT / self._field * (e @ mean),
-                DRIFT_WEIGHT / reference_speed * drift,
+                TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drifting),
+                ALIGN_WEIGHT / self._field * (field_e @ mean),
+                DRIFT_WEIGHT / reference_speed * drifting,
                 CURRENT_WEIGHT / self._max_current * np.eye(len(self.names)),
             ]
         )
@@ -166,6 +183,7 @@ class CoilAllocation:
         target[0] = DRIVE_WEIGHT / reference_speed * float(velocity @ e)
         target[1] = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * sideways
         target[2] = ALIGN_WEIGHT
+        target[3] = DRIFT_WEIGHT / reference_speed * -disturbance.drift
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:
@@ -173,10 +191,20 @@ class CoilAllocation:
             upper = np.clip(previous + max_change, -limit, limit)
         # Most solutions are inside the limits, where the unconstrained one is optimal.
         currents = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
+        fields = np.hypot(*mean) / (MAX_COIL_FIELD * self._field)
+        if np.any(np.abs(fields * currents) > 1.0):
+            # Close to the coils' axes a force across the needle takes large currents whose fields cancel each other, so
+            # that small errors of theirs turn the needle: as much of it as the coils' fields allow, the rest is drift.
+            system[3] = target[3] = 0.0
+            free = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
+            more, left = fields * (currents - free), np.maximum(0.0, 1.0 - np.abs(fields * free))
+            share = min(1.0, float((left / np.maximum(np.abs(more), 1e-12)).min()))
+            currents = free + share * (currents - free)
         if np.any((currents < lower) | (currents > upper)):
             # The solver rejects equal bounds; the small gap has no effect.
             found = lsq_linear(system, target, bounds=(lower, np.maximum(upper, lower + 1e-9)), method="bvls")
             currents = np.clip(found.x, lower, upper)
-        reached = float(along @ currents) * e + float((turning + drift) @ currents) * n
+        reached = float(along @ currents) * e + float((turning + drifting) @ currents) * n
         inaccurate = float(np.linalg.norm(reached - velocity)) > SATURATION_TOLERANCE * float(np.linalg.norm(velocity))
-        return Allocation(currents, reached, inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit)))
+        saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
+        return Allocation(currents, reached, saturated, float(drifting @ currents))

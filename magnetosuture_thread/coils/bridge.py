@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.coils.allocation import Allocation
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.coils.motion_observer import Disturbance, MotionObserver
 from magnetosuture_thread.coils.pose_extrapolator import Pose, PoseExtrapolator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor
@@ -130,6 +131,7 @@ class CoilBridge:
         )
         self.prediction_monitor = PredictionMonitor(settings.prediction_timeout)
         self.feedforward = settings.feedforward()
+        self._observer = MotionObserver(settings.needle().kinematics) if settings.motion_compensation else None
         self._settings = settings
         self._coils = settings.allocation()
         self._filter: NeedleSafetyFilter | None = None
@@ -178,6 +180,21 @@ class CoilBridge:
             arrival: a monotonic clock now [s].
         """
         self.watchdogs[source].update(velocity, stamp, number, now, arrival)
+
+    def on_pose(
+        self,
+        tail: Vector,
+        heading: Vector,
+        stamp: float,
+        number: int,
+        now: float,
+        arrival: float,
+        covariance: Vector | None = None,
+    ) -> None:
+        """Register a measured needle pose; see `PoseExtrapolator.update`."""
+        self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance)
+        if self._observer is not None:
+            self._observer.update(tail, heading, stamp)
 
     def on_margins(self, stamp: float, valid: bool, slowdown: float, scene_version: str, arrival: float) -> None:
         """Register the thread model's margins; see `PredictionMonitor.update`."""
@@ -260,9 +277,12 @@ class CoilBridge:
         if filtered.reason:
             return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
         max_change, pull = self._settings.max_current_slew * elapsed, np.zeros(2)
+        disturbance = Disturbance()
+        if self._observer is not None:
+            disturbance = self._observer.disturbance(pose.heading)
         if self.feedforward is not None and not no_prediction:
             pull = self.feedforward.velocity(filtered.filtered, pose.heading, now, arrival)
-        allocation, limiting = self._allocate(filtered.filtered, pull, pose, max_change, self._filter)
+        allocation, limiting = self._allocate(filtered.filtered, pull, disturbance, pose, max_change, self._filter)
         active += tuple(
             name for name in (limiting, CURRENT_LIMIT if allocation.saturated else "") if name and name not in active
         )
@@ -272,7 +292,10 @@ class CoilBridge:
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
-        self.extrapolator.apply_velocity(allocation.velocity, now, arrival)
+        e = self._coils.chord_direction(pose.heading)
+        self.extrapolator.apply_velocity(allocation.velocity + disturbance.velocity(e), now, arrival)
+        if self._observer is not None:
+            self._observer.apply(now, pose.heading, float(e @ allocation.velocity), allocation.drift, elapsed)
         return self._output(selected, (), True, active, filtered.slowdown)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
@@ -354,21 +377,32 @@ class CoilBridge:
     def _clear(self) -> None:
         """Restart the limits on change from zero current and velocity."""
         self._previous, self._velocity = self._coils.zero(), np.zeros(2)
+        if self._observer is not None:
+            self._observer.stop()
 
     def _allocate(
-        self, velocity: Vector, pull: Vector, pose: Pose, max_change: float, safety: NeedleSafetyFilter
+        self,
+        velocity: Vector,
+        pull: Vector,
+        disturbance: Disturbance,
+        pose: Pose,
+        max_change: float,
+        safety: NeedleSafetyFilter,
     ) -> tuple[Allocation, str]:
-        """Return currents whose velocity, drift included, is certified for the hold time, and the limiting one.
+        """Return currents whose motion, drift included, is certified for the hold time, and the limiting one.
 
-        With a velocity that the thread's pull adds, both are certified: that of the currents with it and without.
+        With what the thread's predicted pull or the measured disturbance adds, both motions are certified: that of
+        the currents with it and without.
         """
+        pull = pull + disturbance.velocity(self._coils.chord_direction(pose.heading))
         velocity = self._within_limit(velocity - pull)
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
         for _ in range(1 + MAX_CORRECTIONS):
-            found = self._coils.allocate(target, pose.tail, pose.heading, self._previous.currents, max_change)
-            share, name = safety.safe_share(found.velocity, pose.tail, pose.heading)
+            found = self._coils.allocate(target, pose.tail, pose.heading, self._previous.currents, max_change, disturbance)
+            share, name = safety.safe_share(found.velocity, pose.tail, pose.heading, found.drift)
             if pull.any():
-                share, name = min((share, name), safety.safe_share(found.velocity + pull, pose.tail, pose.heading))
+                moved = safety.safe_share(found.velocity + pull, pose.tail, pose.heading, found.drift + disturbance.drift)
+                share, name = min((share, name), moved)
             kept = found.scaled(share)
             error = float(np.linalg.norm(kept.velocity - velocity))
             if error < min_error:

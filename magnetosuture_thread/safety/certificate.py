@@ -206,7 +206,9 @@ def _polygon_time(
 
 
 @compiled
-def safe_time(vx: float, vy: float, needle: PosedNeedle, scene: PackedScene) -> tuple[float, int, int]:
+def safe_time(
+    vx: float, vy: float, needle: PosedNeedle, scene: PackedScene, drift: float = 0.0
+) -> tuple[float, int, int]:
     """Return for how long a motion keeps the needle clear, at most `hold`, what ends it, and which point meets it.
 
     No point of the needle gets closer than `keep` to a shape or `keep_wall` to the wall; one that is closer already
@@ -217,18 +219,20 @@ def safe_time(vx: float, vy: float, needle: PosedNeedle, scene: PackedScene) -> 
         vy: velocity of the tip [m/s].
         needle: in its pose.
         scene: packed.
+        drift: part of the tip's velocity across the chord, to its left, that the whole needle has [m/s].
 
     Returns:
         The time [s]; the index of the shape in the scene, `WALL` or `NOTHING`; the index of the point, and -1 for none.
     """
     best, what, where = needle.hold, NOTHING, -1
     points, distances, chord_x, chord_y = needle.points, needle.distances, needle.chord_x, needle.chord_y
-    along, across = vx * chord_x + vy * chord_y, -vx * chord_y + vy * chord_x
+    along, across = vx * chord_x + vy * chord_y, -vx * chord_y + vy * chord_x - drift
     omega = needle.turn * across
     count, discs = len(points), len(scene.discs)
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
-        px, py = along * chord_x + across * needle.turning[i, 0], along * chord_y + across * needle.turning[i, 1]
+        px = along * chord_x - drift * chord_y + across * needle.turning[i, 0]
+        py = along * chord_y + drift * chord_x + across * needle.turning[i, 1]
         speed = math.hypot(px, py)
         if speed == 0.0:
             continue

@@ -239,7 +239,9 @@ class NeedleSafetyFilter:
             return velocity, []
         return clear, [self._names[k] for k in np.flatnonzero(self._touched)]
 
-    def safe_share(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[float, str]:
+    def safe_share(
+        self, velocity: Vector, tail: Vector, heading: Vector, drift: float = 0.0
+    ) -> tuple[float, str]:
         """Return the share of a velocity that keeps clear while it is held for the whole hold time: the guarantee.
 
         With the share of it the needle goes the same way more slowly, and is at the end of the hold where with all
@@ -249,6 +251,8 @@ class NeedleSafetyFilter:
             velocity: of the tip, shape (2,) [m/s].
             tail: the needle's tail, shape (2,) [m].
             heading: unit vector along the needle at its tail, shape (2,).
+            drift: part of that velocity across the chord, to its left, that the whole needle has: the rest turns it about
+                its middle [m/s].
 
         Returns:
             The share, 0 to 1, and the name of what it is for; empty for a share of 1.
@@ -257,7 +261,8 @@ class NeedleSafetyFilter:
             InvalidInputError: something is not finite.
         """
         _speed(velocity)
-        time, what, _ = safe_time(float(velocity[0]), float(velocity[1]), self._at(tail, heading), self._packed)
+        x, y = float(velocity[0]), float(velocity[1])
+        time, what, _ = safe_time(x, y, self._at(tail, heading), self._packed, drift)
         found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
         if not self._barriers:
             return found
