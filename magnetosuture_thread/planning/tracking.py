@@ -8,17 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath, turning_points
 
 Vector = NDArray[np.float64]
 
-GAIN = 6.0  # 1/s; on the error of the leading end
-INTEGRAL_GAIN = 6.0  # 1/s^2; for what thread and coil model take of the velocity
-MAX_CORRECTION = 1.0  # of the allowed speed, by the integral
+ALONG_GAIN = 6.0  # 1/s; on the error along the body
+TURN_GAIN = 6.0  # 1/s; on the error of the direction
+LOOKAHEAD = 8e-4  # m; how far ahead on the path the needle is directed
+INTEGRAL_GAIN = 1.5  # 1/s; on the error across the path, for what makes the needle slip aside
+MAX_INTEGRAL = 8e-4  # m; of it
 ACCELERATION = 0.008  # m/s^2
-MAX_LAG = 4e-4  # m; the setpoint waits for a needle that is farther from it
-ARRIVED = 1.5e-4  # m; an end of the path, or a change of direction on it, is reached this close
+MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle that is farther from it
+ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
+MAX_RATIO = 2.0  # of the allowed speed, that corrections of either kind may take
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
 
 
@@ -29,7 +31,7 @@ class TrackingCommand:
     Attributes:
         velocity: of the tip, shape (2,) [m/s].
         travel: way of the tip along the path, up to the setpoint [m].
-        error: of the leading end from its setpoint [m].
+        error: of the needle's middle from its setpoint [m].
         done: whether the path's end is reached.
     """
 
@@ -40,14 +42,21 @@ class TrackingCommand:
 
 
 class PathTracker:
-    """Tracks a path of poses by its leading end: the tip where it is driven ahead, the tail where it is driven back.
+    """Tracks a path of poses by the middle of the needle's chord, ahead and back.
 
-        v = w dp/ds + k e + c,    e = p(s) - x_end,    dc/dt = k_i e,    |c| <= the allowed speed
+    With the planned pose (p, theta_p) at the setpoint, its speeds u_p along the chord and omega_p, the error (x, y) of
+    the middle along the needle and across the path, to their left, and the share s of the way that is driven, not
+    turned on the spot,
 
-    with the leading end p(s) of the planned poses, and the setpoint's speed w, which has a trapezoidal profile between
-    the places where the needle changes between ahead and back. The setpoint waits while the end is farther from it than
-    `MAX_LAG`. An end of the needle can be given a velocity in any direction, and the rest of the body follows it, as a
-    trailer follows. The tip's velocity for that of the tail is its mirror image about the chord.
+        theta = theta_p + s sign(u_p) atan((y + z) / L),    z' = k_z y
+        u = u_p + k_x x,    omega = omega_p + k_t (theta - theta_needle)
+
+    and the tip's velocity is u along the chord and omega l / 2 across it. The setpoint's speed has a trapezoidal
+    profile between the places where the needle changes between ahead and back. It waits while the needle is farther
+    from it than `MAX_LAG` along the path or `MAX_ANGLE`.
+
+    Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
+    integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
 
     Args:
         path: to track.
@@ -60,9 +69,7 @@ class PathTracker:
         self._stops = [(float(path.travel[index]), sense) for index, sense in turning]
         self._stamp: float | None = None
         self._speed = 0.0
-        self._correction = np.zeros(2)
-        along = path.lever * np.column_stack([np.cos(path.angles), np.sin(path.angles)])
-        self._ends = {1.0: path.middles + along, -1.0: path.middles - along}
+        self._integral = 0.0
 
     @property
     def leeway(self) -> float:
@@ -86,31 +93,38 @@ class PathTracker:
         self._stamp = stamp
         e = np.array([math.cos(angle), math.sin(angle)])
         stop, sense = self._stops[0]
-        end = middle + sense * self.path.lever * e
-        error = self._at(sense, self.travel) - end
-        size = math.hypot(*error)
-        waits = size > MAX_LAG
+        wanted, direction = self.path.at(self.travel)
+        off, turn = wanted - middle, math.remainder(direction - angle, 2.0 * math.pi)
+        along, across = float(off @ e), math.cos(direction) * off[1] - math.sin(direction) * off[0]
+        size = math.hypot(*off)
+        drive, rate = self._rates(stop)
+        driven = abs(drive) / max(abs(drive) + self.path.lever * abs(rate), 1e-12)
+        course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
+        waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
         self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, speed, braked)
         self.travel = min(stop, self.travel + slowdown * self._speed * interval)
-        if stop - self.travel < 1e-6 and size < ARRIVED:
-            self._speed, self._correction = 0.0, np.zeros(2)
+        if stop - self.travel < 1e-6 and abs(along) < ARRIVED and abs(turn) < ALIGNED + abs(course):
+            self._speed = 0.0
             if len(self._stops) == 1:
                 return TrackingCommand(np.zeros(2), self.path.length, size, True)
             self._stops.pop(0)
-        if interval > 0.0 and not waits:
-            self._correction = self._correction + INTEGRAL_GAIN * interval * error
-            limit = MAX_CORRECTION * speed / max(math.hypot(*self._correction), 1e-12)
-            self._correction = self._correction * min(1.0, limit)
-        ahead = self._at(sense, min(stop, self.travel + 5e-5)) - self._at(sense, self.travel)
-        way = math.hypot(*ahead)
-        tangent = ahead / way if way > 0.0 else np.zeros(2)
-        velocity = self._speed * tangent + GAIN * error + self._correction
-        if sense < 0.0:  # of the tail; that of the tip turns the other way
-            velocity = 2.0 * float(velocity @ e) * e - velocity
-        return TrackingCommand(velocity, self.travel, size, False)
+            self._integral = -self._integral  # the same slip asks for the other direction when driven back
+        if not waits:
+            self._integral += INTEGRAL_GAIN * interval * driven * across
+            self._integral = min(MAX_INTEGRAL, max(-MAX_INTEGRAL, self._integral))
+        turn += course
+        limit = MAX_RATIO * speed
+        u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
+        v = self.path.lever * (self._speed * rate) + min(limit, max(-limit, self.path.lever * TURN_GAIN * turn))
+        return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
 
-    def _at(self, sense: float, travel: float) -> Vector:
-        """Return the leading end of the planned pose at a way of the tip, shape (2,) [m]."""
-        ends: Points = self._ends[sense]
-        return np.array([np.interp(travel, self.path.travel, column) for column in ends.T])
+    def _rates(self, stop: float) -> tuple[float, float]:
+        """Return how far the needle is driven along its chord, and turned [rad], for each metre of the tip's way."""
+        before, after = max(0.0, self.travel - 5e-5), min(stop, self.travel + 5e-5)
+        if after <= before:
+            return 0.0, 0.0
+        (start, first), (end, last) = self.path.at(before), self.path.at(after)
+        mean = 0.5 * (first + last)
+        moved = (math.cos(mean) * (end[0] - start[0]) + math.sin(mean) * (end[1] - start[1])) / (after - before)
+        return float(moved), (last - first) / (after - before)
