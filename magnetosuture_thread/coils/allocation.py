@@ -25,7 +25,7 @@ CURRENT_WEIGHT = 1e-3
 
 UNDISTURBED = Disturbance()
 
-MAX_COIL_FIELD = 1.5  # of the aligning field, by each coil at most, where that makes the needle drift
+MAX_COIL_FIELD = 2.0  # of the aligning field, by each coil at most, where that makes the needle drift
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
 

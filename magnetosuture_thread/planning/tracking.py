@@ -100,6 +100,8 @@ class PathTracker:
         drive, rate = self._rates(stop)
         driven = abs(drive) / max(abs(drive) + self.path.lever * abs(rate), 1e-12)
         course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
+        allowed = 0.5 * self.leeway / max(self.path.lever, 1e-9)  # a turn by it takes half of the leeway
+        course = min(allowed, max(-allowed, course))
         waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
         self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, speed, braked)
