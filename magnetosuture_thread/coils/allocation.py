@@ -92,6 +92,15 @@ class Allocation:
             return self
         return Allocation(share * self.currents, share * self.velocity, self.saturated, share * self.drift)
 
+    def towards(self, other: Allocation, share: float) -> Allocation:
+        """Return the allocation that has gone a share of the way to another."""
+        return Allocation(
+            self.currents + share * (other.currents - self.currents),
+            self.velocity + share * (other.velocity - self.velocity),
+            other.saturated,
+            self.drift + share * (other.drift - self.drift),
+        )
+
 
 class CoilAllocation:
     """Allocates coil currents for a velocity of the needle's tip.

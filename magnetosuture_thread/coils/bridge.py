@@ -286,13 +286,14 @@ class CoilBridge:
         active += tuple(
             name for name in (limiting, CURRENT_LIMIT if allocation.saturated else "") if name and name not in active
         )
-        is_stuck = math.hypot(*allocation.velocity) <= STUCK * math.hypot(*filtered.filtered)
+        e = self._coils.chord_direction(pose.heading)
+        moving = math.hypot(*(allocation.velocity + disturbance.velocity(e)))
+        is_stuck = moving <= STUCK * math.hypot(*filtered.filtered)
         if is_stuck or np.abs(allocation.currents).max() < NO_CURRENT:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
-        e = self._coils.chord_direction(pose.heading)
         self.extrapolator.apply_velocity(allocation.velocity + disturbance.velocity(e), now, arrival)
         if self._observer is not None:
             self._observer.apply(now, pose.heading, float(e @ allocation.velocity), allocation.drift, elapsed)
@@ -391,26 +392,37 @@ class CoilBridge:
     ) -> tuple[Allocation, str]:
         """Return currents whose motion, drift included, is certified for the hold time, and the limiting one.
 
-        With what the thread's predicted pull or the measured disturbance adds, both motions are certified: that of
-        the currents with it and without.
+        The motion is that of the currents and the measured disturbance. With what the thread's predicted pull adds, both
+        motions are certified: with the pull and without.
         """
-        pull = pull + disturbance.velocity(self._coils.chord_direction(pose.heading))
-        velocity = self._within_limit(velocity - pull)
+        beside = disturbance.velocity(self._coils.chord_direction(pose.heading))
+        velocity = self._within_limit(velocity - pull) - beside
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
+
+        def certified(allocation: Allocation, added: Vector) -> tuple[float, str]:
+            drift = allocation.drift + disturbance.drift
+            return safety.safe_share(allocation.velocity + added, pose.tail, pose.heading, drift)
+
+        def allocated(wanted: Vector) -> Allocation:
+            previous = self._previous.currents
+            return self._coils.allocate(wanted, pose.tail, pose.heading, previous, max_change, disturbance)
+
         for _ in range(1 + MAX_CORRECTIONS):
-            found = self._coils.allocate(target, pose.tail, pose.heading, self._previous.currents, max_change, disturbance)
-            share, name = safety.safe_share(found.velocity, pose.tail, pose.heading, found.drift)
+            found = allocated(target)
+            share, name = certified(found, beside)
             if pull.any():
-                moved = safety.safe_share(found.velocity + pull, pose.tail, pose.heading, found.drift + disturbance.drift)
-                share, name = min((share, name), moved)
+                share, name = min((share, name), certified(found, beside + pull))
             kept = found.scaled(share)
+            if share < 1.0 and beside.any():  # less of the motion, but all of what holds the needle against the rest
+                kept = allocated(-beside).towards(found, share)
+                kept = kept.scaled(min(certified(kept, beside)[0], certified(kept, beside + pull)[0]))
             error = float(np.linalg.norm(kept.velocity - velocity))
             if error < min_error:
                 best, min_error, limiting = kept, error, name
             if share >= MIN_SHARE:
                 break
-            clear, _ = safety.nearest_clear(found.velocity, pose.tail, pose.heading)
-            target = target - (found.velocity - clear)
+            clear, _ = safety.nearest_clear(found.velocity + beside, pose.tail, pose.heading)
+            target = target - (found.velocity + beside - clear)
         return best, limiting
 
     def _within_limit(self, velocity: Vector) -> Vector:
