@@ -25,7 +25,8 @@ CURRENT_WEIGHT = 1e-3
 
 UNDISTURBED = Disturbance()
 
-MAX_COIL_FIELD = 2.0  # of the aligning field, by each coil at most, where that makes the needle drift
+COIL_ERROR = 0.05  # of a calibrated coil's field
+CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
 
@@ -179,13 +180,17 @@ class CoilAllocation:
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
         sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n)))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
+        # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across the
+        # needle takes large currents whose fields cancel each other, and their errors do not.
+        turned = lever / CORRECTION_TIME * (field_n @ mean) / self._field
+        uncertain = COIL_ERROR * np.hypot(drifting, turned)
         system = np.vstack(
             [
                 DRIVE_WEIGHT / reference_speed * along,
                 TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drifting),
                 ALIGN_WEIGHT / self._field * (field_e @ mean),
                 DRIFT_WEIGHT / reference_speed * drifting,
-                CURRENT_WEIGHT / self._max_current * np.eye(len(self.names)),
+                np.diag(np.hypot(CURRENT_WEIGHT / self._max_current, DRIFT_WEIGHT / reference_speed * uncertain)),
             ]
         )
         target = np.zeros(len(system))
@@ -200,15 +205,6 @@ class CoilAllocation:
             upper = np.clip(previous + max_change, -limit, limit)
         # Most solutions are inside the limits, where the unconstrained one is optimal.
         currents = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
-        fields = np.hypot(*mean) / (MAX_COIL_FIELD * self._field)
-        if np.any(np.abs(fields * currents) > 1.0):
-            # Close to the coils' axes a force across the needle takes large currents whose fields cancel each other, so
-            # that small errors of theirs turn the needle: as much of it as the coils' fields allow, the rest is drift.
-            system[3] = target[3] = 0.0
-            free = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
-            more, left = fields * (currents - free), np.maximum(0.0, 1.0 - np.abs(fields * free))
-            share = min(1.0, float((left / np.maximum(np.abs(more), 1e-12)).min()))
-            currents = free + share * (currents - free)
         if np.any((currents < lower) | (currents > upper)):
             # The solver rejects equal bounds; the small gap has no effect.
             found = lsq_linear(system, target, bounds=(lower, np.maximum(upper, lower + 1e-9)), method="bvls")

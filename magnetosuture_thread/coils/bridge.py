@@ -415,7 +415,8 @@ class CoilBridge:
             kept = found.scaled(share)
             if share < 1.0 and beside.any():  # less of the motion, but all of what holds the needle against the rest
                 kept = allocated(-beside).towards(found, share)
-                kept = kept.scaled(min(certified(kept, beside)[0], certified(kept, beside + pull)[0]))
+                own = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
+                kept = kept.scaled(own[0])
             error = float(np.linalg.norm(kept.velocity - velocity))
             if error < min_error:
                 best, min_error, limiting = kept, error, name
