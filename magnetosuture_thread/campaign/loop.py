@@ -190,9 +190,7 @@ class ClosedLoop:
         self._count += 1
         stamp, now = measured.stamp, self.now
         try:
-            self.bridge.on_pose(
-                measured.tail, measured.heading, stamp, self._count, now, now, measured.covariance
-            )
+            self.bridge.on_pose(measured.tail, measured.heading, stamp, self._count, now, now, measured.covariance)
         except InvalidInputError:
             return  # as the node does, which reports it
         nanoseconds = round(1e9 * stamp)

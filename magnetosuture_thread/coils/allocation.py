@@ -23,8 +23,6 @@ ALIGN_WEIGHT = 0.1
 DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
-UNDISTURBED = Disturbance()
-
 COIL_ERROR = 0.05  # of a calibrated coil's field
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
@@ -149,7 +147,7 @@ class CoilAllocation:
         heading: Vector,
         previous: Vector | None = None,
         max_change: float = math.inf,
-        disturbance: Disturbance = UNDISTURBED,
+        disturbance: Disturbance | None = None,
     ) -> Allocation:
         """Return the currents for a tip velocity.
 
@@ -159,8 +157,8 @@ class CoilAllocation:
             heading: unit vector along the needle at its tail, shape (2,).
             previous: currents of the last step, shape (m,) [A]; no limit on change if None.
             max_change: maximum change of each current [A]; not applied to a zero velocity.
-            disturbance: of which the currents shall give the opposite of the drift, and turn the field by the opposite of
-                the angle; `velocity` is to hold the rest.
+            disturbance: measured; the currents give the opposite of its drift and turn the field by the opposite of its
+                angle, while `velocity` holds the rest. None where nothing is measured.
         """
         if not np.any(velocity):
             return self.zero()
@@ -168,8 +166,10 @@ class CoilAllocation:
         e = needle.chord_direction(heading)
         n = np.array([-e[1], e[0]])
         lever = 0.5 * needle.chord
-        c, s = math.cos(disturbance.angle), math.sin(disturbance.angle)
-        field_e, field_n = c * e - s * n, c * n + s * e  # to which the field is to be set
+        field_e, field_n = e, n  # to which the field is to be set
+        if disturbance is not None:
+            c, s = math.cos(disturbance.angle), math.sin(disturbance.angle)
+            field_e, field_n = c * e - s * n, c * n + s * e
         at_tail, at_tip = self._coils.per_current(tail), self._coils.per_current(tail + needle.chord * e)
         mean = 0.5 * (at_tail + at_tip)
         pull = needle.pole * (at_tip - at_tail)
@@ -180,24 +180,27 @@ class CoilAllocation:
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
         sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n)))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
-        # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across the
-        # needle takes large currents whose fields cancel each other, and their errors do not.
-        turned = lever / CORRECTION_TIME * (field_n @ mean) / self._field
-        uncertain = COIL_ERROR * np.hypot(drifting, turned)
+        effort = np.full(len(self.names), CURRENT_WEIGHT / self._max_current)
+        if disturbance is not None:
+            # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
+            # the needle takes large currents whose fields cancel each other, and their errors do not.
+            turned = lever / CORRECTION_TIME * (field_n @ mean) / self._field
+            effort = np.hypot(effort, DRIFT_WEIGHT / reference_speed * COIL_ERROR * np.hypot(drifting, turned))
         system = np.vstack(
             [
                 DRIVE_WEIGHT / reference_speed * along,
                 TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drifting),
                 ALIGN_WEIGHT / self._field * (field_e @ mean),
                 DRIFT_WEIGHT / reference_speed * drifting,
-                np.diag(np.hypot(CURRENT_WEIGHT / self._max_current, DRIFT_WEIGHT / reference_speed * uncertain)),
+                np.diag(effort),
             ]
         )
         target = np.zeros(len(system))
         target[0] = DRIVE_WEIGHT / reference_speed * float(velocity @ e)
         target[1] = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * sideways
         target[2] = ALIGN_WEIGHT
-        target[3] = DRIFT_WEIGHT / reference_speed * -disturbance.drift
+        if disturbance is not None:
+            target[3] = DRIFT_WEIGHT / reference_speed * -disturbance.drift
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import Allocation
+from magnetosuture_thread.coils.certified_allocation import CertifiedAllocation
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.coils.motion_observer import Disturbance, MotionObserver
-from magnetosuture_thread.coils.pose_extrapolator import Pose, PoseExtrapolator
+from magnetosuture_thread.coils.motion_observer import MotionObserver
+from magnetosuture_thread.coils.pose_extrapolator import PoseExtrapolator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor
 from magnetosuture_thread.errors import InvalidInputError
@@ -28,8 +29,6 @@ INPUTS = {OPERATOR: "operator/servo_cv", NEEDLE: "needle/servo_cv"}  # topics, b
 
 LOOKAHEAD_PERIODS = 2.0  # in which command and pose must stay valid: one to the next step, one to the boards
 MAX_STEP_PERIODS = 2.0  # over which velocity and currents may change in one step, however late it is
-MAX_CORRECTIONS = 4  # of the drift that the coils add to a velocity towards the wall
-MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
 RETRY_DELAY = 0.1  # s until a blocked command is tried again
 NO_CURRENT = 1e-4  # A; with less in each coil the needle is at rest, which needs a reason
 NO_SCENE, NO_POSE = "no scene", "no needle pose"
@@ -133,7 +132,7 @@ class CoilBridge:
         self.feedforward = settings.feedforward()
         self._observer = MotionObserver(settings.needle().kinematics) if settings.motion_compensation else None
         self._settings = settings
-        self._coils = settings.allocation()
+        self._coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
         self._filter: NeedleSafetyFilter | None = None
         self._losses = 0
         self._previous = self._coils.zero()
@@ -277,24 +276,24 @@ class CoilBridge:
         if filtered.reason:
             return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
         max_change, pull = self._settings.max_current_slew * elapsed, np.zeros(2)
-        disturbance = Disturbance()
-        if self._observer is not None:
-            disturbance = self._observer.disturbance(pose.heading)
+        disturbance = None if self._observer is None else self._observer.disturbance(pose.heading)
         if self.feedforward is not None and not no_prediction:
             pull = self.feedforward.velocity(filtered.filtered, pose.heading, now, arrival)
-        allocation, limiting = self._allocate(filtered.filtered, pull, disturbance, pose, max_change, self._filter)
+        allocation, limiting = self._coils.allocate(
+            filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, pull
+        )
         active += tuple(
             name for name in (limiting, CURRENT_LIMIT if allocation.saturated else "") if name and name not in active
         )
         e = self._coils.chord_direction(pose.heading)
-        moving = math.hypot(*(allocation.velocity + disturbance.velocity(e)))
-        is_stuck = moving <= STUCK * math.hypot(*filtered.filtered)
+        expected = allocation.velocity if disturbance is None else allocation.velocity + disturbance.velocity(e)
+        is_stuck = math.hypot(*expected) <= STUCK * math.hypot(*filtered.filtered)
         if is_stuck or np.abs(allocation.currents).max() < NO_CURRENT:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
-        self.extrapolator.apply_velocity(allocation.velocity + disturbance.velocity(e), now, arrival)
+        self.extrapolator.apply_velocity(expected, now, arrival)
         if self._observer is not None:
             self._observer.apply(now, pose.heading, float(e @ allocation.velocity), allocation.drift, elapsed)
         return self._output(selected, (), True, active, filtered.slowdown)
@@ -380,53 +379,3 @@ class CoilBridge:
         self._previous, self._velocity = self._coils.zero(), np.zeros(2)
         if self._observer is not None:
             self._observer.stop()
-
-    def _allocate(
-        self,
-        velocity: Vector,
-        pull: Vector,
-        disturbance: Disturbance,
-        pose: Pose,
-        max_change: float,
-        safety: NeedleSafetyFilter,
-    ) -> tuple[Allocation, str]:
-        """Return currents whose motion, drift included, is certified for the hold time, and the limiting one.
-
-        The motion is that of the currents and the measured disturbance. With what the thread's predicted pull adds, both
-        motions are certified: with the pull and without.
-        """
-        beside = disturbance.velocity(self._coils.chord_direction(pose.heading))
-        velocity = self._within_limit(velocity - pull) - beside
-        target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
-
-        def certified(allocation: Allocation, added: Vector) -> tuple[float, str]:
-            drift = allocation.drift + disturbance.drift
-            return safety.safe_share(allocation.velocity + added, pose.tail, pose.heading, drift)
-
-        def allocated(wanted: Vector) -> Allocation:
-            previous = self._previous.currents
-            return self._coils.allocate(wanted, pose.tail, pose.heading, previous, max_change, disturbance)
-
-        for _ in range(1 + MAX_CORRECTIONS):
-            found = allocated(target)
-            share, name = certified(found, beside)
-            if pull.any():
-                share, name = min((share, name), certified(found, beside + pull))
-            kept = found.scaled(share)
-            if share < 1.0 and beside.any():  # less of the motion, but all of what holds the needle against the rest
-                kept = allocated(-beside).towards(found, share)
-                own = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
-                kept = kept.scaled(own[0])
-            error = float(np.linalg.norm(kept.velocity - velocity))
-            if error < min_error:
-                best, min_error, limiting = kept, error, name
-            if share >= MIN_SHARE:
-                break
-            clear, _ = safety.nearest_clear(found.velocity + beside, pose.tail, pose.heading)
-            target = target - (found.velocity + beside - clear)
-        return best, limiting
-
-    def _within_limit(self, velocity: Vector) -> Vector:
-        """Return a velocity reduced to the maximum speed of the tip."""
-        speed = math.hypot(*velocity)
-        return velocity if speed <= self._settings.max_speed else velocity * (self._settings.max_speed / speed)

@@ -148,7 +148,7 @@ class CoilBridgeSettings(Configuration):
         maximum=10.0,
     )
     motion_compensation: bool = quantity(
-        True, "whether the coils compensate what the needle's poses show of its motion beside the commanded one"
+        False, "whether the coils compensate what the needle's poses show of its motion beside the commanded one"
     )
     needle_turning_drag: float = quantity(
         1.6e-7, "drag torque of the needle at 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2

@@ -239,9 +239,7 @@ class NeedleSafetyFilter:
             return velocity, []
         return clear, [self._names[k] for k in np.flatnonzero(self._touched)]
 
-    def safe_share(
-        self, velocity: Vector, tail: Vector, heading: Vector, drift: float = 0.0
-    ) -> tuple[float, str]:
+    def safe_share(self, velocity: Vector, tail: Vector, heading: Vector, drift: float = 0.0) -> tuple[float, str]:
         """Return the share of a velocity that keeps clear while it is held for the whole hold time: the guarantee.
 
         With the share of it the needle goes the same way more slowly, and is at the end of the hold where with all
@@ -251,8 +249,8 @@ class NeedleSafetyFilter:
             velocity: of the tip, shape (2,) [m/s].
             tail: the needle's tail, shape (2,) [m].
             heading: unit vector along the needle at its tail, shape (2,).
-            drift: part of that velocity across the chord, to its left, that the whole needle has: the rest turns it about
-                its middle [m/s].
+            drift: part of it across the chord, to its left, that the whole needle has [m/s]; the rest of that part turns
+                the needle about its middle.
 
         Returns:
             The share, 0 to 1, and the name of what it is for; empty for a share of 1.

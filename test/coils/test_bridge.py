@@ -278,7 +278,7 @@ def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(mon
     plant = Plant().ready()
     plant.run(0.2)
     zero = plant.bridge._coils.zero()
-    monkeypatch.setattr(plant.bridge, "_allocate", lambda *_: (zero, "wall"))
+    monkeypatch.setattr(plant.bridge._coils, "allocate", lambda *_: (zero, "wall"))
     assert plant.run(PERIOD)[0].reasons == ("stopped by wall: no feasible currents",)
     monkeypatch.undo()
     assert all(still(output) for output in plant.run(0.08))
@@ -362,7 +362,7 @@ def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: p
     def broken(*_: object) -> None:
         raise FloatingPointError("no such number")
 
-    monkeypatch.setattr(plant.bridge, "_allocate", broken)
+    monkeypatch.setattr(plant.bridge._coils, "allocate", broken)
     outputs = plant.run(0.2)
     assert all(still(output) for output in outputs)
     assert plant.bridge.latch.fault == "internal error: FloatingPointError: no such number"

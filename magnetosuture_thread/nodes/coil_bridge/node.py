@@ -121,9 +121,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         try:
             pose = reading.needle_pose(message)
             covariance = reading.pose_covariance(message)
-            self.system.bridge.on_pose(
-                pose.tail, pose.heading, pose.stamp, number, *self._times(), covariance
-            )
+            self.system.bridge.on_pose(pose.tail, pose.heading, pose.stamp, number, *self._times(), covariance)
         except INPUT_ERRORS as error:
             self.refuse(error)
 

@@ -1,0 +1,130 @@
+"""What the needle does beside its currents, measured from its poses and compensated by the coils."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magnetosuture_thread.coils.bridge import CoilBridge
+from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.coils.motion_observer import MAX_SPEED, MotionObserver
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.scene import Scene
+
+SETTINGS = CoilBridgeSettings(motion_compensation=True)
+NEEDLE = SETTINGS.needle()
+PERIOD, FRAME = 1.0 / SETTINGS.rate, 0.05
+GAINS = np.array([1.05, 0.95, 0.96, 1.04])
+
+
+def direction(angle: float) -> NDArray[np.float64]:
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+def observed(turn_rate: float, along: float, drift: float, applied: tuple[float, float]) -> MotionObserver:
+    """Return an observer of two seconds of poses, on time, of a needle that turns as well."""
+    observer, middle, lever = MotionObserver(NEEDLE.kinematics), np.zeros(2), 0.5 * NEEDLE.chord
+    for k in range(400):
+        angle = 0.3 + turn_rate * k * PERIOD
+        e = direction(angle)
+        observer.apply(1.0 + k * PERIOD, e, *applied, PERIOD)
+        if k % 10 == 0:
+            observer.update(middle - lever * e, e, 1.0 + k * PERIOD)
+        middle = middle + PERIOD * (along * e + drift * np.array([-e[1], e[0]]))
+    return observer
+
+
+def test_the_disturbance_is_the_motion_beside_that_of_the_currents():
+    found = observed(0.0, 3e-3, 1e-3, (4e-3, -5e-4)).disturbance(direction(0.3))
+    assert found.along == pytest.approx(-1e-3, rel=0.01)
+    assert found.drift == pytest.approx(1.5e-3, rel=0.01)
+    assert found.angle == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_turn_about_the_middle_is_none():
+    found = observed(1.0, 0.0, 0.0, (0.0, 0.0)).disturbance(direction(0.3))
+    assert np.abs(found).max() < 1e-9
+
+
+def test_it_is_bounded():
+    found = observed(0.0, 0.0, 0.05, (0.0, 0.0)).disturbance(direction(0.3))
+    assert math.hypot(found.along, found.drift) == pytest.approx(MAX_SPEED)
+
+
+def test_after_a_gap_between_poses_nothing_is_known():
+    observer = observed(0.0, 0.0, 1e-3, (0.0, 0.0))
+    observer.update(np.zeros(2), direction(0.3), 4.0)
+    assert observer.disturbance(direction(0.3))[:2] == (0.0, 0.0)
+
+
+def test_the_angle_is_that_between_the_measured_heading_and_the_one_the_field_was_set_for():
+    observer, e = MotionObserver(NEEDLE.kinematics), direction(0.3)
+    for k in range(40):
+        observer.apply(1.0 + 0.05 * k, e, 0.0, 0.0, FRAME)
+        found = observer.disturbance(e)
+        turned = direction(0.3 + 0.1 - found.angle)  # the field is turned back by what was found
+        observer.update(np.zeros(2), turned, 1.0 + 0.05 * k)
+    assert observer.disturbance(e).angle == pytest.approx(0.1, abs=1e-3)
+
+
+def test_without_currents_no_angle_is_learned():
+    observer = MotionObserver(NEEDLE.kinematics)
+    observer.apply(1.0, direction(0.3), 0.0, 0.0, PERIOD)
+    observer.stop()
+    observer.update(np.zeros(2), direction(0.8), 1.01)
+    assert observer.disturbance(direction(0.8)).angle == 0.0
+
+
+class MagneticNeedle:
+    """A needle that lies along the field of coils that are not as calibrated, and is pulled aside all the time."""
+
+    def __init__(self, settings: CoilBridgeSettings, pull: NDArray[np.float64], angle: float) -> None:
+        self.bridge = CoilBridge(settings, ArmingLatch(), Scene())
+        self.bridge.latch.activate()
+        self.bridge.arm(DriverState(True))
+        self._field = settings.allocation()._coils
+        self.pull, self.angle, self.middle = pull, angle, np.zeros(2)
+
+    def run(self, speed: float, heading: float, duration: float) -> None:
+        """Command a velocity for some time, by poses that are a frame old."""
+        lever, waiting = 0.5 * NEEDLE.chord, [(1.0, self.middle, self.angle)]
+        for k in range(round(duration / PERIOD)):
+            now = 1.0 + k * PERIOD
+            e = direction(self.angle)
+            if k % 10 == 0:
+                waiting.append((now, self.middle, self.angle))
+                stamp, middle, angle = waiting[-2]
+                self.bridge.on_pose(middle - lever * direction(angle), direction(angle), stamp, k + 1, now, now)
+                tip = speed * direction(angle) + 2.0 * lever * (heading - angle) * np.array([-e[1], e[0]])
+                self.bridge.command("needle", tip, now, k + 1, now, now)
+            self.bridge.on_margins(now, True, 1.0, self.bridge.scene_version, now)
+            currents = GAINS * self.bridge.step(now, now, DriverState(True)).allocation.currents
+            tail, tip_field = (self._field.per_current(self.middle + s * lever * e) @ currents for s in (-1.0, 1.0))
+            force = NEEDLE.pole * (tip_field - tail)
+            n = np.array([-e[1], e[0]])
+            velocity = (force @ e) / NEEDLE.drag * e + (force @ n) / NEEDLE.drag_across * n + self.pull
+            self.middle = self.middle + PERIOD * velocity
+            field = 0.5 * (tail + tip_field)
+            if field.any():
+                self.angle = math.atan2(field[1], field[0])
+
+
+@pytest.mark.parametrize("angle", [0.5, 1.2, -2.3])
+def test_a_needle_that_is_pulled_aside_by_weak_and_strong_coils_goes_where_it_is_commanded(angle: float):
+    e = direction(angle)
+    n = np.array([-e[1], e[0]])
+    off, turned = {}, {}
+    for compensated in (True, False):
+        settings = replace(SETTINGS, motion_compensation=compensated)
+        needle = MagneticNeedle(settings, 1e-3 * n - 5e-4 * e, angle)
+        needle.run(2e-3, angle, 2.0)
+        off[compensated], turned[compensated] = abs(needle.middle @ n), abs(needle.angle - angle)
+        if compensated:
+            assert needle.middle @ e == pytest.approx(4e-3, rel=0.05)
+    assert off[True] < 0.4 * off[False]
+    assert turned[True] < 0.5 * turned[False]
