@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from magnetosuture_thread.coils.field import CoilModel
-from magnetosuture_thread.coils.motion_observer import Disturbance
+from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
@@ -147,7 +147,7 @@ class CoilAllocation:
         heading: Vector,
         previous: Vector | None = None,
         max_change: float = math.inf,
-        disturbance: Disturbance | None = None,
+        disturbance: MotionDisturbance | None = None,
     ) -> Allocation:
         """Return the currents for a tip velocity.
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import Allocation, CoilAllocation
-from magnetosuture_thread.coils.motion_observer import Disturbance
+from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.pose_extrapolator import Pose
 from magnetosuture_thread.safety import NeedleSafetyFilter
 
@@ -54,7 +54,7 @@ class CertifiedAllocation:
         safety: NeedleSafetyFilter,
         previous: Allocation,
         max_change: float,
-        disturbance: Disturbance | None,
+        disturbance: MotionDisturbance | None,
         pull: Vector,
     ) -> tuple[Allocation, str]:
         """Return the currents, and what limits them; empty if nothing does.

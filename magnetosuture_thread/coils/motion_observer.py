@@ -20,7 +20,7 @@ MAX_SPEED = 0.003  # m/s; compensated at most
 MAX_ANGLE = 0.3  # rad; compensated at most
 
 
-class Disturbance(NamedTuple):
+class MotionDisturbance(NamedTuple):
     """Motion of the needle that its currents do not explain.
 
     Attributes:
@@ -109,7 +109,7 @@ class MotionObserver:
         """Register that the currents are zero: nothing holds the needle's direction."""
         self._set.clear()
 
-    def disturbance(self, heading: Vector) -> Disturbance:
+    def disturbance(self, heading: Vector) -> MotionDisturbance:
         """Return what to compensate.
 
         Args:
@@ -117,4 +117,4 @@ class MotionObserver:
         """
         e = self._needle.chord_direction(heading)
         x, y = self._velocity * min(1.0, MAX_SPEED / max(math.hypot(*self._velocity), 1e-12))
-        return Disturbance(float(e[0] * x + e[1] * y), float(e[0] * y - e[1] * x), self._angle)
+        return MotionDisturbance(float(e[0] * x + e[1] * y), float(e[0] * y - e[1] * x), self._angle)

@@ -249,7 +249,7 @@ class NeedleSafetyFilter:
             velocity: of the tip, shape (2,) [m/s].
             tail: the needle's tail, shape (2,) [m].
             heading: unit vector along the needle at its tail, shape (2,).
-            drift: part of it across the chord, to its left, that the whole needle has [m/s]; the rest of that part turns
+            drift: part of it across the chord, to its left, that the whole needle has [m/s]; the rest of it turns
                 the needle about its middle.
 
         Returns:
