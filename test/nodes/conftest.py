@@ -85,7 +85,7 @@ class Graph:
         self.wait(lambda: all(s.get_publisher_count() > 0 for s in others), f"{topic.name} to be found")
         publisher.publish(message)
 
-    def wait(self, condition: Callable[[], bool], what: str, timeout: float = 10.0) -> None:
+    def wait(self, condition: Callable[[], bool], what: str, timeout: float = 30.0) -> None:
         """Wait until a condition holds."""
         deadline = time.monotonic() + timeout
         while not condition():
