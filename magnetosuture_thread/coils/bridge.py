@@ -273,7 +273,7 @@ class CoilBridge:
             time=now,
         )
         active += filtered.active
-        if filtered.reason:
+        if filtered.reason and self._observer is None:
             return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
         max_change, pull = self._settings.max_current_slew * elapsed, np.zeros(2)
         disturbance = None if self._observer is None else self._observer.disturbance(pose.heading)
@@ -288,7 +288,8 @@ class CoilBridge:
         e = self._coils.chord_direction(pose.heading)
         expected = allocation.velocity if disturbance is None else allocation.velocity + disturbance.velocity(e)
         is_stuck = math.hypot(*expected) <= STUCK * math.hypot(*filtered.filtered)
-        if is_stuck or np.abs(allocation.currents).max() < NO_CURRENT:
+        # A needle that is pulled is held by currents where it may not go on.
+        if (is_stuck and self._observer is None) or np.abs(allocation.currents).max() < NO_CURRENT:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)

@@ -16,7 +16,7 @@ Vector = NDArray[np.float64]
 GAIN = 4.0  # 1/s; of the velocities, well below the rate and the delay of a camera's poses
 ANGLE_GAIN = 0.3  # of the angle, for each pose
 MAX_INTERVAL = 0.2  # s; two poses farther apart say nothing of the motion between them
-MAX_SPEED = 0.003  # m/s; compensated at most
+MAX_SPEED = 0.006  # m/s; compensated at most
 MAX_ANGLE = 0.3  # rad; compensated at most
 
 
