@@ -1,0 +1,80 @@
+"""What the node `needle_planner` hears of the loop while it executes a procedure."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from magnetosuture_msgs.msg import EstimatedThread, PredictedThread, SafetyMargins, TrackerState
+from std_msgs.msg import Header
+
+from magnetosuture_thread import InvalidInputError
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.model.estimator.disturbance import disturbance_text
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.node import PackageNode
+from magnetosuture_thread.planning.loop_state import LoopState
+
+MAX_DISTURBANCES = 3  # that are named
+
+
+class ProcedureInputs:
+    """Registers tracker, thread and held page in the state of the loop.
+
+    Args:
+        node: that subscribes.
+        known: where it is registered.
+        hold_timeout: age beyond which a message on `procedure/hold` does not count [s].
+    """
+
+    def __init__(self, node: PackageNode, known: LoopState, hold_timeout: float) -> None:
+        self._node, self._known, self._hold_timeout = node, known, hold_timeout
+        topics.TRACKER_STATE.subscribe(node, self.on_tracker)
+        topics.PREDICTED_THREAD.subscribe(node, self.on_prediction)
+        topics.ESTIMATED_THREAD.subscribe(node, self.on_estimate)
+        topics.MARGINS.subscribe(node, self.on_margins)
+        topics.PROCEDURE_HOLD.subscribe(node, self.on_hold)
+
+    def on_tracker(self, message: TrackerState) -> None:
+        """Register whether the needle is tracked."""
+        tracked = message.state == TrackerState.STATE_TRACKED
+        self._known.on_tracker("" if tracked else message.reason or "no reason is given")
+
+    def on_prediction(self, message: PredictedThread) -> None:
+        """Register the tension of the thread."""
+        tension = float(np.max(message.tension, initial=0.0))
+        if not math.isfinite(tension):
+            self._node.refuse(InvalidInputError("thread/predicted.tension", tension, "finite numbers"))
+            return
+        self._known.on_prediction(tension, lambda: _vertices(message))
+
+    def on_estimate(self, message: EstimatedThread) -> None:
+        """Register how sure the estimate is, and which forces the model does not know of."""
+        found = [
+            disturbance_text(each.arc_length, each.force, (each.direction.x, each.direction.y))
+            for each in message.disturbances[:MAX_DISTURBANCES]
+        ]
+        self._known.on_estimate(message.unmeasured_for, found, lambda: _vertices(message))
+
+    def on_margins(self, message: SafetyMargins) -> None:
+        """Register the thread's friction, and whether its margins are valid."""
+        reason = "" if message.valid else message.reason or "no reason is given"
+        if not reason and not 0.0 < message.slowdown <= 1.0:
+            self._node.refuse(InvalidInputError("thread/margins.slowdown", message.slowdown, "above 0 and at most 1"))
+            return
+        nodes = len(message.friction_nodes)
+        self._known.on_margins(time.monotonic(), reason, nodes, message.slowdown, message.scene_version)
+
+    def on_hold(self, message: Header) -> None:
+        """Register that somebody holds the page; a message that was on its way for too long does not count."""
+        now = self._node.get_clock().now().nanoseconds * 1e-9
+        if abs(now - reading.seconds(message.stamp)) <= self._hold_timeout:
+            self._known.on_hold(time.monotonic())
+
+
+def _vertices(message: Any) -> Points:
+    """Return the nodes of a predicted or estimated thread, shape (n + 1, 2) [m]."""
+    return np.array([(point.x, point.y) for point in message.positions])
