@@ -51,6 +51,7 @@ class NeedlePlannerNode(PackageNode):
         self._moving = False  # whether the last command was not zero
         self._scene = SceneFollower(self, self.health, scene, self.on_scene)
         self._commands = topics.NEEDLE_COMMAND.publisher(self)
+        self._setpoints = topics.TIP_SETPOINT.publisher(self)
         self._outputs = ProcedureOutputs(self, self._session)
         self._action = ProcedureAction(self, self.begin, self.abort)
         self._inputs = ProcedureInputs(self, self._session.known, settings.hold_timeout)
@@ -110,6 +111,8 @@ class NeedlePlannerNode(PackageNode):
         if velocity is not None:
             self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), velocity))
             self._moving = bool(velocity.any())
+        if (setpoint := self._session.setpoint) is not None:
+            self._setpoints.publish(MESSAGES.placed(message.header.stamp, *setpoint))
         self._publish()
 
     def on_bridge(self, message: CoilBridgeState) -> None:
@@ -154,8 +157,7 @@ class NeedlePlannerNode(PackageNode):
     def _check_bridge(self) -> None:
         problem = self._graph_problem()
         if problem:
-            expected = "the coil bridge as subscriber, and no other node that commands"
-            raise InvalidInputError("needle/servo_cv", problem, expected)
+            raise InvalidInputError("needle/servo_cv", problem, "the coil bridge, and no other node that commands")
         self._session.check_armed()
 
     def _graph_problem(self) -> str:

@@ -215,6 +215,15 @@ class ProcedureSession:
         self._update_status()
         return output.velocity if self.is_running else None
 
+    @property
+    def setpoint(self) -> tuple[Vector, float] | None:
+        """Where the path wants the needle's tip, shape (2,) [m], and the chord's angle [rad]; None without one."""
+        executor = self._executor
+        if executor is None or executor.path is None or not self.is_running:
+            return None
+        middle, angle = executor.path.at(executor.travel)
+        return middle + executor.path.lever * np.array([math.cos(angle), math.sin(angle)]), angle
+
     def check(self, now: float) -> None:
         """Pause a procedure that cannot go on, also where no pose comes any more."""
         if self._executor is None or self._pose is None or not self.is_running:

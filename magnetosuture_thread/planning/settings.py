@@ -66,7 +66,7 @@ class NeedlePlannerSettings(Configuration):
         """Reject a coiled needle."""
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
-    def planner(self, scene: Scene) -> NeedlePlanner:
-        """Return a planner for a scene."""
+    def planner(self, scene: Scene, keep_out: float | None = None) -> NeedlePlanner:
+        """Return a planner for a scene, with another clearance than `keep_out` if one is given [m]."""
         kinematics = NeedleKinematics(self.needle_length, self.needle_curvature)
-        return NeedlePlanner(scene, kinematics, self.keep_out, self.thread_length)
+        return NeedlePlanner(scene, kinematics, self.keep_out if keep_out is None else keep_out, self.thread_length)
