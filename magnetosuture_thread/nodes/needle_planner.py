@@ -54,7 +54,7 @@ class NeedlePlannerNode(PackageNode):
         self._setpoints = topics.TIP_SETPOINT.publisher(self)
         self._outputs = ProcedureOutputs(self, self._session)
         self._action = ProcedureAction(self, self.begin, self.abort)
-        self._inputs = ProcedureInputs(self, self._session.known, settings.hold_timeout)
+        self._inputs = ProcedureInputs(self, self._session, settings.hold_timeout)
         topics.NEEDLE_POSE.subscribe(self, self.on_pose)
         topics.BRIDGE_STATE.subscribe(self, self.on_bridge)
         topics.OPERATOR_COMMAND.subscribe(self, self.on_operator)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,10 @@ from magnetosuture_thread.messages import reading
 from magnetosuture_thread.model.estimator.disturbance import disturbance_text
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.planning.loop_state import LoopState
+from magnetosuture_thread.planning.session import ProcedureSession
 
 MAX_DISTURBANCES = 3  # that are named
+IDLE_PERIOD = 0.2  # s between two messages of a thread that are read while nothing is executed
 
 
 class ProcedureInputs:
@@ -26,16 +28,20 @@ class ProcedureInputs:
 
     Args:
         node: that subscribes.
-        known: where it is registered.
+        session: in which it is registered.
         hold_timeout: age beyond which a message on `procedure/hold` does not count [s].
     """
 
-    def __init__(self, node: PackageNode, known: LoopState, hold_timeout: float) -> None:
-        self._node, self._known, self._hold_timeout = node, known, hold_timeout
+    def __init__(self, node: PackageNode, session: ProcedureSession, hold_timeout: float) -> None:
+        self._node, self._session, self._hold_timeout = node, session, hold_timeout
+        self._known = session.known
         topics.TRACKER_STATE.subscribe(node, self.on_tracker)
-        topics.PREDICTED_THREAD.subscribe(node, self.on_prediction)
-        topics.ESTIMATED_THREAD.subscribe(node, self.on_estimate)
-        topics.MARGINS.subscribe(node, self.on_margins)
+        for topic, handle in (
+            (topics.PREDICTED_THREAD, self.on_prediction),
+            (topics.ESTIMATED_THREAD, self.on_estimate),
+            (topics.MARGINS, self.on_margins),
+        ):
+            topic.subscribe(node, _Sparing(node, topic, handle, lambda: session.is_active).take, raw=True)
         topics.PROCEDURE_HOLD.subscribe(node, self.on_hold)
 
     def on_tracker(self, message: TrackerState) -> None:
@@ -73,6 +79,36 @@ class ProcedureInputs:
         now = self._node.get_clock().now().nanoseconds * 1e-9
         if abs(now - reading.seconds(message.stamp)) <= self._hold_timeout:
             self._known.on_hold(time.monotonic())
+
+
+class _Sparing:
+    """Reads every message of a topic while a procedure is executed, and few while none is: to read them costs the most.
+
+    Args:
+        node: that reports messages which cannot be read.
+        topic: of the messages.
+        handle: called with each that is read.
+        is_active: whether a procedure is executed.
+    """
+
+    def __init__(
+        self, node: PackageNode, topic: topics.Topic, handle: Callable[[Any], None], is_active: Callable[[], bool]
+    ) -> None:
+        self._node, self._topic, self._handle, self._is_active = node, topic, handle, is_active
+        self._due = -math.inf
+
+    def take(self, data: bytes) -> None:
+        """Take the bytes of a message."""
+        now = time.monotonic()
+        if now < self._due and not self._is_active():
+            return
+        self._due = now + IDLE_PERIOD
+        try:
+            message = self._topic.decode(data)
+        except InvalidInputError as error:
+            self._node.refuse(error)
+        else:
+            self._handle(message)
 
 
 def _vertices(message: Any) -> Points:

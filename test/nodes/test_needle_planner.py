@@ -45,6 +45,7 @@ NEEDLE = NeedleKinematics(0.0025)
 RATE = 20.0  # Hz; of the poses, by their stamps: they come as fast as the test runs
 OPEN = read_scene("dish_35mm")
 POST = SceneShape("post", "instrument", Disc((0.004, 0.0), 0.001))
+ANSWER_TIMEOUT = 1.0  # s
 THREAD = [Point(), Point(x=-0.01)]
 NEAR = "goals: [{go_to: {position: [0.002, 0.001]}}]"
 FAR = "goals: [{go_to: {position: [-0.012, 0.0]}}]"
@@ -82,7 +83,14 @@ class Bench:
             topics.PREDICTED_THREAD, PredictedThread(positions=[Point(), Point(x=-0.01)], tension=[1e-5])
         )
         self.graph.publish(topics.MARGINS, self.margins)
+        runs, count = self.is_in(ProcedureState.STATE_RUNNING), len(self.commands)
         self.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(stamp, self.tail, self.heading))
+        # A needle that went on meanwhile would be controlled late; a pose that got lost has no answer.
+        deadline = time.monotonic() + ANSWER_TIMEOUT
+        while runs and len(self.commands) == count and self.is_in(ProcedureState.STATE_RUNNING):
+            if time.monotonic() > deadline:
+                return
+            time.sleep(0.001)
 
     def until(self, condition: Any, what: str) -> None:
         """Show frames until a condition holds."""
