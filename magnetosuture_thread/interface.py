@@ -71,6 +71,8 @@ DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 # Services of the coil bridge, of std_srvs: SetBool, Trigger and Trigger.
 ARM, EMERGENCY_STOP, RESET = "coils/arm", "coils/emergency_stop", "coils/reset"
 
+FORECAST_PATH = "thread/forecast_path"  # of the thread model, where it forecasts: ForecastPath of magnetosuture_msgs
+
 # Services of the scene server, of magnetosuture_msgs: LoadScene, EditShape, EditShape and RemoveShape.
 LOAD_SCENE, ADD_SHAPE, REPLACE_SHAPE, REMOVE_SHAPE = "scene/load", "scene/add", "scene/replace", "scene/remove"
 

@@ -50,6 +50,7 @@ SERVICES = {
     interface.ADD_SHAPE: "EditShape",
     interface.REPLACE_SHAPE: "EditShape",
     interface.REMOVE_SHAPE: "RemoveShape",
+    interface.FORECAST_PATH: "ForecastPath",
     interface.PLAN_PROCEDURE: "PlanProcedure",
     interface.PAUSE_PROCEDURE: "Trigger",
     interface.RESUME_PROCEDURE: "Trigger",
