@@ -60,7 +60,7 @@ class RequestHandler:
             InvalidInputError: the request needs control, or too many are pending.
         """
         unleased = isinstance(message, messages.BridgeAction) and message.action in UNLEASED_ACTIONS
-        if isinstance(message, messages.ProcedureAction):
+        if isinstance(message, messages.ProcedureRequest):
             unleased = message.action in UNLEASED_PROCEDURE_ACTIONS
         if not unleased and client != self._jog.holder:
             raise InvalidInputError(_name(message), "a page without control", "one with control: take control first")
@@ -91,7 +91,7 @@ class RequestHandler:
     def _request(self, message: messages.ClientMessage, operator: str) -> Awaitable[str]:
         if isinstance(message, messages.BridgeAction):
             return self._graph.execute_action(message.action)
-        if isinstance(message, messages.ProcedureAction):
+        if isinstance(message, messages.ProcedureRequest):
             return self._graph.execute_procedure(message.action, message.procedure, message.hold_to_run)
         if isinstance(message, messages.SelectSetup):
             return self._host.select_setup(message.setup)
@@ -103,7 +103,7 @@ class RequestHandler:
 
 
 def _name(message: messages.ClientMessage) -> str:
-    if isinstance(message, messages.ProcedureAction):
+    if isinstance(message, messages.ProcedureRequest):
         return f"{message.action} procedure"
     return message.action if isinstance(message, messages.BridgeAction) else message.TYPE
 

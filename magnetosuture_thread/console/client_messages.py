@@ -152,7 +152,7 @@ class RecordBag(ClientMessage):
 
 
 @dataclass(frozen=True)
-class ProcedureAction(ClientMessage):
+class ProcedureRequest(ClientMessage):
     """Request to the needle planner: plan a procedure, begin or resume it, pause it, or give it up.
 
     Attributes:

@@ -46,7 +46,7 @@ OPTIONAL = (
     topics.TIP_SETPOINT,
     topics.FAULT_REQUEST,
     topics.MATERIAL,
-    topics.FORECAST,
+    *topics.ON_REQUEST,
     *topics.PROCEDURES,
 )
 INTERRUPTED = "interrupted"

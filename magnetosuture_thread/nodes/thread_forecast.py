@@ -92,7 +92,7 @@ class ThreadForecasts:
         Raises:
             InvalidInputError: path, speed or horizon are out of bounds, or nothing is estimated yet.
         """
-        follower = path_follower(request, self._session.settings)
+        follower = make_path_follower(request, self._session.settings)
         forecaster = self._forecaster()
         if self._last is None or forecaster is None:
             raise InvalidInputError("forecast", "no estimate yet", "a thread that is estimated, in a scene")
@@ -130,7 +130,7 @@ class ThreadForecasts:
         return forecaster
 
 
-def path_follower(request: Any, settings: ThreadModelSettings) -> PathFollower:
+def make_path_follower(request: Any, settings: ThreadModelSettings) -> PathFollower:
     """Return the controller that takes the tip along the path of a request, as the node `path_follower` does.
 
     Raises:

@@ -201,6 +201,7 @@ OUTPUTS = (
     DIAGNOSTICS,
 )
 
+ON_REQUEST = (FORECAST,)  # outputs that nobody publishes unless a parameter asks for them
 SETTINGS = (SCENE, SCENE_MARKERS, MATERIAL)  # what may be told at any time, or never
 SIMULATED = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
 

@@ -39,6 +39,7 @@ from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+from test.nodes.bridge import applied, armed, reasons
 from test.nodes.scenes import scene_told
 
 NEEDLE = NeedleKinematics(0.0025)
@@ -65,6 +66,7 @@ class Bench:
         self.feedback: list[Any] = []
         self.tail, self.heading = np.array([-0.006, 0.0]), np.array([1.0, 0.0])
         self.frame, self.moved = 0, 0
+        self.real_time = False  # whether the stamps of poses are those of a clock, for a coil bridge
         self.margins = SafetyMargins(valid=True, slowdown=1.0)
         graph.publish(topics.SCENE, scene_told(scene))
         graph.wait(lambda: self.node._scene.version == scene.version, "the scene")
@@ -77,6 +79,9 @@ class Bench:
             self.tail, self.heading = NEEDLE.moved(self.tail, self.heading, *along, 1.0 / RATE)
             self.moved = len(self.commands)
         stamp = Time(sec=5 + self.frame // 20, nanosec=50_000_000 * (self.frame % 20))
+        if self.real_time:
+            stamp = self.graph.now()
+            self.margins.header.stamp = stamp
         self.frame += 1
         self.margins.scene_version = self.scene.version
         self.graph.publish(
@@ -403,6 +408,18 @@ def test_a_node_that_ends_gives_up_and_stops_the_needle(graph, make_bench):
         bench.node.finish()
     graph.wait(lambda: bench.is_in(ProcedureState.STATE_FAILED, "the needle planner has ended"), "the end")
     graph.wait(lambda: not bench.is_commanded(), "the needle to be stopped")
+
+
+def test_a_planner_that_is_killed_leaves_the_needle_at_rest(graph, make_bench):
+    bridge = armed(graph, needle_length=NEEDLE.length, keep_out=2.5e-4, pose_timeout=1.0, prediction_timeout=5.0)
+    bench = make_bench()
+    states = graph.listen(topics.BRIDGE_STATE)
+    bench.real_time = True
+    bench.run()
+    bench.until(lambda: any(currents.any() for currents in applied(bridge)[-3:]), "currents")
+    graph.remove(bench.node)  # without its `finish`, as a crash ends it
+    graph.wait(lambda: "no command for" in reasons(states), "the bridge to miss its commands")
+    assert not applied(bridge)[-1].any()
 
 
 def test_without_a_scene_or_a_needle_nothing_is_begun(graph):

@@ -20,7 +20,7 @@ from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.thread_forecast import path_follower
+from magnetosuture_thread.nodes.thread_forecast import make_path_follower
 from test.model.estimator.threads import whole
 from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp
 
@@ -138,4 +138,4 @@ def test_a_client_is_told_what_happens_along_its_path(graph: Any, monkeypatch: p
 def test_a_path_that_cannot_be_forecast_is_refused(fields: dict[str, Any], reason: str):
     given = {"path": [Point(x=0.01)], "speed": 0.002, "horizon": 1.0, **fields}
     with pytest.raises(InvalidInputError, match=re.escape(reason)):
-        path_follower(ForecastPath.Request(**given), ThreadModelSettings())
+        make_path_follower(ForecastPath.Request(**given), ThreadModelSettings())
