@@ -124,7 +124,10 @@ def simulate(
     if problem and execution is None:
         raise GraphError(f"{problem}; what was recorded is in {output}")
     log("evaluating the run")
-    summary = measure_loop(Bag(output), setup).summary(setup.name)
+    try:
+        summary = measure_loop(Bag(output), setup).summary(setup.name)
+    except GraphError as error:
+        raise GraphError(f"{problem}; {error}" if problem else str(error)) from None
     if execution is not None:
         summary = replace(summary, procedure=execution.result)
         (output / SUMMARY_FILE).write_text(json.dumps(summary.to_json(), indent=2) + "\n", encoding="utf-8")

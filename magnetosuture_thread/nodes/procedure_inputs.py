@@ -16,8 +16,9 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.model.estimator.disturbance import disturbance_text
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import PackageNode
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode
 from magnetosuture_thread.planning.session import ProcedureSession
+from magnetosuture_thread.texts import shortened
 
 MAX_DISTURBANCES = 3  # that are named
 IDLE_PERIOD = 0.2  # s between two messages of a thread that are read while nothing is executed
@@ -47,7 +48,7 @@ class ProcedureInputs:
     def on_tracker(self, message: TrackerState) -> None:
         """Register whether the needle is tracked."""
         tracked = message.state == TrackerState.STATE_TRACKED
-        self._known.on_tracker("" if tracked else message.reason or "no reason is given")
+        self._known.on_tracker("" if tracked else _reason(message))
 
     def on_prediction(self, message: PredictedThread) -> None:
         """Register the tension of the thread."""
@@ -67,7 +68,7 @@ class ProcedureInputs:
 
     def on_margins(self, message: SafetyMargins) -> None:
         """Register the thread's friction, and whether its margins are valid."""
-        reason = "" if message.valid else message.reason or "no reason is given"
+        reason = "" if message.valid else _reason(message)
         if not reason and not 0.0 < message.slowdown <= 1.0:
             self._node.refuse(InvalidInputError("thread/margins.slowdown", message.slowdown, "above 0 and at most 1"))
             return
@@ -109,6 +110,11 @@ class _Sparing:
             self._node.refuse(error)
         else:
             self._handle(message)
+
+
+def _reason(message: Any) -> str:
+    """Return the reason that a message gives, as it may be kept."""
+    return shortened(message.reason, MAX_REASON_CHARS) or "no reason is given"
 
 
 def _vertices(message: Any) -> Points:

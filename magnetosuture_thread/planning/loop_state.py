@@ -73,7 +73,7 @@ class LoopState:
             vertices: returns them, shape (n + 1, 2) [m].
         """
         self._estimates, self._vertices, self._estimate_problem = True, vertices, ""
-        if unmeasured_for > self._settings.unmeasured_timeout:
+        if not unmeasured_for <= self._settings.unmeasured_timeout:  # also where it is no number
             self._estimate_problem = f"the thread has not been measured for {unmeasured_for:.1f} s"
         elif disturbances:
             self._estimate_problem = f"an unmodelled contact: the thread is {'; '.join(disturbances)}"

@@ -172,9 +172,9 @@ def run_simulate(options: argparse.Namespace) -> int:
     With --procedure, needle_planner executes it in place of path_follower. What came of it is in summary.json in BAG,
     and a procedure that fails ends the command with the reason.
 
-    SETUP is a setup with waypoints in its section path_follower. BAG, which must not exist, records every topic,
-    including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run, and what was recorded
-    stays. The first run on a machine compiles for a minute before it begins.
+    SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
+    exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
+    and what was recorded stays. The first run on a machine compiles for a minute before it begins.
     """
     from magnetosuture_thread.evaluation.tables import loop_table
     from magnetosuture_thread.jobs.simulate import simulate
