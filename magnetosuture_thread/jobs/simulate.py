@@ -124,13 +124,17 @@ def simulate(
     if problem and execution is None:
         raise GraphError(f"{problem}; what was recorded is in {output}")
     log("evaluating the run")
+    figures = None if execution is None else {"setup": setup.name, "procedure": execution.result}
     try:
         summary = measure_loop(Bag(output), setup).summary(setup.name)
+        if execution is not None:
+            summary = replace(summary, procedure=execution.result)
+            figures = summary.to_json()
     except GraphError as error:
         raise GraphError(f"{problem}; {error}" if problem else str(error)) from None
-    if execution is not None:
-        summary = replace(summary, procedure=execution.result)
-        (output / SUMMARY_FILE).write_text(json.dumps(summary.to_json(), indent=2) + "\n", encoding="utf-8")
+    finally:
+        if figures is not None:
+            (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if problem:
         raise GraphError(f"{problem}; what was recorded is in {output}")
     return summary

@@ -20,7 +20,7 @@ from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode
 from magnetosuture_thread.planning.session import ProcedureSession
 from magnetosuture_thread.texts import shortened
 
-MAX_DISTURBANCES = 3  # that are named
+MAX_DISTURBANCES = 20  # that are read of a message
 IDLE_PERIOD = 0.2  # s between two messages of a thread that are read while nothing is executed
 
 
@@ -60,10 +60,12 @@ class ProcedureInputs:
 
     def on_estimate(self, message: EstimatedThread) -> None:
         """Register how sure the estimate is, and which forces the model does not know of."""
-        found = [
-            disturbance_text(each.arc_length, each.force, (each.direction.x, each.direction.y))
+        found = {
+            reading.seconds(each.since): disturbance_text(
+                each.arc_length, each.force, (each.direction.x, each.direction.y)
+            )
             for each in message.disturbances[:MAX_DISTURBANCES]
-        ]
+        }
         self._known.on_estimate(message.unmeasured_for, found, lambda: _vertices(message))
 
     def on_margins(self, message: SafetyMargins) -> None:

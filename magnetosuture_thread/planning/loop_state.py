@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from magnetosuture_thread.geometry.polyline import Points
@@ -11,6 +11,7 @@ from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 
 NO_POSE, NO_THREAD, NO_MARGINS = "no needle pose yet", "no thread yet", "no margins of the thread yet"
+MAX_NAMED = 3  # forces, in a reason
 NOT_HELD = "nobody holds the page"
 
 
@@ -45,6 +46,8 @@ class LoopState:
         self._tension = 0.0
         self._vertices: Callable[[], Points] | None = None
         self._estimates, self._estimate_problem = False, ""
+        self._disturbances: dict[float, str] = {}
+        self._accepted: set[float] = set()
         self._held = -math.inf
         self._graph_problem = ""
         self._last_problem, self._last_problem_time = NO_POSE, -math.inf
@@ -64,19 +67,25 @@ class LoopState:
         if not self._estimates:
             self._vertices = vertices
 
-    def on_estimate(self, unmeasured_for: float, disturbances: Sequence[str], vertices: Callable[[], Points]) -> None:
+    def on_estimate(
+        self, unmeasured_for: float, disturbances: Mapping[float, str], vertices: Callable[[], Points]
+    ) -> None:
         """Register an estimated thread.
 
         Args:
             unmeasured_for: time since the thread was measured [s].
-            disturbances: forces on it that the model does not know of, as texts.
+            disturbances: forces on it that the model does not know of, as texts, each by when it was found first [s].
             vertices: returns them, shape (n + 1, 2) [m].
         """
         self._estimates, self._vertices, self._estimate_problem = True, vertices, ""
         if not unmeasured_for <= self._settings.unmeasured_timeout:  # also where it is no number
             self._estimate_problem = f"the thread has not been measured for {unmeasured_for:.1f} s"
-        elif disturbances:
-            self._estimate_problem = f"an unmodelled contact: the thread is {'; '.join(disturbances)}"
+        self._accepted &= disturbances.keys()
+        self._disturbances = dict(disturbances)
+
+    def accept_disturbances(self) -> None:
+        """Go on in spite of the forces that are known now, as a person who begins or resumes wants; new ones count."""
+        self._accepted = set(self._disturbances)
 
     def on_margins(self, now: float, reason: str, friction_nodes: int, slowdown: float, scene_version: str) -> None:
         """Register the thread's margins, or the reason why they are not valid."""
@@ -142,4 +151,7 @@ class LoopState:
             return f"no margins of the thread for more than {self._settings.thread_timeout:g} s"
         if margins.scene_version != self.scene_version:
             return "thread_model goes by another scene"
-        return self._estimate_problem
+        if self._estimate_problem:
+            return self._estimate_problem
+        new = [text for since, text in self._disturbances.items() if since not in self._accepted]
+        return f"an unmodelled contact: the thread is {'; '.join(new[:MAX_NAMED])}" if new else ""

@@ -153,6 +153,7 @@ class ProcedureSession:
             state = "no procedure" if executor is None else f"a procedure that is {executor.state.value}"
             raise InvalidInputError("resume", state, "one that is planned or paused")
         self.check_armed()
+        self.known.accept_disturbances()
         executor.start()
         self._by_person = False
         self._update_status()

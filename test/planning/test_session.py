@@ -30,7 +30,7 @@ def known(now: float = 0.0, **changes: Any) -> LoopState:
     state = LoopState(NeedlePlannerSettings(**changes))
     state.scene_version = "1"
     state.on_pose(now, 0.006, 0.0175)
-    state.on_estimate(0.0, (), thread)
+    state.on_estimate(0.0, {}, thread)
     state.on_margins(now, "", 3, 0.7, "1")
     return state
 
@@ -44,7 +44,7 @@ def test_a_state_in_which_all_is_known_has_no_problem():
 @pytest.mark.parametrize("unmeasured", [1.01, math.inf, math.nan])
 def test_an_estimate_that_was_not_measured_is_unsure(unmeasured: float):
     state = known()
-    state.on_estimate(unmeasured, (), thread)
+    state.on_estimate(unmeasured, {}, thread)
     assert "not been measured" in state.condition(0.1).problem
 
 
@@ -81,6 +81,20 @@ def test_all_has_to_be_known_again_for_a_while():
     assert not state.condition(0.61).problem
 
 
+def test_a_force_that_is_new_is_a_problem_and_one_that_a_person_goes_on_with_is_none():
+    state = known(settle=0.0)
+    state.on_estimate(0.0, {3.5: "held at 10 mm"}, thread)
+    assert state.condition(0.1).problem == "an unmodelled contact: the thread is held at 10 mm"
+    state.accept_disturbances()
+    assert not state.condition(0.1).problem
+    state.on_estimate(0.0, {3.5: "held at 12 mm", 4.0: "held at 30 mm"}, thread)
+    assert state.condition(0.1).problem == "an unmodelled contact: the thread is held at 30 mm"
+    state.on_estimate(0.0, {}, thread)
+    assert not state.condition(0.1).problem
+    state.on_estimate(0.0, {3.5: "held at 10 mm"}, thread)  # it was gone
+    assert "held at 10 mm" in state.condition(0.1).problem
+
+
 def test_a_page_has_to_be_held_within_the_timeout():
     state = known(settle=0.0)
     state.hold_to_run = True
@@ -94,7 +108,7 @@ def session(now: float = 0.0) -> ProcedureSession:
     """Return a session whose needle and thread are known."""
     made = ProcedureSession(SETTINGS, SCENE)
     made.on_pose(0.0, TAIL, EAST, now)
-    made.known.on_estimate(0.0, (), thread)
+    made.known.on_estimate(0.0, {}, thread)
     made.known.on_margins(now, "", 0, 1.0, SCENE.version)
     return made
 
