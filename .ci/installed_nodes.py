@@ -21,6 +21,7 @@ NODES = {  # by program, what it says it is
     "coil_bridge": "coil_bridge",
     "rig_simulator": "rig_simulator",
     "path_follower": "path_follower",
+    "needle_planner": "needle_planner",
     "console": "console",
 }
 TIMEOUT = 90.0  # s; the first start compiles kernels

@@ -3,7 +3,8 @@
 The setup is one that ships with the package, by `setup:=NAME`, or a file of your own, by `setup_file:=PATH`. With
 `namespace:=NAME` all nodes are in a namespace. The coil bridge goes as far as the setup says; on hardware a person
 arms it. With `simulated:=true` a rig in software and a path follower come with them, and the bridge drives that rig and
-arms itself. With `console:=true` the operator's page is served on this machine.
+arms itself. With `planner:=true` procedures can be executed, and no path follower starts. With `console:=true` the
+operator's page is served on this machine.
 """
 
 from pathlib import Path
@@ -37,7 +38,8 @@ def generate_launch_description() -> LaunchDescription:
         file = Path(given).expanduser() if given else folder / f"{LaunchConfiguration('setup').perform(context)}.yaml"
         if not file.is_file():
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
-        return started(str(file.resolve()))
+        planner = LaunchConfiguration("planner").perform(context).lower() in ("true", "1")
+        return started(str(file.resolve()), planner)
 
     return LaunchDescription(
         [
@@ -46,14 +48,15 @@ def generate_launch_description() -> LaunchDescription:
             argument("namespace", "", "namespace of all nodes"),
             argument("use_sim_time", "false", "take the time from /clock"),
             argument("simulated", "false", "with a rig in software"),
+            argument("planner", "false", "with the needle planner, in place of the path follower"),
             argument("console", "false", "with the operator's page"),
             OpaqueFunction(function=nodes),
         ]
     )
 
 
-def started(file: str) -> list[Node]:
-    """Return the nodes with a parameter file."""
+def started(file: str, planner: bool) -> list[Node]:
+    """Return the nodes with a parameter file, the needle planner among them or not."""
     with_console = IfCondition(LaunchConfiguration("console"))
     with_rig, without = (condition(LaunchConfiguration("simulated")) for condition in (IfCondition, UnlessCondition))
 
@@ -74,6 +77,8 @@ def started(file: str) -> list[Node]:
         node("perception", named=False),
         node("coil_bridge", condition=without),
         node("coil_bridge", {"driver": "simulated", "autostart": "armed"}, condition=with_rig),
-        *(node(name, condition=with_rig) for name in RIG_NODES),
+        # Two nodes that command the needle would be in each other's way.
+        *(node(name, condition=with_rig) for name in RIG_NODES if not (planner and name == "path_follower")),
+        *([node("needle_planner")] if planner else []),
         node("console", condition=with_console),
     ]

@@ -253,17 +253,37 @@ def read_yaml(path: Path, what: str) -> Any:
         ConfigurationError: the file cannot be read, is not regular or too large, or is no plain YAML.
     """
     try:
-        return _load(read_regular(path, MAX_TEXT_BYTES).decode("utf-8"))
-    except BudgetError as error:
-        raise ConfigurationError(what, str(error), f"plain YAML, at most {MAX_YAML_DEPTH} deep", str(path)) from None
+        text = read_regular(path, MAX_TEXT_BYTES).decode("utf-8")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise ConfigurationError(what, reason, "a readable YAML file", str(path)) from None
+    return read_yaml_text(text, what, str(path))
+
+
+def read_yaml_text(text: str, what: str, source: str = "") -> Any:
+    """Return the content of a text as `read_yaml` does that of a file.
+
+    Args:
+        text: of at most `MAX_TEXT_BYTES` characters.
+        what: it is, for the error.
+        source: file that it is from, for the error.
+
+    Raises:
+        ConfigurationError: it is too large, or no plain YAML.
+    """
+    if len(text) > MAX_TEXT_BYTES:
+        raise ConfigurationError(what, f"{len(text)} characters", f"at most {MAX_TEXT_BYTES}", source)
+    try:
+        return _load(text)
+    except BudgetError as error:
+        raise ConfigurationError(what, str(error), f"plain YAML, at most {MAX_YAML_DEPTH} deep", source) from None
     except yaml.YAMLError as error:
         problem = str(getattr(error, "problem", error))
         mark = getattr(error, "problem_mark", None)
         line = f" in line {mark.line + 1}" if mark else ""
-        raise ConfigurationError(what, problem + line, "valid YAML", str(path)) from None
+        raise ConfigurationError(what, problem + line, "valid YAML", source) from None
+    except ValueError:
+        raise ConfigurationError(what, "not text", "a readable YAML file", source) from None
 
 
 def parse_parameter_value(text: str) -> Any:

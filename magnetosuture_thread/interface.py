@@ -16,7 +16,8 @@ SCENE_SERVER = "scene_server"  # besides, where the scene changes while the othe
 # As they run here: tracker and model in one process, so that a prediction waits for no message; the bridge alone.
 PROCESSES = ("perception", "coil_bridge")
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
-ALL_NODES = (*NODES, SCENE_SERVER, *RIG_NODES)
+PLANNER = "needle_planner"  # besides, where procedures are executed
+ALL_NODES = (*NODES, SCENE_SERVER, PLANNER, *RIG_NODES)
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"
 STORAGE_SUFFIXES = (".mcap", ".db3")  # of files of messages, which make a folder a bag
@@ -62,13 +63,23 @@ SCENE_MARKERS = Channel("scene/markers", "visualization_msgs/msg/MarkerArray")
 MATERIAL = Channel("thread/material", "magnetosuture_msgs/msg/ThreadMaterial")
 CURRENTS = Channel("coils/currents", "magnetosuture_msgs/msg/CoilCurrents")
 BRIDGE_STATE = Channel("coils/state", "magnetosuture_msgs/msg/CoilBridgeState")
+PROCEDURE_STATE = Channel("procedure/state", "magnetosuture_msgs/msg/ProcedureState")
+PROCEDURE_PLAN = Channel("procedure/plan", "nav_msgs/msg/Path")
+PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header")  # while a person holds the page
 DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
 # Services of the coil bridge, of std_srvs: SetBool, Trigger and Trigger.
 ARM, EMERGENCY_STOP, RESET = "coils/arm", "coils/emergency_stop", "coils/reset"
 
+FORECAST_PATH = "thread/forecast_path"  # of the thread model, where it forecasts: ForecastPath of magnetosuture_msgs
+
 # Services of the scene server, of magnetosuture_msgs: LoadScene, EditShape, EditShape and RemoveShape.
 LOAD_SCENE, ADD_SHAPE, REPLACE_SHAPE, REMOVE_SHAPE = "scene/load", "scene/add", "scene/replace", "scene/remove"
+
+# Of the needle planner: its action, ExecuteProcedure of magnetosuture_msgs, and services, PlanProcedure and Triggers.
+EXECUTE_PROCEDURE = "execute_procedure"
+PLAN_PROCEDURE = "procedure/make_plan"
+PAUSE_PROCEDURE, RESUME_PROCEDURE, ABORT_PROCEDURE = "procedure/pause", "procedure/resume", "procedure/abort"
 
 # Services of std_srvs/SetBool that let time stand still: of a replayed bag, of the simulated rig.
 PAUSE_REPLAY, PAUSE_RIG = "replay/pause", "rig/pause"

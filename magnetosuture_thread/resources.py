@@ -61,6 +61,11 @@ def find_procedure_file(name: str) -> Path:
     return _named_file("procedure", name, "config/procedures", (".yaml", ".yml"))
 
 
+def shipped_procedures() -> list[str]:
+    """Return the names of the procedures that ship with the package."""
+    return sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config/procedures").glob("*.yaml"))
+
+
 def _named_file(what: str, name: str, folder: str, endings: tuple[str, ...]) -> Path:
     shipped = share_directory("magnetosuture_thread") / folder
     path = Path(name) if Path(name).suffix in endings or os.sep in name else shipped / f"{name}.yaml"

@@ -14,6 +14,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import EVERY_NODE, load_setup
+from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, read_scene
@@ -26,6 +27,7 @@ SETTINGS_CLASSES = (
     CoilBridgeSettings,
     RigSettings,
     PathFollowerSettings,
+    NeedlePlannerSettings,
     ConsoleSettings,
 )
 
@@ -42,6 +44,7 @@ class Setup:
         coils: settings of the coil bridge.
         rig: settings of the simulated rig.
         follower: settings of the path follower.
+        planner: settings of the needle planner.
         console: settings of the operator's page.
     """
 
@@ -52,6 +55,7 @@ class Setup:
     coils: CoilBridgeSettings
     rig: RigSettings
     follower: PathFollowerSettings
+    planner: NeedlePlannerSettings
     console: ConsoleSettings
 
     def with_scene(self, scene: Scene) -> Setup:

@@ -66,7 +66,7 @@ ALLOWED = {
     "nodes": {
         *BASE,
         *("interface", "messages", "geometry", "scene", "model", "vision", "coils", "guidance", "rig", "console"),
-        *("parameter_files", "thread_observation", "forecast"),
+        *("parameter_files", "thread_observation", "forecast", "planning"),
     },
     "offline": {
         *BASE,
@@ -75,7 +75,8 @@ ALLOWED = {
     },
     "setups": {
         *BASE,
-        *("scene", "model", "vision", "coils", "guidance", "rig", "console", "parameter_files", "shared_parameters"),
+        *("scene", "model", "vision", "coils", "guidance", "planning", "rig", "console"),
+        *("parameter_files", "shared_parameters"),
     },
     "jobs": {
         *BASE,

@@ -85,6 +85,11 @@ def test_every_node_gets_the_same_file_and_namespace(description):
     assert bridges == {"unless": [], "if": [{"driver": "simulated", "autostart": "armed"}]}
 
 
+def test_a_planner_comes_in_place_of_the_path_follower(description):
+    started = {node.executable for node in nodes(description, planner="true")}
+    assert started == {"scene_server", *PROCESSES, "rig_simulator", "needle_planner", "console"}
+
+
 def test_a_file_of_ones_own_comes_in_place_of_a_name_and_must_be_there(description, tmp_path: Path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("")

@@ -33,20 +33,22 @@ def test_every_message_is_built():
     assert listed == {path.stem for path in (ROOT / "msg_defs" / "msg").glob("*.msg")}
     listed = set(re.findall(r'"srv/(\w+)\.srv"', (ROOT / "msg_defs" / "CMakeLists.txt").read_text()))
     assert listed == {path.stem for path in (ROOT / "msg_defs" / "srv").glob("*.srv")}
+    listed = set(re.findall(r'"action/(\w+)\.action"', (ROOT / "msg_defs" / "CMakeLists.txt").read_text()))
+    assert listed == {path.stem for path in (ROOT / "msg_defs" / "action").glob("*.action")}
 
 
 def test_every_message_package_that_the_nodes_import_is_declared():
     declared = {entry.text for entry in package_xml(ROOT / "package.xml").findall("depend")}
     used = set()
     for path in (ROOT / "magnetosuture_thread" / "nodes").rglob("*.py"):
-        used |= set(re.findall(r"^from (\w+)\.(?:msg|srv) import", path.read_text(), re.MULTILINE))
+        used |= set(re.findall(r"^from (\w+)\.(?:msg|srv|action) import", path.read_text(), re.MULTILINE))
     interface = (ROOT / "magnetosuture_thread" / "interface.py").read_text()
     used |= set(re.findall(r'"(\w+)/msg/\w+"', interface))
     assert used <= declared
 
 
 @pytest.mark.parametrize(
-    "name", ["scene_server", "vision_tracker", "thread_model", "perception", "coil_bridge", "console"]
+    "name", ["scene_server", "vision_tracker", "thread_model", "perception", "coil_bridge", "needle_planner", "console"]
 )
 def test_every_node_is_an_executable_and_launched(name: str):
     assert f'{name} = "magnetosuture_thread.nodes.{name}:main"' in PYPROJECT

@@ -144,6 +144,7 @@ def test_what_is_on_the_wire_has_no_old_word():
     definitions = [
         *(share_directory("magnetosuture_msgs") / "msg").glob("*.msg"),
         *(share_directory("magnetosuture_msgs") / "srv").glob("*.srv"),
+        *(share_directory("magnetosuture_msgs") / "action").glob("*.action"),
     ]
     assert len(definitions) > 5
     fields = [word for path in definitions for word in re.findall(r"^\S+ +(\w+)", path.read_text(), re.MULTILINE)]

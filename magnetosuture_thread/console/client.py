@@ -29,6 +29,7 @@ MAX_EXCESS_MESSAGES = 2000  # beyond that rate, in total, after which the connec
 EMERGENCY_STOP, DISARM = messages.BridgeAction("stop"), messages.BridgeAction("disarm")
 MAX_PENDING_REQUESTS = 4  # of one page, besides emergency stops
 UNLEASED_ACTIONS = ("stop", "disarm")  # allowed for every page with the token, with or without control
+UNLEASED_PROCEDURE_ACTIONS = ("pause", "abort")  # the same
 
 Reply = Callable[[str, str], None]
 
@@ -59,6 +60,8 @@ class RequestHandler:
             InvalidInputError: the request needs control, or too many are pending.
         """
         unleased = isinstance(message, messages.BridgeAction) and message.action in UNLEASED_ACTIONS
+        if isinstance(message, messages.ProcedureRequest):
+            unleased = message.action in UNLEASED_PROCEDURE_ACTIONS
         if not unleased and client != self._jog.holder:
             raise InvalidInputError(_name(message), "a page without control", "one with control: take control first")
         if not unleased and list(self._pending.values()).count(client) >= MAX_PENDING_REQUESTS:
@@ -88,6 +91,8 @@ class RequestHandler:
     def _request(self, message: messages.ClientMessage, operator: str) -> Awaitable[str]:
         if isinstance(message, messages.BridgeAction):
             return self._graph.execute_action(message.action)
+        if isinstance(message, messages.ProcedureRequest):
+            return self._graph.execute_procedure(message.action, message.procedure, message.hold_to_run)
         if isinstance(message, messages.SelectSetup):
             return self._host.select_setup(message.setup)
         if isinstance(message, messages.Pause):
@@ -98,6 +103,8 @@ class RequestHandler:
 
 
 def _name(message: messages.ClientMessage) -> str:
+    if isinstance(message, messages.ProcedureRequest):
+        return f"{message.action} procedure"
     return message.action if isinstance(message, messages.BridgeAction) else message.TYPE
 
 
@@ -112,6 +119,7 @@ class Client:
         token: that permits commands.
         jog: control lease and jog commands.
         requests: handler of all other requests.
+        hold: called while the page is held for a procedure.
 
     Attributes:
         address: of the page's computer.
@@ -128,12 +136,13 @@ class Client:
         token: str,
         jog: JogController,
         requests: RequestHandler,
+        hold: Callable[[], None],
     ) -> None:
         self.number, self.address, self.has_token = number, request.remote or "", False
         self.is_script = True
         self._socket, self._request = socket, request
         self._settings, self._token = settings, token
-        self._jog, self._requests = jog, requests
+        self._jog, self._requests, self._hold = jog, requests, hold
         self._outbox = Outbox()
         self._wake = asyncio.Event()
         self._can_command = False
@@ -244,6 +253,9 @@ class Client:
     async def _dispatch(self, message: messages.ClientMessage, now: float) -> None:
         if isinstance(message, messages.Jog):
             await self._on_jog(message, now)
+        elif isinstance(message, messages.HoldProcedure):
+            if self._in_time(message.sent, now) and self._jog.holder == self.number:
+                self._hold()
         elif isinstance(message, messages.EndJog):
             self._jog.end_jog(self.number)
         elif isinstance(message, messages.AcquireControl):
@@ -262,17 +274,23 @@ class Client:
             )
 
     async def _on_jog(self, message: messages.Jog, now: float) -> None:
-        delay = self._delay.update(message.sent, now)
-        if delay <= self._settings.hold_timeout:
-            self._last_in_time = now
+        if self._in_time(message.sent, now):
             if not self._jog.jog(self.number, message.velocity):
                 self._reply("error", text="jog: this page does not have control; take control first")
             return
         self._jog.interrupt(self.number)
-        expected = f"expected at most {self._settings.hold_timeout:g} s"
-        self._reply("error", text=f"jog: computer or network {delay:.2f} s late, {expected}", delay=delay)
         if now - self._last_in_time > MAX_LATE_TIME:
             await self._socket.close(code=1008, message=b"all messages are late")
+
+    def _in_time(self, sent: float, now: float) -> bool:
+        """Return whether a message of a hold is not late; report it else."""
+        delay = self._delay.update(sent, now)
+        if delay <= self._settings.hold_timeout:
+            self._last_in_time = now
+            return True
+        expected = f"expected at most {self._settings.hold_timeout:g} s"
+        self._reply("error", text=f"jog: computer or network {delay:.2f} s late, {expected}", delay=delay)
+        return False
 
     def _count_message(self, now: float) -> bool:
         """Count a message; return whether it exceeds the maximum rate."""

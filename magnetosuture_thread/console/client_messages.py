@@ -151,6 +151,39 @@ class RecordBag(ClientMessage):
     recording: bool = _switch()
 
 
+@dataclass(frozen=True)
+class ProcedureRequest(ClientMessage):
+    """Request to the needle planner: plan a procedure, begin or resume it, pause it, or give it up.
+
+    Attributes:
+        action: what is requested.
+        procedure: its name, for a plan; empty else.
+        hold_to_run: for a plan, whether the needle moves only while the page is held.
+    """
+
+    TYPE = "procedure"
+    action: str = _choice("plan", "resume", "pause", "abort")
+    procedure: str = _text()
+    hold_to_run: bool = _switch()
+
+
+@dataclass(frozen=True)
+class HoldProcedure(ClientMessage):
+    """The page is held, so that the needle may go on.
+
+    Attributes:
+        sent: time of sending by the page's clock [s].
+    """
+
+    TYPE = "hold"
+    sent: float
+
+    @classmethod
+    def parse(cls, fields: dict[str, Any], max_speed: float) -> HoldProcedure:
+        """Return the message of these fields; see `parse_client_message`."""
+        return cls(_finite("sent", fields.get("sent")))
+
+
 def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     """Parse and validate a message of a page.
 

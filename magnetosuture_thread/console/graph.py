@@ -31,6 +31,11 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
                  "reasons": [str], "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy], "saturated": bool,
                  "driver": str, "driver_ready": bool, "driver_warnings": [str], "current": [A],
                  "measured_current": [A], "refused": int, "age": s} | None,
+      "procedure": {"state": "idle|ready|running|paused|done|failed", "name": str, "goals": [str], "goal": int,
+                    "goals_met": int, "progress": share, "reason": str, "resumes": bool, "hold_to_run": bool,
+                    "clearance": m | None} | None,   # None where no needle planner runs
+      "plan": [[x, y], ...],           # where the middle of the needle is to go, may be empty
+      "procedures": [str],             # names of those that can be planned
       "nodes": {name: {"level": "ok|warn|error|silent", "message": str, "values": {str: str}, "age": s}},
     }
 
@@ -60,6 +65,12 @@ class Graph(Protocol):
 
     async def execute_action(self, action: str) -> str:
         """Execute arm, disarm, stop or reset; return an empty text, or the reason of a refusal."""
+
+    def publish_hold(self) -> None:
+        """Publish that the page is held, so that a procedure may go on."""
+
+    async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
+        """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""
 
     def state(self) -> dict[str, Any]:
         """Return the present state as a new dictionary; fast enough for 30 calls a second."""

@@ -147,7 +147,9 @@ class ConsoleServer:
         socket.headers.update(HEADERS)
         self._count += 1
         number = self._count
-        client = Client(number, socket, request, self._settings, self._token, self._jog, self._requests)
+        client = Client(
+            number, socket, request, self._settings, self._token, self._jog, self._requests, self._graph.publish_hold
+        )
         client.has_token = has_token
         self._clients[number] = client
         if self._frame:

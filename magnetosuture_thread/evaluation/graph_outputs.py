@@ -253,6 +253,7 @@ class LoopSummary:
         stretch: greatest absolute stretch of a segment.
         prediction: errors of the prediction; see `compare_errors`.
         estimate: errors of the estimate, under the same names.
+        procedure: what came of a procedure; None for a path that was followed.
     """
 
     setup: str
@@ -277,6 +278,7 @@ class LoopSummary:
     stretch: float
     prediction: dict[str, float | None] = field(default_factory=dict)
     estimate: dict[str, float | None] = field(default_factory=dict)
+    procedure: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none; units as above."""

@@ -18,7 +18,7 @@ from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import NODES, PROCESSES, SCENE_SERVER
+from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log
 from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE, START_TIMEOUT
@@ -270,8 +270,9 @@ class SimulatedHost(RecordingHost):
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
         arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS]
+        arguments += ["-p", f"{PLANNER}:keep_out:={self.setup.coils.keep_out!r}"]
         # Here and not in another thread: the nodes end with the thread that has started them.
-        processes = (SCENE_SERVER, RIG, *PROCESSES)
+        processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)
         self._nodes = NodeProcesses(processes, arguments, self._environment, self._logs).__enter__()
         self._since = time.monotonic()
 
@@ -307,7 +308,7 @@ class SimulatedHost(RecordingHost):
         self._nodes.check()
         if not self.busy:
             return
-        missing = [name for name in (SCENE_SERVER, RIG, *NODES) if not self.graph.is_active(name)]
+        missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
             # Only now: while it compiles for the first time, others shall not wait for it.

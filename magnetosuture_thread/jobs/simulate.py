@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,6 +20,7 @@ from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.interface import (
     CAMERA,
     NODES,
+    PLANNER,
     PREDICTED_THREAD,
     PROCESSES,
     SCENE,
@@ -28,6 +30,7 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
+from magnetosuture_thread.jobs.simulate_procedure import ProcedureRun
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
@@ -43,8 +46,11 @@ OPTIONAL = (
     topics.TIP_SETPOINT,
     topics.FAULT_REQUEST,
     topics.MATERIAL,
+    *topics.ON_REQUEST,
+    *topics.PROCEDURES,
 )
 INTERRUPTED = "interrupted"
+SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 SETTLING_TIME = 1.0  # s for all nodes to have found each other
 PREDICTION_TIMEOUT = 10.0  # s for the first prediction: where the needle cannot be tracked, there is none
@@ -73,46 +79,65 @@ def simulate(
     duration: float | None = None,
     rate: float | None = None,
     boards: bool = False,
+    procedure: str = "",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> LoopSummary:
     """Run rig, tracker, model, bridge and path follower as processes of their own, and evaluate the loop.
+
+    With a procedure the needle planner executes it in place of the path follower, and the figures, with what came of
+    the procedure, are in the folder too, as `summary.json`.
 
     `output` becomes a bag of every topic, including ground truth, with the nodes' `logs/` beside it; its
     notes hold the setup and say that it is simulated, and `replay` takes it. It is made at the end, also
     of a run that was interrupted, or for which the disk was too small; of one that never began nothing is left.
 
     Args:
-        setup_name: name or path of a setup with a path for the needle.
+        setup_name: name or path of a setup with a path for the needle, unless there is a procedure.
         output: the bag's folder.
         duration: the run ends after this many seconds of the setup's time, wherever the needle is then;
             when the path is done if None.
         rate: how much faster than real time, with a simulated clock; in real time if None.
         boards: whether the bridge drives the rig through simulated RoboClaw boards on pseudo-terminals, by the
             driver for real ones; they keep real time, so not with `rate`.
+        procedure: name or path of a procedure; empty for the setup's path.
         log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
     Raises:
         BagError: the output exists or cannot be written; where the disk was full, what was recorded is there.
-        ConfigurationError: the setup cannot be used.
-        GraphError: a node ended or did not come, or the needle never got to the end of its path.
+        ConfigurationError: the setup cannot be used, or the procedure does not fit its scene.
+        GraphError: a node ended or did not come, the needle never got to the end of its path, or the procedure failed.
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
     setup = read_setup(setup_name)
-    if not setup.follower.waypoints:
+    execution = ProcedureRun(procedure, setup) if procedure else None
+    if execution is None and not setup.follower.waypoints:
         raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
     if setup.vision.image_transport != "compressed":
         name, expectation = "vision_tracker.image_transport", "compressed: the bag must hold what the tracker saw"
         raise ConfigurationError(name, setup.vision.image_transport, expectation, str(setup.path))
     with whole_folder(output, is_recording=True) as folder:
-        problem = _run(setup, folder, output.name, duration, rate, boards, log, progress)
+        problem = _run(setup, folder, output.name, duration, rate, boards, execution, log, progress)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
-    if problem:
+    if problem and execution is None:
         raise GraphError(f"{problem}; what was recorded is in {output}")
     log("evaluating the run")
-    return measure_loop(Bag(output), setup).summary(setup.name)
+    figures = None if execution is None else {"setup": setup.name, "procedure": execution.result}
+    try:
+        summary = measure_loop(Bag(output), setup).summary(setup.name)
+        if execution is not None:
+            summary = replace(summary, procedure=execution.result)
+            figures = summary.to_json()
+    except GraphError as error:
+        raise GraphError(f"{problem}; {error}" if problem else str(error)) from None
+    finally:
+        if figures is not None:
+            (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    if problem:
+        raise GraphError(f"{problem}; what was recorded is in {output}")
+    return summary
 
 
 def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
@@ -133,6 +158,7 @@ def _run(
     duration: float | None,
     rate: float | None,
     boards: bool,
+    execution: ProcedureRun | None,
     log: Log,
     progress: Progress,
 ) -> str:
@@ -145,7 +171,8 @@ def _run(
         SETUP_NOTE: setup.path.read_text(encoding="utf-8"),
         "simulated": f"the whole rig, closed loop, setup {setup.name}",
     }
-    every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS)
+    procedures = () if execution is None else topics.PROCEDURES
+    every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *procedures)
     recorded = [topic for topic in every if topic is not topics.IMAGE]
     with reserved_domain() as domain, BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
         environment = graph_environment(domain)
@@ -189,6 +216,10 @@ def _run(
                     _arm()
                 log("running" if rate is None else f"running at {rate:g} times the speed")
                 running = True
+                if execution is not None:
+                    nodes.start(PLANNER, arguments=execution.arguments)
+                    with interruption:
+                        return execution.execute(recorder, check, duration, rate or 1.0, progress)
                 nodes.start("path_follower", arguments=BRIDGE_AND_RECORDER)
                 with interruption:
                     return _follow(recorder, check, setup, duration, rate or 1.0, progress)

@@ -1,8 +1,12 @@
-"""Forecasts of the node `thread_model`: of the estimated thread while the present command is held."""
+"""Forecasts of the node `thread_model`: while the present command is held, and along a path that a client sends."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
+from magnetosuture_msgs.srv import ForecastPath
 
 from magnetosuture_thread import (
     Forecast,
@@ -14,6 +18,9 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.guidance.follower import PathFollower
+from magnetosuture_thread.guidance.settings import PathFollowerSettings
+from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_message
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
@@ -22,12 +29,16 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import PackageNode
 
+MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
+MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed
+MIN_SPEED, MAX_SPEED = 1e-5, 0.1  # m/s
 MAX_COMMAND_AGE = 500_000_000  # ns; a command is held no longer when none follows
 
 
 class ThreadForecasts:
     """Publishes a forecast with every estimate, where the parameter `forecast_horizon` asks for it.
 
+    A service answers what would happen along a path instead.
     What is held is the command that the coil bridge follows, of `needle/filter_state`; without one the needle rests.
 
     Args:
@@ -37,11 +48,13 @@ class ThreadForecasts:
 
     def __init__(self, node: PackageNode, session: ThreadSession) -> None:
         self._node, self._session = node, session
+        self._last: tuple[PredictionResult, NeedlePose] | None = None
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
         self._command: tuple[int, np.ndarray, np.ndarray] | None = None  # stamp, commanded, filtered
         self._published = topics.FORECAST.publisher(node)
         self._markers = topics.THREAD_MARKERS.publisher(node)
         topics.FILTER_STATE.subscribe(node, self.on_filter_state)
+        node.create_service(ForecastPath, FORECAST_PATH, self.on_path)
         self._forecaster()
 
     def on_filter_state(self, message: object) -> None:
@@ -60,6 +73,7 @@ class ThreadForecasts:
         """
         if result.estimate is None or not result.estimate.converged:
             return
+        self._last = result, pose
         try:
             forecast = self._forecast(result, pose)
         except MagnetosutureError as error:
@@ -71,6 +85,27 @@ class ThreadForecasts:
         self._published.publish(forecast_message(MESSAGES, when, forecast))
         if self._markers.get_subscription_count():
             self._markers.publish(forecast_markers(MESSAGES, when, forecast))
+
+    def on_path(self, request: Any, answer: Any) -> Any:
+        """Answer what happens while the needle's tip follows a path, from the last estimate; nothing moves.
+
+        Raises:
+            InvalidInputError: path, speed or horizon are out of bounds, or nothing is estimated yet.
+        """
+        follower = make_path_follower(request, self._session.settings)
+        forecaster = self._forecaster()
+        if self._last is None or forecaster is None:
+            raise InvalidInputError("forecast", "no estimate yet", "a thread that is estimated, in a scene")
+        result, pose = self._last
+        assert result.estimate is not None
+
+        def command(time: float, tail: np.ndarray, heading: np.ndarray) -> np.ndarray:
+            return follower.compute_command(time, tail, heading).velocity
+
+        forecast = forecaster.forecast(ForecastStart(pose, result.estimate.positions), command, request.horizon)
+        answer.success = True
+        answer.forecast = forecast_message(MESSAGES, MESSAGES.time(result.stamp), forecast)
+        return answer
 
     def _forecast(self, result: PredictionResult, pose: NeedlePose) -> Forecast | None:
         forecaster = self._forecaster()
@@ -93,3 +128,29 @@ class ThreadForecasts:
             forecaster.warm_up()
         self._made = settings, scene, forecaster
         return forecaster
+
+
+def make_path_follower(request: Any, settings: ThreadModelSettings) -> PathFollower:
+    """Return the controller that takes the tip along the path of a request, as the node `path_follower` does.
+
+    Raises:
+        InvalidInputError: path, speed or horizon are out of bounds.
+    """
+    points = np.array([(point.x, point.y) for point in request.path]).reshape(-1, 2)
+    if not (0 < len(points) <= MAX_PATH_POINTS):
+        raise InvalidInputError("path", f"{len(points)} points", f"1 to {MAX_PATH_POINTS}")
+    if not (np.abs(points) <= MAX_PLACE).all():
+        raise InvalidInputError("path", "a point that is not finite or far away", f"within {MAX_PLACE:g} m")
+    if not MIN_SPEED <= request.speed <= MAX_SPEED:
+        raise InvalidInputError("speed", request.speed, f"{MIN_SPEED:g} to {MAX_SPEED:g} m/s")
+    if not (math.isfinite(request.horizon) and 0.0 < request.horizon <= MAX_PATH_HORIZON):
+        raise InvalidInputError("horizon", request.horizon, f"above 0 and at most {MAX_PATH_HORIZON:g} s")
+    chosen = PathFollowerSettings(
+        waypoints=tuple(points.ravel().tolist()),
+        speed=request.speed,
+        settle=0.0,
+        integral_gain=0.0,  # the forecast knows all drag that there is
+        needle_length=settings.needle_length,
+        needle_curvature=settings.needle_curvature,
+    )
+    return chosen.follower()

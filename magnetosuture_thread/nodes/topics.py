@@ -34,6 +34,7 @@ SENSOR = qos_profile_sensor_data
 # rest while poses are old.
 FRAMES = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
@@ -176,6 +177,9 @@ CURRENTS = Topic(interface.CURRENTS, RELIABLE, STATUS)
 BRIDGE_STATE = Topic(interface.BRIDGE_STATE, LATCHED, STATUS)
 RIG_CURRENTS = Topic(interface.RIG_CURRENTS, RELIABLE, STATUS)
 FAULT_REQUEST = Topic(interface.FAULT_REQUEST, RELIABLE)
+PROCEDURE_STATE = Topic(interface.PROCEDURE_STATE, LATCHED, STATUS)
+PROCEDURE_PLAN = Topic(interface.PROCEDURE_PLAN, LATCHED, SHAPES)
+PROCEDURE_HOLD = Topic(interface.PROCEDURE_HOLD, NEWEST)
 CLOCK = Topic(interface.CLOCK, SENSOR, absolute=True)
 DIAGNOSTICS = Topic(interface.DIAGNOSTICS, RELIABLE, STATUS, absolute=True)
 
@@ -197,8 +201,11 @@ OUTPUTS = (
     DIAGNOSTICS,
 )
 
+ON_REQUEST = (FORECAST,)  # outputs that nobody publishes unless a parameter asks for them
 SETTINGS = (SCENE, SCENE_MARKERS, MATERIAL)  # what may be told at any time, or never
 SIMULATED = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
+
+PROCEDURES = (PROCEDURE_STATE, PROCEDURE_PLAN, PROCEDURE_HOLD)  # of the needle planner, where there is one
 
 
 def lossless(depth: int) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +32,11 @@ class ClearanceMap(NamedTuple):
     distance: NDArray[np.float64]
 
 
+@lru_cache(maxsize=16)  # a plan asks for each of a few maps many times
 def map_clearance(scene: Scene, shapes: tuple[str, ...] | None = None) -> ClearanceMap:
     """Return the distances from the wall and all shapes of a scene; from some shapes alone, if they are named.
+
+    It is computed once for each scene and shapes, and not to be changed.
 
     Args:
         scene: dish and shapes.

@@ -214,7 +214,7 @@ class ProcedureExecutor:
         if command.done:
             return self._at_end(stamp, goal, middle, angle)
         assert self.path is not None
-        if command.travel >= self.path.ends[self._reached]:
+        if self._reached + 1 < len(self.path.ends) and command.travel >= self.path.ends[self._reached]:
             self._begin_goal(self.goal + 1)
             self._reached += 1
         rests = self._rest.update(stamp, middle, angle, self.planner.lever, bool(command.velocity.any()))

@@ -15,7 +15,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from magnetosuture_thread.configuration import Configuration, from_mapping, quantity, read_yaml, suggest_names
+from magnetosuture_thread.configuration import (
+    Configuration,
+    from_mapping,
+    quantity,
+    read_yaml,
+    read_yaml_text,
+    suggest_names,
+)
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.resources import find_procedure_file
 
@@ -204,6 +211,17 @@ def read_procedure(name: str) -> Procedure:
     """
     path = find_procedure_file(name)
     return parse_procedure(read_yaml(path, "procedure"), path.stem, str(path))
+
+
+def read_procedure_text(text: str) -> Procedure:
+    """Return a procedure, given by its name as `read_procedure` takes it, or by the YAML text of one.
+
+    Raises:
+        ConfigurationError: see `read_procedure`.
+    """
+    if ":" in text or "\n" in text:  # as every procedure has, and no name
+        return parse_procedure(read_yaml_text(text, "procedure"), "procedure")
+    return read_procedure(text)
 
 
 def _mapping(value: Any, name: str, source: str) -> dict[str, Any]:

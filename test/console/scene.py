@@ -155,6 +155,25 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
     }
 
 
+def procedure_state(state_name: str = "idle", **values: Any) -> dict[str, Any]:
+    """Return the state of a graph with a needle planner, whose procedure is in a state."""
+    shown = state()
+    shown["procedure"] = {
+        "state": state_name,
+        "name": "" if state_name == "idle" else "hernia",
+        "goals": [] if state_name == "idle" else ["pass_through", "wrap"],
+        "goal": 0,
+        "goals_met": 0,
+        "progress": 0.0,
+        "reason": "",
+        "resumes": False,
+        "hold_to_run": False,
+        "clearance": None,
+        **values,
+    }
+    return {**shown, "plan": [], "procedures": ["hernia", "slalom"]}
+
+
 def estimated_state(hidden: bool = False, found: bool = False, **values: Any) -> dict[str, Any]:
     """Return the state of a graph that estimates its thread too, while the model alone has gone another way.
 
@@ -200,6 +219,8 @@ class RecordingGraph:
         self.picture: tuple[int, bytes] | None = None
         self.commands: list[tuple[float, tuple[float, float]]] = []  # when, and what
         self.actions: list[str] = []
+        self.procedures: list[tuple[str, str, bool]] = []
+        self.holds: list[float] = []
         self.refusal = ""
 
     @property
@@ -218,6 +239,24 @@ class RecordingGraph:
         if self.shown["filter"]:
             factor = self.shown["filter"]["slowdown"]
             self.shown["filter"].update(commanded=list(velocity), filtered=[entry * factor for entry in velocity])
+
+    def publish_hold(self) -> None:
+        """Record that the page is held."""
+        self.holds.append(time.monotonic())
+
+    async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
+        """Record a request, and change the state of the procedure."""
+        self.procedures.append((action, procedure, hold_to_run))
+        if self.refusal:
+            return self.refusal
+        shown = self.shown["procedure"]
+        if action == "plan":
+            shown.update(state="ready", name=procedure, hold_to_run=hold_to_run, goals=["pass_through", "wrap"])
+            self.shown["plan"] = [[0.0, 0.0], [0.004, 0.002], [0.008, 0.004]]
+        else:
+            states = {"resume": "running", "pause": "paused", "abort": "failed"}
+            shown.update(state=states[action], reason="" if action == "resume" else f"{action} by a person")
+        return ""
 
     async def execute_action(self, action: str) -> str:
         """Record an action, and change the state of the bridge."""

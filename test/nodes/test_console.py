@@ -31,6 +31,7 @@ from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.inbox import ConsoleTap, Latest
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
@@ -425,3 +426,41 @@ def test_a_message_that_cannot_be_read_ends_no_page(graph, node: Node, failure: 
     tell(graph, topics.RIG_CURRENTS, CoilCurrents(current=[1.0]), polled, "the first")
     tell(graph, topics.RIG_CURRENTS, CoilCurrents(current=[-1.0]), lambda: polled() and asked[-1] < 0.0, "the bad one")
     assert latest.value == 1.0
+
+
+def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, console):
+    """With the real needle planner, and somebody who shows a needle."""
+    assert console.state()["procedure"] is None
+    assert console.state()["procedures"] == ["hernia"]
+    graph.add(NeedlePlannerNode, scene="dish_35mm", needle_length=0.0025, settle=0.0, pose_timeout=5.0)
+    commands, holds = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.PROCEDURE_HOLD)
+    pose = MESSAGES.pose_message(1_000_000_000, np.zeros(2), np.array([1.0, 0.0]))
+    near = "goals: [{go_to: {position: [0.008, 0.0]}}]"
+    refusal = asyncio.run(console.execute_procedure("resume", "", False))
+    assert "no procedure" in refusal
+
+    def planned() -> bool:
+        graph.publish(topics.NEEDLE_POSE, pose)
+        return not asyncio.run(console.execute_procedure("plan", near, True))
+
+    graph.wait(planned, "the plan", timeout=60.0)
+    graph.wait(lambda: (console.state()["procedure"] or {}).get("state") == "ready", "its state")
+    graph.wait(lambda: len(console.state()["plan"]) > 10, "its plan")
+    assert console.state()["procedure"]["goals"] == ["go_to"]
+    assert asyncio.run(console.execute_procedure("resume", "", False)) == ""
+
+    def is_in(state: str, reason: str) -> bool:
+        graph.publish(topics.NEEDLE_POSE, pose)
+        shown = console.state()["procedure"]
+        return bool(shown["state"] == state and reason in shown["reason"])
+
+    graph.wait(lambda: is_in("paused", "no thread yet"), "it to wait for the thread")
+    console.publish_hold()
+    graph.wait(lambda: bool(holds), "the hold")
+    assert asyncio.run(console.execute_procedure("pause", "", False)) == ""
+    graph.wait(lambda: is_in("paused", "by a person"), "the pause")
+    assert asyncio.run(console.execute_procedure("abort", "", False)) == ""
+    graph.wait(lambda: is_in("failed", "by a person"), "the end")
+    assert commands == []
+    console.blocked = "starting"
+    assert asyncio.run(console.execute_procedure("plan", near, False)) == "starting"

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Vector3
+from geometry_msgs.msg import Point, Vector3
 from magnetosuture_msgs.msg import FilterState
+from magnetosuture_msgs.srv import ForecastPath
 
 from magnetosuture_thread import Disc, ForecastStart, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadForecaster
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_message, forecast_text
+from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.thread_forecast import make_path_follower
 from test.model.estimator.threads import whole
 from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp
 
@@ -87,3 +93,49 @@ def test_message_and_markers_say_what_happens_when():
     still = forecaster.forecast(start, np.zeros(2), 0.1)
     assert not forecast_text(still)
     assert math.isnan(forecast_message(MESSAGES, stamp(0), still).contact_time)
+
+
+def ask(graph: Any, **fields: Any) -> Any:
+    """Return the answer of the service that forecasts along a path."""
+    client = graph.probe.create_client(ForecastPath, FORECAST_PATH)
+    graph.wait(client.service_is_ready, "the service")
+    future = client.call_async(ForecastPath.Request(**fields))
+    graph.wait(future.done, "the answer", timeout=60.0)
+    return future.result()
+
+
+def test_a_client_is_told_what_happens_along_its_path(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
+    forecasts = graph.listen(topics.FORECAST)
+    heading, tail = WAY[0].heading, WAY[0].tail
+    ahead = [Point(x=x, y=y) for x, y in (tail + np.outer([0.012, 0.03], heading)).tolist()]
+    assert "no estimate yet" in ask(graph, path=ahead, speed=0.004, horizon=1.0).message
+    bench.show(0)
+    graph.wait(lambda: len(forecasts) == 1, "a forecast")
+    answer = ask(graph, path=ahead, speed=0.004, horizon=1.2)
+    assert (answer.success, answer.message) == (True, "")
+    found = answer.forecast
+    assert found.header.stamp == stamp(0)
+    assert found.horizon == pytest.approx(1.2)
+    moved = math.hypot(found.tail[-1].x - found.tail[0].x, found.tail[-1].y - found.tail[0].y)
+    assert 0.7 * 0.0048 < moved < 1.1 * 0.0048  # from rest
+    assert len(found.positions) == 26 * len(found.time)
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"path": []}, "path: got 0 points"),
+        ({"path": [Point(x=math.nan)]}, "path: got a point that is not finite"),
+        ({"path": [Point(x=9.0)]}, "expected within 0.5 m"),
+        ({"speed": -0.001}, "speed: got -0.001"),
+        ({"speed": math.nan}, "speed: got nan"),
+        ({"horizon": 0.0}, "horizon: got 0.0"),
+        ({"horizon": math.inf}, "horizon: got inf"),
+        ({"path": [Point()] * 1001}, "1001"),
+    ],
+)
+def test_a_path_that_cannot_be_forecast_is_refused(fields: dict[str, Any], reason: str):
+    given = {"path": [Point(x=0.01)], "speed": 0.002, "horizon": 1.0, **fields}
+    with pytest.raises(InvalidInputError, match=re.escape(reason)):
+        make_path_follower(ForecastPath.Request(**given), ThreadModelSettings())

@@ -54,8 +54,9 @@ def add(subparsers: Subparsers) -> None:
     option = parser.add_argument
     option("setup", metavar="SETUP", help="a setup's name or YAML file")
     option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
-    duration = "end after this many seconds (default: at the end of the path)"
+    duration = "end after this many seconds (default: at the end of the path or procedure)"
     option("--duration", type=number_argument(0.1, 1e5), help=duration)
+    option("--procedure", default="", metavar="NAME", help="execute a procedure, by its name or YAML file")
     clock = parser.add_mutually_exclusive_group()
     rate = "run with a simulated clock, this much faster than real time (default: in real time)"
     clock.add_argument("--rate", type=number_argument(0.5, 5.0), help=rate)
@@ -168,9 +169,12 @@ def run_simulate(options: argparse.Namespace) -> int:
     the setup's path. All are processes of their own, on a ROS domain that nobody else uses. Everything is
     simulated, and the bag says so.
 
-    SETUP is a setup with waypoints in its section path_follower. BAG, which must not exist, records every topic,
-    including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run, and what was recorded
-    stays. The first run on a machine compiles for a minute before it begins.
+    With --procedure, needle_planner executes it in place of path_follower. What came of it is in summary.json in BAG,
+    and a procedure that fails ends the command with the reason.
+
+    SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
+    exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
+    and what was recorded stays. The first run on a machine compiles for a minute before it begins.
     """
     from magnetosuture_thread.evaluation.tables import loop_table
     from magnetosuture_thread.jobs.simulate import simulate
@@ -178,7 +182,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     console = make_console()
     log = make_log(console)
     new = not options.output.exists()
-    given = {name: getattr(options, name) for name in ("duration", "rate", "boards")}
+    given = {name: getattr(options, name) for name in ("duration", "rate", "boards", "procedure")}
     try:
         with progress(console, "simulate") as advance:
             summary = simulate(options.setup, options.output, log=log, progress=advance, **given)

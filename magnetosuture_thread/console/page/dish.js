@@ -1,6 +1,6 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
 // data-friction (free, sliding, stuck, unknown, invalid, old, none) and data-colour of the thread that the margins are of,
-// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
+// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import {
   ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, nodeLook, onGround, tensionColour, threadLook, threadOf,
@@ -13,6 +13,7 @@ const STALE = 0.5; // [s] a needle that is older is drawn grey
 const ARROW = 0.3; // of the dish's diameter, at the greatest speed
 const SIGMAS = 2.33; // standard deviations on either side of the shaded band, which holds the thread with 98 %
 const PUSH = 34; // [px] length of the arrow of a force that was found
+const PLANNED = ["ready", "running", "paused"]; // states of a procedure whose plan is drawn
 const STEPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05];
 
 export class Dish {
@@ -57,8 +58,10 @@ export class Dish {
     const estimate = graph ? estimateState(graph, since) : "none";
     const tip = graph?.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop().join(",") : "";
     const tension = showTension && look.colour !== GREY && graph.predicted?.tension?.length ? graph.predicted.tension : null;
+    const plan = PLANNED.includes(graph?.procedure?.state) ? graph.plan : [];
     if (graph) {
       this.#line(graph.measured ?? [], 12, MEASURED);
+      this.#drawPlan(plan);
       if (estimate !== "none") this.#drawBand(graph.estimated);
       if (thread !== graph.predicted) this.#drawModel(graph, since);
       this.#drawThread(thread, graph.margins, look, thread === graph.estimated ? estimate : "none", tension);
@@ -71,6 +74,7 @@ export class Dish {
     Object.assign(canvas.dataset, {
       friction: look.state, colour: look.colour, estimate, tension: tension ? "shown" : "not",
       disturbances: String(estimate === "none" ? 0 : graph.estimated.disturbances.length), image: shown ? "yes" : "no", tip,
+      plan: String(plan.length),
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
   }
@@ -148,6 +152,14 @@ export class Dish {
     context.fillStyle = ESTIMATED;
     context.fill();
     context.globalAlpha = 1;
+  }
+
+  // Where the middle of the needle is to go.
+  #drawPlan(plan) {
+    this.#line(plan, 5, this.halo);
+    this.context.setLineDash([2, 6]);
+    this.#line(plan, 3, this.velocity);
+    this.context.setLineDash([]);
   }
 
   // What the model alone says, beside the estimate.

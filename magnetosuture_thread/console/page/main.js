@@ -5,6 +5,7 @@ import { Dish } from "./dish.js";
 import { Input } from "./input.js";
 import { showPanel } from "./panel.js";
 import { Plots } from "./plots.js";
+import { ProcedureBar } from "./procedure.js";
 import { SetupPicker } from "./setup_picker.js";
 import { SILENCE_TIMEOUT } from "./status.js";
 
@@ -35,6 +36,8 @@ const input = new Input(find("dish"), find("directions"), {
 });
 const connection = new Connection({ opened, closed, received, frame });
 
+const procedure = new ProcedureBar((message) => connection.send(message));
+
 const since = () => (state.graph ? clock() - state.received : 0);
 const hasControl = () => state.link === "open" && state.canCommand && state.client !== null && state.lease?.holder === state.client;
 
@@ -48,6 +51,7 @@ function closed(reason) {
   Object.assign(state, { link: "closed", problem: reason, lease: null, client: null, jogging: false });
   drawSoon();
   input.clear();
+  procedure.release();
 }
 
 function received(message) {
@@ -99,6 +103,7 @@ function sendJog() {
 
 function emergencyStop() {
   input.clear();
+  procedure.release();
   if (!connection.send({ type: "bridge_action", action: "stop" })) notice("Not connected: the emergency stop was not sent. Use the one on the rig.");
 }
 
@@ -178,17 +183,20 @@ function update() {
     drawSoon();
   }
   document.body.dataset.link = state.link;
-  showPanel({
+  const view = {
     link: state.link, open: state.link === "open", problem: state.problem, since: since(), graph: state.graph, host: state.host,
     lease: state.lease, client: state.client, hasControl: hasControl(), canCommand: state.canCommand, jogging: state.jogging, hasImage: dish.image !== null,
     stale: input.stale, late: now - state.late.at < LATE_TIME ? state.late.delay : 0,
     fps: stats.fps, speed: state.speed, maxSpeed: state.maxSpeed, setups,
-  });
+  };
+  showPanel(view);
+  procedure.show(view);
 }
 
 setInterval(() => {
   input.poll();
   sendJog();
+  procedure.poll(clock());
   if (input.pointer) drawSoon();
 }, JOG_PERIOD);
 setInterval(update, PANEL_PERIOD);

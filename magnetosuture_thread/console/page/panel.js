@@ -29,6 +29,7 @@ export function showPanel(view) {
     showNodes(view);
   }
   if (lease) write("pages", `${plural(lease.pages, "page")} watching`);
+  find("plan-legend").hidden = !Number(find("dish").dataset.plan ?? 0);
   find("simulated").hidden = !host?.simulated;
 }
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
+from magnetosuture_msgs.srv import PlanProcedure
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
@@ -16,13 +18,25 @@ from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import InvalidInputError, read_scene
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.interface import ALL_NODES, ARM, EMERGENCY_STOP, PAUSE_REPLAY, PAUSE_RIG, RESET
+from magnetosuture_thread.interface import (
+    ABORT_PROCEDURE,
+    ALL_NODES,
+    ARM,
+    EMERGENCY_STOP,
+    PAUSE_PROCEDURE,
+    PAUSE_REPLAY,
+    PAUSE_RIG,
+    PLAN_PROCEDURE,
+    RESET,
+    RESUME_PROCEDURE,
+)
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
+from magnetosuture_thread.resources import shipped_procedures
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.vision.images import unpack_image
@@ -31,7 +45,20 @@ TIMEOUT = 10.0  # s for a service to be found and to answer
 RETRY_PERIOD = 0.5  # s without an answer, after which it is called again
 POLL_PERIOD = 0.005  # s between two checks for an answer
 
-_TYPES = {ARM: SetBool, EMERGENCY_STOP: Trigger, RESET: Trigger, PAUSE_REPLAY: SetBool, PAUSE_RIG: SetBool}
+PLAN_TIMEOUT = 60.0  # s; a long way takes some seconds, and is planned once
+
+_TYPES = {
+    ARM: SetBool,
+    EMERGENCY_STOP: Trigger,
+    RESET: Trigger,
+    PAUSE_REPLAY: SetBool,
+    PAUSE_RIG: SetBool,
+    PLAN_PROCEDURE: PlanProcedure,
+    RESUME_PROCEDURE: Trigger,
+    PAUSE_PROCEDURE: Trigger,
+    ABORT_PROCEDURE: Trigger,
+}
+PROCEDURE_ACTIONS = {"resume": RESUME_PROCEDURE, "pause": PAUSE_PROCEDURE, "abort": ABORT_PROCEDURE}
 ACTIONS: dict[str, tuple[str, Any]] = {
     "arm": (ARM, SetBool.Request(data=True)),
     "disarm": (ARM, SetBool.Request(data=False)),
@@ -72,10 +99,18 @@ class ConsoleServices:
         """Pause or resume time by one of the services `PAUSE_REPLAY` and `PAUSE_RIG`."""
         return await self._call(name, SetBool.Request(data=paused), lambda: True)
 
+    async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
+        """Plan a procedure, or execute one of `PROCEDURE_ACTIONS`; return an empty text, or the reason of a refusal."""
+        if action == "plan":
+            request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
+            return await self._call(PLAN_PROCEDURE, request, lambda: True)
+        return await self._call(PROCEDURE_ACTIONS[action], Trigger.Request(), lambda: True)
+
     async def _call(self, name: str, request: Any, is_current: Any) -> str:
         client, answers = self._clients[name], self._answers[name]
+        timeout, retry_period = (PLAN_TIMEOUT, math.inf) if name == PLAN_PROCEDURE else (TIMEOUT, RETRY_PERIOD)
         calls: list[int] = []
-        deadline, retry_at = time.monotonic() + TIMEOUT, 0.0
+        deadline, retry_at = time.monotonic() + timeout, 0.0
         while (now := time.monotonic()) < deadline:
             if not is_current():
                 return "cancelled by a later action"
@@ -83,7 +118,7 @@ class ConsoleServices:
                 # The services may be called repeatedly: a lost answer blocks nothing.
                 with client.handle:
                     calls.append(client.handle.send_request(request))
-                retry_at = now + RETRY_PERIOD
+                retry_at = now + retry_period
             await asyncio.sleep(POLL_PERIOD)
             self._collect(name)
             for number in calls:
@@ -94,8 +129,8 @@ class ConsoleServices:
                         return "" if name in (PAUSE_REPLAY, PAUSE_RIG) else text
                     return text or "refused"
         if not calls:
-            return f"no service {name} within {TIMEOUT:g} s"
-        return f"{name} did not answer within {TIMEOUT:g} s"
+            return f"no service {name} within {timeout:g} s"
+        return f"{name} did not answer within {timeout:g} s"
 
     def _collect(self, name: str) -> None:
         """Collect answers of all calls."""
@@ -126,6 +161,8 @@ READERS = {
     "scene": (topics.SCENE, messages.scene, SCENE_PERIOD),
     "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
     "bridge": (topics.BRIDGE_STATE, messages.bridge, 0.0),
+    "procedure": (topics.PROCEDURE_STATE, messages.procedure, 0.0),
+    "plan": (topics.PROCEDURE_PLAN, messages.plan, 0.0),
 }
 ZERO_FILTER_STATE = {
     "source": "",
@@ -137,6 +174,7 @@ ZERO_FILTER_STATE = {
     "overridden": "",
     "age": 0.0,
 }
+LISTED_PARTS = ("measured", "plan")
 AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "filter", "bridge")
 
 
@@ -163,6 +201,8 @@ class ConsoleGraph:
         self.blocked = ""
         self.services = ConsoleServices(node)
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
+        self._holds = topics.PROCEDURE_HOLD.publisher(node)
+        self._procedures = shipped_procedures()
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
         self._open(settings, _file_scene(settings))
@@ -185,6 +225,15 @@ class ConsoleGraph:
         if not self.blocked:
             self._commands.publish(MESSAGES.twist_message(self.now().to_msg(), np.asarray(velocity, dtype=float)))
 
+    def publish_hold(self) -> None:
+        """Publish that the page is held; nothing while commands are blocked."""
+        if not self.blocked:
+            self._holds.publish(MESSAGES.header(self.now().to_msg()))
+
+    async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
+        """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""
+        return self.blocked or await self.services.execute_procedure(action, procedure, hold_to_run)
+
     async def execute_action(self, action: str) -> str:
         """Arm, disarm, stop or reset; return an empty text, or the reason of a refusal.
 
@@ -202,7 +251,7 @@ class ConsoleGraph:
             latest.poll()
         settings = self.settings
         parts: dict[str, Any] = {
-            name: latest.aged() if name in AGED_PARTS else latest.value or ([] if name == "measured" else None)
+            name: latest.aged() if name in AGED_PARTS else latest.value or ([] if name in LISTED_PARTS else None)
             for name, latest in self._latest.items()
         }
         if self.blocked:
@@ -214,6 +263,7 @@ class ConsoleGraph:
             **parts,
             "camera": None if self._camera.value is None else {"age": self._camera.age},
             "scene": parts["scene"] or self._scene,
+            "procedures": self._procedures,
             "nodes": self.nodes(),
         }
 

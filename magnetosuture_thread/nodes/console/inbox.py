@@ -133,7 +133,7 @@ def _never(data: bytes) -> None:
 
 QUEUE_DEPTH = 1000  # messages of a topic
 POLL_PERIOD = 0.01  # s
-_GROUPS = (topics.INPUTS, topics.OUTPUTS, topics.SIMULATED, topics.SETTINGS)
+_GROUPS = (topics.INPUTS, topics.OUTPUTS, topics.SIMULATED, topics.SETTINGS, topics.PROCEDURES)
 RECORDED_TOPICS = tuple({topic.name: topic for kind in _GROUPS for topic in kind}.values())
 
 

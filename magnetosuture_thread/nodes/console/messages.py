@@ -13,6 +13,7 @@ from magnetosuture_msgs.msg import (
     EstimatedThread,
     FilterState,
     PredictedThread,
+    ProcedureState,
     SafetyMargins,
     ThreadDisturbance,
     TrackerState,
@@ -30,6 +31,8 @@ from magnetosuture_thread.texts import shortened
 
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
 MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page
+MAX_REASON_CHARS = 400
+MAX_PLAN_POINTS = 400  # that are sent to the page
 DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
 
 TRACKER = {
@@ -48,6 +51,14 @@ FRICTION = {
     SafetyMargins.FRICTION_FREE: "free",
     SafetyMargins.FRICTION_SLIDING: "sliding",
     SafetyMargins.FRICTION_STUCK: "stuck",
+}
+PROCEDURE = {
+    ProcedureState.STATE_IDLE: "idle",
+    ProcedureState.STATE_READY: "ready",
+    ProcedureState.STATE_RUNNING: "running",
+    ProcedureState.STATE_PAUSED: "paused",
+    ProcedureState.STATE_DONE: "done",
+    ProcedureState.STATE_FAILED: "failed",
 }
 SOURCES = {SafetyMargins.OF_PREDICTION: "prediction", SafetyMargins.OF_ESTIMATE: "estimate"}
 LEVELS = {
@@ -225,6 +236,28 @@ def bridge(message: CoilBridgeState) -> dict[str, Any]:
         "measured_current": list(message.measured_current[:MAX_LISTED]),
         "refused": message.refused,
     }
+
+
+def procedure(message: ProcedureState) -> dict[str, Any]:
+    """Return what the needle planner does."""
+    return {
+        "state": PROCEDURE.get(message.state, "failed"),
+        "name": shortened(message.procedure),
+        "goals": _texts(message.goals),
+        "goal": message.goal,
+        "goals_met": message.goals_met,
+        "progress": message.progress,
+        "reason": shortened(message.reason, MAX_REASON_CHARS),
+        "resumes": message.resumes,
+        "hold_to_run": message.hold_to_run,
+        "clearance": message.clearance if np.isfinite(message.clearance) else None,
+    }
+
+
+def plan(message: Path) -> list[list[float]]:
+    """Return where the middle of the needle is to go [m]; of a long way every second place, or fewer."""
+    points = measured_thread(message)
+    return points[:: 1 + len(points) // MAX_PLAN_POINTS]
 
 
 def node_state(status: DiagnosticStatus) -> dict[str, Any]:

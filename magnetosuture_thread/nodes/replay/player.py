@@ -134,6 +134,7 @@ class LiveReplay:
         Raises:
             GraphError: the nodes do not come, or one ends.
         """
+        on_request = {topic.name for topic in topics.ON_REQUEST}
         deadline = time.perf_counter() + START_TIMEOUT
         complete: float | None = None
         while complete is None or time.perf_counter() - complete < SETTLE:
@@ -145,7 +146,8 @@ class LiveReplay:
                 for name, publisher in self._inputs.items()
                 if name not in (CAMERA_INFO.recorded, SCENE.recorded) and not publisher.get_subscription_count()
             ]
-            missing += [name for name, output in self._outputs.items() if not output.get_publisher_count()]
+            expected = {name: output for name, output in self._outputs.items() if name not in on_request}
+            missing += [name for name, output in expected.items() if not output.get_publisher_count()]
             if self._clock.get_subscription_count() < self._nodes:
                 missing.append("/clock")
             if missing:

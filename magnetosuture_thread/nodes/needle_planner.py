@@ -1,0 +1,200 @@
+"""The node `needle_planner`: takes the needle through the goals of a procedure."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
+from magnetosuture_msgs.msg import CoilBridgeState
+from magnetosuture_msgs.srv import PlanProcedure
+from rclpy.clock import Clock, ClockType
+from std_srvs.srv import Trigger
+
+from magnetosuture_thread import InvalidInputError, Scene
+from magnetosuture_thread.interface import ABORT_PROCEDURE, PAUSE_PROCEDURE, PLAN_PROCEDURE, PLANNER, RESUME_PROCEDURE
+from magnetosuture_thread.messages import reading
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.node import PackageNode
+from magnetosuture_thread.nodes.parameter_files import node_options
+from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.procedure_action import ProcedureAction
+from magnetosuture_thread.nodes.procedure_inputs import ProcedureInputs
+from magnetosuture_thread.nodes.procedure_outputs import PERIOD, ProcedureOutputs
+from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.planning.path import BodyPath
+from magnetosuture_thread.planning.procedure import read_procedure_text
+from magnetosuture_thread.planning.session import ProcedureSession, compile_planning
+from magnetosuture_thread.planning.settings import NeedlePlannerSettings
+
+
+class NeedlePlannerNode(PackageNode):
+    """Commands the needle along planned paths, at every pose; without poses the coil bridge times out.
+
+    The operator is above it: any message on `operator/servo_cv` pauses the procedure until `procedure/resume`.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(PLANNER, **node_options(PLANNER, options))
+        settings = declare(self, NeedlePlannerSettings)
+        scene = initial_scene(settings.scene)
+        self._audience, self._session = settings.audience, ProcedureSession(settings, scene)
+        with self.health.busy("loading the planner's kernels; the first start on a machine compiles them"):
+            compile_planning()
+        self._moving = False  # whether the last command was not zero
+        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
+        self._commands = topics.NEEDLE_COMMAND.publisher(self)
+        self._setpoints = topics.TIP_SETPOINT.publisher(self)
+        self._outputs = ProcedureOutputs(self, self._session)
+        self._action = ProcedureAction(self, self.begin, self.abort)
+        self._inputs = ProcedureInputs(self, self._session, settings.hold_timeout)
+        topics.NEEDLE_POSE.subscribe(self, self.on_pose)
+        topics.BRIDGE_STATE.subscribe(self, self.on_bridge)
+        topics.OPERATOR_COMMAND.subscribe(self, self.on_operator)
+        self.create_service(PlanProcedure, PLAN_PROCEDURE, self.on_plan)
+        self._offer(PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person"))
+        self._offer(RESUME_PROCEDURE, self.resume)
+        self._offer(ABORT_PROCEDURE, lambda: self._session.abort("given up by a person"))
+        # Where simulated time stands still, a goal can be cancelled all the same.
+        self.create_timer(PERIOD, self.on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._publish()
+
+    def begin(self, request: Any) -> None:
+        """Plan and begin a procedure; raise a `MagnetosutureError` where that cannot be."""
+        self._check_bridge()
+        self._plan(request)
+        self._session.resume()
+        self._publish()
+
+    def resume(self) -> bool:
+        """Begin what is planned, or go on; raise an `InvalidInputError` where that cannot be."""
+        self._check_bridge()
+        self._session.resume()
+        return True
+
+    def abort(self, reason: str) -> None:
+        """Give the procedure up, the needle at rest."""
+        self._session.abort(reason)
+        self._publish()
+
+    def on_plan(self, request: Any, answer: Any) -> Any:
+        """Plan a procedure; the plan is published, and nothing moves."""
+        paths = self._plan(request)
+        answer.success, answer.length = True, sum(path.length for path in paths)
+        answer.duration = self._session.planned_duration
+        self._publish()
+        return answer
+
+    def on_scene(self, scene: Scene) -> None:
+        """Go by another scene; a procedure that does not fit it fails."""
+        self._rest()
+        with self._deaf():
+            self._session.set_scene(scene)
+        self._publish()
+
+    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Publish the velocity command of the procedure, if one runs."""
+        try:
+            pose = reading.needle_pose(message)
+        except InvalidInputError as error:
+            self.refuse(error)
+            return
+        with self._deaf():
+            velocity = self._session.on_pose(pose.stamp, pose.tail, pose.heading, time.monotonic())
+        if velocity is not None:
+            self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), velocity))
+            self._moving = bool(velocity.any())
+        if (setpoint := self._session.setpoint) is not None:
+            self._setpoints.publish(MESSAGES.placed(message.header.stamp, *setpoint))
+        self._publish()
+
+    def on_bridge(self, message: CoilBridgeState) -> None:
+        """Pause where the coil bridge is disarmed or stopped."""
+        self._session.on_armed(message.armed)
+        self._publish()
+
+    def on_operator(self, message: TwistStamped) -> None:
+        """Leave the needle to the operator, whatever is commanded."""
+        self._session.pause("an operator commands the needle")
+        self._publish()
+
+    def on_timer(self) -> None:
+        """Look after the graph, and after a needle of which no pose comes."""
+        self._session.known.on_graph(self._graph_problem())
+        self._session.check(time.monotonic())
+        self._publish()
+
+    def finish(self) -> None:
+        """Give the procedure up before the node ends, the needle at rest."""
+        self.abort("the needle planner has ended")
+
+    def destroy_node(self) -> None:
+        """Leave the graph."""
+        self._action.destroy()
+        super().destroy_node()
+
+    def _offer(self, name: str, execute: Callable[[], bool]) -> None:
+        self.create_service(Trigger, name, partial(self._serve, execute))
+
+    def _serve(self, execute: Callable[[], bool], request: Any, answer: Any) -> Any:
+        answer.success = execute()
+        answer.message = "" if answer.success else "no procedure is executed"
+        self._publish()
+        return answer
+
+    def _plan(self, request: Any) -> tuple[BodyPath, ...]:
+        procedure = read_procedure_text(request.procedure)
+        with self._deaf():
+            return self._session.plan(procedure, time.monotonic(), hold_to_run=request.hold_to_run)
+
+    def _check_bridge(self) -> None:
+        problem = self._graph_problem()
+        if problem:
+            raise InvalidInputError("needle/servo_cv", problem, "the coil bridge, and no other node that commands")
+        self._session.check_armed()
+
+    def _graph_problem(self) -> str:
+        """Return why commands would not be followed, or not those of one planner alone."""
+        subscribers = self._commands.get_subscription_count()
+        if subscribers < self._audience:
+            return f"{subscribers} of {self._audience} subscribers to velocity commands"
+        publishers = self.count_publishers(self._commands.topic_name)
+        return f"{publishers} nodes publish {topics.NEEDLE_COMMAND.name}" if publishers > 1 else ""
+
+    def _publish(self) -> None:
+        """Publish what has changed; bring the needle to rest where the procedure does not command it."""
+        if not self._session.is_running:
+            self._rest()
+        message = self._outputs.publish()
+        if message is not None:
+            self._action.update(message)
+        self._action.finish()
+
+    def _rest(self) -> None:
+        """Stop the needle now, and not when its last command times out."""
+        if self._moving:
+            self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), np.zeros(2)))
+            self._moving = False
+
+    @contextmanager
+    def _deaf(self) -> Iterator[None]:
+        """While a path is planned, for up to some seconds, nothing is heard: what is known gets no older by that."""
+        began = time.monotonic()
+        yield
+        self._session.known.shift(time.monotonic() - began)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node as a program."""
+    return run(NeedlePlannerNode, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

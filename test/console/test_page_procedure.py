@@ -1,0 +1,144 @@
+"""Procedures on the operator's page, in a real browser: planned, seen, run, paused, taken over, held and given up."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+from test.console.scene import procedure_state, state
+from test.console.test_page import Operator, operator
+
+__all__ = ["operator"]  # the fixture
+
+
+def enabled(operator: Operator, *names: str) -> None:
+    """Wait until these of the buttons are enabled, and no other."""
+    for name in ("plan", "run", "pause", "abort"):
+        button = operator.page.locator(f"#{name}-procedure")
+        (expect(button).to_be_enabled if name in names else expect(button).to_be_disabled)()
+
+
+def test_without_a_planner_there_is_no_bar(operator: Operator):
+    expect(operator.page.locator("#headline")).to_have_text("At rest: no page has control")
+    expect(operator.page.locator("#procedure")).to_be_hidden()
+    operator.served.graph.shown = procedure_state()
+    expect(operator.page.locator("#procedure")).to_be_visible()
+    operator.served.graph.shown = state()
+    expect(operator.page.locator("#procedure")).to_be_hidden()
+
+
+def test_a_procedure_is_chosen_planned_seen_run_paused_resumed_and_given_up(operator: Operator):
+    graph, page = operator.served.graph, operator.page
+    graph.shown = procedure_state()
+    expect(page.locator("#procedures button")).to_have_text(["Hernia", "Slalom"])
+    enabled(operator)  # without control nothing
+    operator.take_control()
+    enabled(operator, "plan")
+    page.click("#procedures button >> nth=1")
+    expect(page.locator("#procedures button").nth(1)).to_have_attribute("aria-pressed", "true")
+    page.click("#plan-procedure")
+    operator.until(lambda: graph.procedures == [("plan", "slalom", False)])
+    expect(page.locator("#dish")).to_have_attribute("data-plan", "3")
+    expect(page.locator("#plan-legend")).to_be_visible()
+    expect(page.locator("#procedure-state")).to_have_text("slalom: ready")
+    expect(page.locator("#goals")).to_have_text("Pass through · Wrap")
+    enabled(operator, "plan", "run", "abort")
+    page.click("#run-procedure")
+    expect(page.locator("#procedure-state")).to_have_text("slalom: running, 0 %")
+    enabled(operator, "pause", "abort")
+    graph.shown["procedure"].update(goal=1, goals_met=1, progress=0.42)
+    expect(page.locator("#goals")).to_have_text("✓ Pass through · ▸ Wrap")
+    expect(page.locator("#procedure-state")).to_have_text("slalom: running, 42 %")
+    page.click("#pause-procedure")
+    expect(page.locator("#procedure-reason")).to_have_text("pause by a person")
+    expect(page.locator("#run-procedure")).to_have_text("Resume")
+    enabled(operator, "run", "abort")
+    page.click("#run-procedure")
+    enabled(operator, "pause", "abort")
+    page.click("#abort-procedure")
+    expect(page.locator("#procedure-state")).to_have_text("slalom: failed")
+    expect(page.locator("#dish")).to_have_attribute("data-plan", "0")
+    enabled(operator, "plan")
+    assert [action for action, *_ in graph.procedures] == ["plan", "resume", "pause", "resume", "abort"]
+
+
+def test_a_procedure_is_neither_begun_disarmed_nor_resumed_where_it_goes_on_by_itself(operator: Operator):
+    graph = operator.served.graph
+    graph.shown = procedure_state("ready")
+    operator.take_control()
+    enabled(operator, "plan", "run", "abort")
+    graph.shown["bridge"]["armed"] = False
+    enabled(operator, "plan", "abort")
+    graph.shown = procedure_state("paused", reason="the needle is not tracked: lost", resumes=True)
+    enabled(operator, "pause", "abort")
+    expect(operator.page.locator("#procedure-reason")).to_have_text(
+        "the needle is not tracked: lost; it goes on by itself"
+    )
+
+
+def test_a_jog_takes_over_while_a_procedure_runs(operator: Operator):
+    operator.served.graph.shown = procedure_state("running")
+    operator.take_control()
+    operator.page.keyboard.down("ArrowRight")
+    operator.last((0.003, 0.0))
+    operator.page.keyboard.up("ArrowRight")
+    operator.last((0.0, 0.0))
+
+
+def test_a_page_without_control_may_pause_and_give_up(operator: Operator):
+    graph = operator.served.graph
+    graph.shown = procedure_state("running")
+    enabled(operator, "pause", "abort")
+    operator.page.click("#pause-procedure")
+    operator.until(lambda: graph.procedures == [("pause", "hernia", False)])
+
+
+def test_a_refusal_is_shown(operator: Operator):
+    graph = operator.served.graph
+    graph.shown, graph.refusal = procedure_state(), "goals[0].wrap.around: got 'ring', expected a shape of the scene"
+    operator.take_control()
+    operator.page.click("#plan-procedure")
+    expect(operator.page.locator("#notice")).to_have_text(f"plan procedure: {graph.refusal}")
+
+
+@pytest.mark.parametrize("end", ["release", "blur", "stop"])
+def test_the_page_is_held_while_the_button_is_and_no_longer(operator: Operator, end: str):
+    graph, page = operator.served.graph, operator.page
+    graph.shown = procedure_state()
+    operator.take_control()
+    hold = page.locator("#hold-procedure")
+    expect(hold).to_be_hidden()
+    page.click("#hold-to-run")
+    expect(page.locator("#hold-to-run")).to_have_attribute("aria-pressed", "true")
+    page.click("#plan-procedure")
+    operator.until(lambda: graph.procedures == [("plan", "hernia", True)])
+    page.click("#run-procedure")
+    expect(hold).to_be_visible()
+    assert graph.holds == []
+    hold.hover()
+    page.mouse.down()
+    operator.until(lambda: len(graph.holds) > 3)
+    if end == "blur":
+        page.evaluate("window.dispatchEvent(new Event('blur'))")
+    elif end == "stop":
+        page.keyboard.press("Space")
+    else:
+        page.mouse.up()
+    states = operator.stats("states")
+    operator.until(lambda: operator.stats("states") > states + 3)  # what was sent before has come
+    count, states = len(graph.holds), operator.stats("states")
+    operator.until(lambda: operator.stats("states") > states + 5)
+    assert len(graph.holds) == count
+    page.mouse.up()
+
+
+def test_nothing_is_cut_off_beside_the_bar(operator: Operator):
+    graph = operator.served.graph
+    graph.shown = procedure_state(
+        "paused", hold_to_run=True, reason="the needle is not tracked: lost", goals=["wrap"] * 8
+    )
+    operator.take_control()
+    for width, height in ((1366, 768), (1024, 700)):
+        operator.page.set_viewport_size({"width": width, "height": height})
+        expect(operator.page.locator("#hold-procedure")).to_be_visible()
+        assert operator.cut_off() == []
