@@ -355,8 +355,10 @@ def correct(
     residual = np.empty(len(weights))
     solves, change, off = 0, 1.0, np.inf
     found = (0.0, 0.0, 0.0)
-    row = _measurements(points, weights, end, scale, start, work.gram, buffers)
+    row = segments
     while True:
+        if change > CHANGED:
+            row = _measurements(points, weights, end, scale, start, work.gram, buffers)
         mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
         strain = segment_rows(buffers, about, start, known, 1.0)
         contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True)
@@ -365,14 +367,6 @@ def correct(
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
         if solves > 0 and ((off <= 1.0 and change <= CHANGED) or solves >= MAX_SOLVES):
             break
-        if solves > 0:  # with the new weights, and as many rows before those of the contacts
-            before, row = row, _measurements(points, weights, end, scale, start, work.gram, buffers)
-            if row != before:
-                contacts, _ = contact_rows(
-                    buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True
-                )
-                if contacts < 0:
-                    return NO_ROOM, solves, off, found, scale
         prior_information(density, noise, length, stiffness, scale, rod.clamped, work.normals, buffers)
         rows = row + contacts
         program = program_of(buffers, known, rows)

@@ -27,7 +27,9 @@ GRID = 10.0 ** np.arange(-17.0, -5.5)
 """Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
 QUIET = 1e-14  # before anything is measured [m^2/s]
 SCALE_TIME = 5.0  # s; over which the scale of the points' variance is learned
-RATIO_TIME = 2.0  # s; over which the covariance of innovations is matched to them
+RATIO_TIME = 0.1  # s; over which, with `LEARNING_PRIOR`, the covariance of innovations is matched to them: a tenth
+# is what nine frames of 16 windows tell
+MAX_SQUARE = 4.0  # normalised, of a frame's windows in the mean, that counts in that
 LEARNING_PRIOR = 0.2  # s of measurements, that what is assumed to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
 SURE = 3.0  # standard deviations
@@ -126,7 +128,7 @@ def match_innovations(
 ) -> tuple[float, float]:
     """Match what is expected of innovations to those of a frame; return the new scale and ratio.
 
-        E nu^2 = c (r + p)                  c, the ratio
+        E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
         E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames are independent
 
     Args:
@@ -157,7 +159,8 @@ def match_innovations(
             changes += min(change / (variance[w] + last_variance[w]), MAX_SCALE)
             both += 1
     if seen:
-        ratio += share_of(elapsed, learned_for, RATIO_TIME) * (squares / seen - ratio)
+        off = min(squares / (seen * ratio), MAX_SQUARE) - 1.0
+        ratio *= np.exp(share_of(elapsed, learned_for, RATIO_TIME) * off)
     if both:
         scale += share_of(elapsed, learned_for, SCALE_TIME) * (changes / both - scale)
         scale = min(max(scale, MIN_SCALE), MAX_SCALE)

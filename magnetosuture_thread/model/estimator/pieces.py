@@ -84,7 +84,7 @@ def place_pieces(
     """
     segments = len(nodes) - 1
     covered = np.zeros(segments, dtype=np.bool_)
-    placed = []
+    placed: list[PlacedPiece] = []
     if len(observation.pieces) > MAX_PIECES:
         problems.append(f"{len(observation.pieces)} pieces, more than {MAX_PIECES}; the others are ignored")
     # What is known to be where it is comes first, whatever the order in which it was given.
