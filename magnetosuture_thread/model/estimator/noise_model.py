@@ -113,7 +113,7 @@ def learn_noise(
     mean, own, expected, intensity = np.empty(windows), np.empty(windows), np.empty(windows), np.empty(windows)
     before = bank.intensity.copy()
     weigh(points, variance, weights, sums)
-    scale, ratio = match_innovations(
+    scale, matched = match_innovations(
         sums, unit, scale, ratio, elapsed, learned_for, last_mean, last_variance, mean, own, expected
     )
     learn(bank, grid, mean, sums.own * unit**2, elapsed, time_constant)
@@ -123,7 +123,10 @@ def learn_noise(
     interpolate_to_nodes(intensity, len(noise), noise)
     noise /= unit**2
     weigh(points, variance, weights, sums)
-    return scale, ratio, mean, own, expected, intensity
+    if learned_for == 0.0:
+        # Of the first step after a start no noise was known: it is tested with the noise that it shows.
+        matched, expected[:] = ratio, ratio * (sums.own + sums.known) * unit**2
+    return scale, matched, mean, own, expected, intensity
 
 
 @compiled
