@@ -218,8 +218,8 @@ class ThreadEstimator:
     def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
 
-        At once where the estimate is known to be as bad as that, else when a second frame says so too. What the piece
-        does not show goes on as it lay.
+        At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
+        so too. What the piece does not show goes on as it lay.
         """
         fresh = self._unknown
         if not piece.attached or (not fresh and piece.square < LARGE_ERROR**2):
@@ -228,7 +228,8 @@ class ThreadEstimator:
         self._gross += 1
         end = piece.start + piece.arcs[-1]
         prior = float(np.interp(0.5 * end, np.arange(len(self._variance)), self._variance))
-        if not fresh and self._gross < 2 and piece.square > 9.0 * prior:
+        measured = math.isfinite(self._measured_at)
+        if not fresh and measured and self._gross < 2 and piece.square > 9.0 * prior:
             return None
         self._gross = 0
         unit, segments = self._unit, self.thread.segments
@@ -277,7 +278,8 @@ class ThreadEstimator:
         # of a window share it, and so do both times that the test compares.
         shared = max(1.0 - self._noise.scale, MIN_SHARED) / self._noise.scale * self._sums.independent
         variance = self._sums.own * (1.0 + 0.5 * shared) * unit**2
-        self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
+        if math.isfinite(self._measured_at):  # else there is no earlier time to compare with
+            self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
         corrected = ThreadState(work.about * unit, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True
