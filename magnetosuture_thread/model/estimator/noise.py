@@ -27,8 +27,7 @@ GRID = 10.0 ** np.arange(-17.0, -5.5)
 """Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
 QUIET = 1e-14  # before anything is measured [m^2/s]
 SCALE_TIME = 5.0  # s; over which the scale of the points' variance is learned
-RATIO_TIME = 0.1  # s; over which, with `LEARNING_PRIOR`, the covariance of innovations is matched to them: a tenth
-# is what nine frames of 16 windows tell
+RATIO_TIME = 0.15  # s; over which the covariance of innovations is matched to them; a few frames of 16 windows
 MAX_SQUARE = 4.0  # normalised, of a frame's windows in the mean, that counts in that
 LEARNING_PRIOR = 0.2  # s of measurements, that what is assumed to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
@@ -160,7 +159,7 @@ def match_innovations(
             both += 1
     if seen:
         off = min(squares / (seen * ratio), MAX_SQUARE) - 1.0
-        ratio *= np.exp(share_of(elapsed, learned_for, RATIO_TIME) * off)
+        ratio *= np.exp(min(elapsed / RATIO_TIME, 1.0) * off)
     if both:
         scale += share_of(elapsed, learned_for, SCALE_TIME) * (changes / both - scale)
         scale = min(max(scale, MIN_SCALE), MAX_SCALE)
