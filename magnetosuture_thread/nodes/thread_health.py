@@ -79,4 +79,4 @@ class ThreadHealth:
         }
         if estimate.problems:
             figures["last_refused_piece"] = estimate.problems[0]
-        return figures
+        return figures | {f"learned {each.name}": each for each in estimate.slow_parameters}

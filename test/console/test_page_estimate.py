@@ -70,6 +70,15 @@ def test_a_disturbance_is_marked_at_its_position_and_described(operator: Operato
     operator.until(lambda: RED not in operator.colours_at(behind))
 
 
+def test_what_is_learned_of_the_thread_is_listed_with_its_interval(operator: Operator) -> None:
+    shown = estimated_state()
+    text = "1.3e-09 m^4/s, 95 % in 1.2e-09 to 1.4e-09, frozen: not excited"
+    shown["nodes"]["thread_model"]["values"] = {"learned stiffness_over_drag": text, "residual": "1.0e-09"}
+    operator.served.graph.shown = shown
+    expect(operator.page.locator("#margins")).to_contain_text(f"Stiffness over drag: {text}")
+    expect(operator.page.locator("#margins")).not_to_contain_text("1.0e-09")
+
+
 def test_an_old_estimate_is_not_drawn_as_one(operator: Operator) -> None:
     graph = operator.served.graph
     graph.shown = estimated_state()

@@ -191,6 +191,19 @@ def test_what_holds_the_thread_unknown_to_the_model_is_reported(bench: Bench):
     assert "N " in warned.message.split("held at")[1]  # so many mN or uN to a side
 
 
+def test_what_is_learned_of_the_thread_is_reported_with_its_interval(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, estimator_slow_parameters=["stiffness_over_drag", "flow"])
+    for k in range(3):
+        bench.show(k)
+
+    def learned() -> dict[str, str]:
+        return {value.key: value.value for report in bench.reports for value in report.status[0].values}
+
+    names = ["stiffness_over_drag", "flow_x", "flow_y"]
+    graph.wait(lambda: {f"learned {name}" for name in names} <= learned().keys(), "what is learned")
+    assert "m^4/s, 95 % in" in learned()["learned stiffness_over_drag"]
+
+
 def spoiled(name: str) -> tuple[float, ThreadObservation]:
     """Return when an observation that cannot be used is stamped, in frames after the third, and it."""
     good = piece_of(NODES[3], 3)

@@ -164,6 +164,9 @@ function showThread({ graph, since }) {
   for (const [kind, value] of Object.entries(margins?.valid ? margins.least : {})) {
     rows.push([KINDS[kind] ?? capital(kind.replaceAll("_", " ")), millimetres(value, 3)]);
   }
+  if (estimate !== "none") for (const [key, value] of Object.entries(graph.nodes?.thread_model?.values ?? {})) {
+    if (key.startsWith("learned ")) rows.push([`${capital(key.slice(8).replaceAll("_", " "))}: ${value}`, null]);
+  }
   if (margins?.valid) rows.push(["In contact", plural(margins.contact.length, "node")]);
   if (predicted?.tension?.length) {
     rows.push(["Peak tension", micronewtons(Math.max(...predicted.tension))]);

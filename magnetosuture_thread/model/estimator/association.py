@@ -100,10 +100,13 @@ def clean_path(
     spacing = np.empty(count - 1)
     for k in range(count - 1):
         spacing[k] = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-    kept = np.empty(count, dtype=np.bool_)
-    path_without_outliers(points, np.median(spacing), detour * np.median(deviation), kept)
-    points, deviation = points[kept], deviation[kept]
-    count = len(points)
+    kept = np.ones(count, dtype=np.bool_)
+    usual = np.median(spacing)
+    if spacing.max() > 2.0 * usual:  # else the path through all points costs nothing
+        path_without_outliers(points, usual, detour * np.median(deviation), kept)
+    if not kept.all():
+        points, deviation = points[kept], deviation[kept]
+        count = len(points)
     arcs, share = np.zeros(count), np.ones(count)
     path_lengths(points, step * np.median(deviation), arcs)
     for k in range(count):
@@ -111,6 +114,30 @@ def clean_path(
         own *= 2.0 if k in (0, count - 1) else 1.0
         share[k] = min(1.0, own / correlation)
     return points, deviation, arcs, share
+
+
+@compiled
+def read_piece(
+    points: Points,
+    deviation: Vector,
+    largest: float,
+    min_deviation: float,
+    unit: float,
+    max_points: int,
+    detour: float,
+    step: float,
+    correlation: float,
+) -> tuple[Points, Vector, Vector, Vector, float, int]:
+    """Return `clean_path` of the `usable_points` of a piece, with variances for deviations.
+
+    Besides the mean of the deviations, and how many points are finite; with fewer than two of them nothing is cleaned.
+    The arguments are those of the two functions.
+    """
+    places, deviations, count = usable_points(points, deviation, largest, min_deviation, unit, max_points)
+    arcs, share = np.zeros(len(places)), np.ones(len(places))
+    if count >= 2:
+        places, deviations, arcs, share = clean_path(places, deviations, detour, step, correlation)
+    return places, deviations**2, arcs, share, deviations.mean() if len(deviations) else 0.0, count
 
 
 @compiled
@@ -196,15 +223,7 @@ def path_lengths(points: Points, spacing: float, arcs: Vector) -> None:
 
 
 @compiled
-def project(
-    nodes: Points,
-    points: Points,
-    arcs: Vector,
-    start: float,
-    slack: float,
-    place: Vector,
-    innovation: Vector,
-) -> None:
+def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: float) -> tuple[Vector, Vector, int]:
     """Project a piece's points onto the thread, each next to where its arc length says.
 
         place_p = i + t,    innovation_p = m_i . (y_p - (1 - t) x_i - t x_{i+1} + t (1 - t) (c_i + c_{i+1}) / 4)
@@ -218,10 +237,13 @@ def project(
         arcs: of the points from the first, shape (m,) [D].
         start: arc length of the first [D].
         slack: how far from its arc length the first point may lie; those after by `PATH_ERROR` more [D].
-        place: written: arc length of each point, nan of one that lies beyond an end, shape (m,) [D].
-        innovation: written, shape (m,) [D].
+
+    Returns:
+        The arc length of each point, nan of one that lies beyond an end, shape (m,) [D]; its innovation, shape (m,)
+        [D]; and how many points lie on the thread.
     """
-    segments = len(nodes) - 1
+    segments, count = len(nodes) - 1, 0
+    place, innovation = np.empty(len(points)), np.zeros(len(points))
     for p in range(len(points)):
         low, high = start + arcs[p] * (1.0 - PATH_ERROR) - slack, start + arcs[p] * (1.0 + PATH_ERROR) + slack
         place[p] = np.nan
@@ -251,3 +273,5 @@ def project(
                 if cx * cx + cy * cy < 1.0:
                     value += 0.25 * t * (1.0 - t) * (mx * cx + my * cy)
         innovation[p] = value
+        count += 1
+    return place, innovation, count

@@ -238,6 +238,30 @@ def measured_rows(
     return row
 
 
+@compiled
+def _measurements(
+    points: MeasuredPoints,
+    weights: Vector,
+    end: tuple[float, float],
+    scale: float,
+    start: Points,
+    gram: NDArray[np.float64],
+    buffers: StepBuffers,
+) -> int:
+    """Write the rows of all that is measured behind those of the segments; return their end. See `correct`."""
+    nodes, segments = len(start), len(start) - 1
+    row = measured_rows(points, weights, scale, start, segments, gram, buffers)
+    if np.isfinite(end[1]):
+        ex, ey = start[segments, 0] - start[segments - 1, 0], start[segments, 1] - start[segments - 1, 1]
+        size = np.hypot(ex, ey)
+        buffers.first[row], buffers.gradient[row] = nodes - 3, 0.0
+        buffers.gradient[row, 2, 0], buffers.gradient[row, 2, 1] = ex / size, ey / size
+        buffers.lower[row] = buffers.upper[row] = end[0]
+        buffers.compliance[row], buffers.multipliers[row] = scale * end[1], 0.0
+        row += 1
+    return row
+
+
 class CorrectionBuffers(NamedTuple):
     """Memory of a correction, kept from one to the next.
 
@@ -327,23 +351,16 @@ def correct(
         scale = max(scale, 1.0 / density[i])
     for p in range(len(weights)):
         scale = max(scale, points.share[p] / points.variance[p])
-    about[:], moved[:] = start, 0.0
-    buffers.multipliers[:], buffers.push[:] = 0.0, 0.0
+    about[:], moved[:], buffers.multipliers[:], buffers.push[:] = start, 0.0, 0.0, 0.0
     residual = np.empty(len(weights))
     solves, change, off = 0, 1.0, np.inf
     found = (0.0, 0.0, 0.0)
+    row = segments
     while True:
+        if change > CHANGED:
+            row = _measurements(points, weights, end, scale, start, work.gram, buffers)
         mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
         strain = segment_rows(buffers, about, start, known, 1.0)
-        row = measured_rows(points, weights, scale, start, segments, work.gram, buffers)
-        if np.isfinite(end[1]):
-            ex, ey = start[segments, 0] - start[segments - 1, 0], start[segments, 1] - start[segments - 1, 1]
-            size = np.hypot(ex, ey)
-            buffers.first[row], buffers.gradient[row] = nodes - 3, 0.0
-            buffers.gradient[row, 2, 0], buffers.gradient[row, 2, 1] = ex / size, ey / size
-            buffers.lower[row] = buffers.upper[row] = end[0]
-            buffers.compliance[row], buffers.multipliers[row] = scale * end[1], 0.0
-            row += 1
         contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True)
         if contacts < 0:
             return NO_ROOM, solves, off, found, scale
@@ -374,7 +391,6 @@ def correct(
     for i in range(nodes):
         for a in range(2):
             for b in range(2):
-                j = 2 * i
-                value = work.inverse[j + min(a, b), abs(a - b)] / scale
+                value = work.inverse[2 * i + min(a, b), abs(a - b)] / scale
                 work.covariance[i, a, b] = 0.0 if known[i] else value
     return CORRECTED, solves, off, found, scale

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator.relaxation import relax, significances
+from magnetosuture_thread.model.estimator.relaxation import add_displacement, relax
 from magnetosuture_thread.model.thread import Attachment, Thread
 
 Vector = NDArray[np.float64]
 
 FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
+STRAIGHT = np.zeros(2)  # a heading that is right
 CONFIRMED = 0.25  # of the averaging time, for which it must last
 
 
@@ -187,7 +188,7 @@ class DisturbanceTest:
     def decay(self, interval: float) -> None:
         """Let time pass [s]."""
         self._displacement *= math.exp(-interval / self._time)
-        relax(interval * self._stiffness, self._clamped, np.zeros(2), self._displacement)
+        relax(interval * self._stiffness, self._clamped, STRAIGHT, self._displacement)
 
     def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, deviations: Vector) -> None:
         """Add a correction.
@@ -199,10 +200,7 @@ class DisturbanceTest:
             stamp: [s]
             deviations: standard deviations of the needle's tail [m] and heading [rad].
         """
-        self._displacement += moved
-        found = np.empty(len(variance))
-        significances(self._displacement, normals, variance, self._response, deviations, found)
-        self._significance = float(found.max())
+        self._significance = add_displacement(self._displacement, moved, normals, variance, self._response, deviations)
         if self._significance > FOUND:
             self._since = stamp if math.isnan(self._since) else self._since
         elif self._significance < LOST:

@@ -13,7 +13,7 @@ from magnetosuture_thread.barrier import OBSTACLE, WALL, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.model.estimator.innovations import Innovations
-from magnetosuture_thread.model.estimator.noise import NoiseModel
+from magnetosuture_thread.model.estimator.noise_model import NoiseModel
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameter
 from magnetosuture_thread.model.formulations import ThreadState

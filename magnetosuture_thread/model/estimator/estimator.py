@@ -13,18 +13,11 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.model.estimator.correction import MeasuredPoints
 from magnetosuture_thread.model.estimator.corrector import Corrector
-from magnetosuture_thread.model.estimator.covariance import propagate
 from magnetosuture_thread.model.estimator.disturbance import DisturbanceTest
 from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
-from magnetosuture_thread.model.estimator.innovations import Innovations, WindowSums, take_over, weigh
-from magnetosuture_thread.model.estimator.noise import (
-    MIN_INTERVAL,
-    WINDOWS,
-    NoiseModel,
-    grow,
-    interpolate_to_nodes,
-    shift_errors,
-)
+from magnetosuture_thread.model.estimator.innovations import Innovations, WindowSums, weigh
+from magnetosuture_thread.model.estimator.noise import WINDOWS, interpolate_to_nodes
+from magnetosuture_thread.model.estimator.noise_model import NoiseModel, propagate_errors, take_correction
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.pieces import (
     PlacedPiece,
@@ -75,15 +68,13 @@ class ThreadEstimator:
         self.predictor, self.thread = predictor, predictor.thread
         self.options = options or EstimatorOptions()
         self._formulation = formulation
-        nodes = self.thread.segments + 1
         self._unit = self.thread.segment_length
         self._length = max(self.options.error_correlation * self.thread.segments, 0.5)
         self._corrector = Corrector(predictor, formulation, self._length)
         self._slow = SlowParameters(predictor, self.options)
-        self._work, self._added = np.empty(nodes), np.empty(nodes)
         self._prediction: Prediction | None = None
         self._converged = False
-        self._sums, self._applied = WindowSums.of(WINDOWS), np.zeros(WINDOWS)
+        self._sums = WindowSums.of(WINDOWS)
         self._forget()
 
     def _forget(self) -> None:
@@ -171,12 +162,16 @@ class ThreadEstimator:
         state = self.predictor.state
         assert before is not None
         assert state is not None
-        interpolate_to_nodes(self._noise.bank.intensity, len(self._added), self._added)
-        self._added *= self._prediction.interval / self._unit**2
-        self._added[0] = 0.0
-        here, there = state.positions / self._unit, before.positions / self._unit
-        propagate(here, there, self._added, self._variance, self._work)
-        propagate(here, there, 2.0 * self._length * self._added, self._density, self._work)
+        propagate_errors(
+            np.ascontiguousarray(state.positions),
+            np.ascontiguousarray(before.positions),
+            self._unit,
+            self._noise.bank.intensity,
+            self._prediction.interval,
+            2.0 * self._length,
+            self._variance,
+            self._density,
+        )
         self._test.decay(self._prediction.interval)
         return self.correct(observation) if observation is not None else self._estimate(())
 
@@ -203,7 +198,7 @@ class ThreadEstimator:
             end = free_end(placed, nodes, float(self._variance[-1]))
             again = measured_points(placed, nodes, unit, workspace, 0.5 * self.thread.diameter, scale, problems := [])
             points = again if again is not None else points
-        return self._corrected(points, end, pose, state, problems)
+        return self._corrected(points, end, pose, nodes, state, problems)
 
     def _learn_parameters(
         self, points: MeasuredPoints, end: tuple[float, float], pose: NeedlePose, state: ThreadState
@@ -223,8 +218,8 @@ class ThreadEstimator:
     def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
 
-        At once where the estimate is known to be as bad as that, else when a second frame says so too. What the piece
-        does not show goes on as it lay.
+        At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
+        so too. What the piece does not show goes on as it lay.
         """
         fresh = self._unknown
         if not piece.attached or (not fresh and piece.square < LARGE_ERROR**2):
@@ -233,7 +228,8 @@ class ThreadEstimator:
         self._gross += 1
         end = piece.start + piece.arcs[-1]
         prior = float(np.interp(0.5 * end, np.arange(len(self._variance)), self._variance))
-        if not fresh and self._gross < 2 and piece.square > 9.0 * prior:
+        measured = math.isfinite(self._measured_at)
+        if not fresh and measured and self._gross < 2 and piece.square > 9.0 * prior:
             return None
         self._gross = 0
         unit, segments = self._unit, self.thread.segments
@@ -258,33 +254,32 @@ class ThreadEstimator:
         points: MeasuredPoints,
         end: tuple[float, float],
         pose: NeedlePose,
+        nodes: Points,
         state: ThreadState,
         problems: list[str],
     ) -> ThreadEstimate:
         unit, segments = self._unit, self.thread.segments
         weights = np.ones(len(points.place))
-        elapsed = pose.stamp - self._measured_at
-        innovations = self._learn(points, weights, elapsed if math.isfinite(elapsed) else 0.0)
-        noise = np.empty(segments + 1)
-        interpolate_to_nodes(self._noise.intensity, segments + 1, noise)
-        noise /= unit**2
-        weigh(points, self._variance, weights, self._sums)
+        elapsed = pose.stamp - self._measured_at if math.isfinite(self._measured_at) else 0.0
+        innovations, noise = self._noise.learn(
+            points, weights, self._sums, unit, elapsed, 2.0 * self._length, self._variance, self._density
+        )
         density = np.maximum(self._density, MIN_VARIANCE)
-        start = np.ascontiguousarray(state.positions / unit)
+        start = np.ascontiguousarray(nodes)
         done = self._corrector.solve(start, pose.heading, density, noise, points, weights, end)
         if not done.solved:
             problems.append(f"the correction was not solved: residual {done.residual:.1e}, off by {done.off:.1g}")
             return self._estimate(tuple(problems), innovations=innovations, points=len(weights))
         self._density, self._variance = density, np.empty(segments + 1)
         work = self._corrector.work
-        hidden = take_over(points, weights, work, density, self._variance, self._applied)
+        hidden = take_correction(points, weights, work, unit, self._noise.bank, density, self._variance)
         self._slow.correct(self._corrector, self._variance)
-        shift_errors(self._noise.bank, self._applied * unit)
         # What of a point's variance does not change from frame to frame is of the dish's place in the image: the points
         # of a window share it, and so do both times that the test compares.
         shared = max(1.0 - self._noise.scale, MIN_SHARED) / self._noise.scale * self._sums.independent
         variance = self._sums.own * (1.0 + 0.5 * shared) * unit**2
-        self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
+        if math.isfinite(self._measured_at):  # else there is no earlier time to compare with
+            self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
         corrected = ThreadState(work.about * unit, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True
@@ -299,15 +294,6 @@ class ThreadEstimator:
             points=len(weights),
             hidden=hidden,
         )
-
-    def _learn(self, points: MeasuredPoints, weights: Vector, elapsed: float) -> Innovations:
-        """Learn the noise from the innovations, and grow the prior where it rose."""
-        weigh(points, self._variance, weights, self._sums)
-        before = self._noise.bank.intensity.copy()
-        innovations = self._noise.learn(self._sums, self._unit, elapsed)
-        amount = max(elapsed, MIN_INTERVAL) / self._unit**2
-        grow(before, self._noise.intensity, amount, 2.0 * self._length, self._variance, self._density)
-        return innovations
 
     def _set_variance(self, variance: Vector) -> None:
         self._variance = np.array(variance)

@@ -12,14 +12,13 @@ within a frame or two where something happens that the model does not know.
 
 from __future__ import annotations
 
-import copy
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.model.estimator.innovations import Innovations, WindowSums
+from magnetosuture_thread.model.estimator.innovations import WindowSums
 
 Vector = NDArray[np.float64]
 
@@ -28,7 +27,8 @@ GRID = 10.0 ** np.arange(-17.0, -5.5)
 """Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
 QUIET = 1e-14  # before anything is measured [m^2/s]
 SCALE_TIME = 5.0  # s; over which the scale of the points' variance is learned
-RATIO_TIME = 2.0  # s; over which the covariance of innovations is matched to them
+RATIO_TIME = 0.15  # s; over which the covariance of innovations is matched to them; a few frames of 16 windows
+MAX_SQUARE = 4.0  # normalised, of a frame's windows in the mean, that counts in that
 LEARNING_PRIOR = 0.2  # s of measurements, that what is assumed to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
 SURE = 3.0  # standard deviations
@@ -79,13 +79,13 @@ def learn(
         time_constant: over which likelihoods are forgotten [s].
     """
     keep, share = np.exp(-interval / time_constant), min(1.0, SWITCHING * interval) / len(grid)
+    logs, log_grid = np.empty(len(grid)), np.log(grid)
     for w in range(len(innovation)):
         if not np.isfinite(variance[w]):
             for g in range(len(grid)):
                 bank.variance[w, g] += grid[g] * interval
             continue
         best = -np.inf
-        logs = np.empty(len(grid))
         for g in range(len(grid)):
             prior = bank.variance[w, g] + grid[g] * interval
             expected = prior + variance[w]
@@ -101,7 +101,7 @@ def learn(
         mean = 0.0
         for g in range(len(grid)):
             bank.weight[w, g] = max(bank.weight[w, g] / total * (1.0 - share * len(grid)) + share, 1e-30)
-            mean += bank.weight[w, g] * np.log(grid[g])
+            mean += bank.weight[w, g] * log_grid[g]
         bank.intensity[w] = np.exp(mean)
 
 
@@ -127,7 +127,7 @@ def match_innovations(
 ) -> tuple[float, float]:
     """Match what is expected of innovations to those of a frame; return the new scale and ratio.
 
-        E nu^2 = c (r + p)                  c, the ratio
+        E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
         E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames are independent
 
     Args:
@@ -158,7 +158,8 @@ def match_innovations(
             changes += min(change / (variance[w] + last_variance[w]), MAX_SCALE)
             both += 1
     if seen:
-        ratio += share_of(elapsed, learned_for, RATIO_TIME) * (squares / seen - ratio)
+        off = min(squares / (seen * ratio), MAX_SQUARE) - 1.0
+        ratio *= np.exp(min(elapsed / RATIO_TIME, 1.0) * off)
     if both:
         scale += share_of(elapsed, learned_for, SCALE_TIME) * (changes / both - scale)
         scale = min(max(scale, MIN_SCALE), MAX_SCALE)
@@ -225,60 +226,3 @@ def interpolate_to_nodes(values: Vector, nodes: int, result: Vector) -> None:
         low = int(min(max(np.floor(at), 0.0), windows - 2.0))
         part = min(max(at - low, 0.0), 1.0)
         result[i] = np.exp((1.0 - part) * np.log(values[low]) + part * np.log(values[low + 1]))
-
-
-class NoiseModel:
-    """What is learned of process noise and measurement noise.
-
-    Args:
-        time_constant: over which the process noise is learned [s].
-
-    Attributes:
-        bank: filters of the windows.
-        scale: of the points' variance over what the camera says.
-        ratio: of squared innovations over what is expected.
-        intensity: of the process noise at the last measurement, shape (w,) [m^2/s].
-    """
-
-    def __init__(self, time_constant: float) -> None:
-        self.bank = NoiseBank.of(WINDOWS)
-        self.scale, self.ratio = 1.0, 1.0
-        self.intensity = self.bank.intensity.copy()
-        self._time_constant, self._learned_for = time_constant, 0.0
-        self._last_mean, self._last_variance = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)
-
-    def copied(self, time_constant: float | None = None) -> NoiseModel:
-        """Return a copy, that learns over another time if one is given [s]."""
-        other = copy.copy(self)
-        other.bank, other.intensity = self.bank.copied(), self.intensity.copy()
-        other._time_constant = self._time_constant if time_constant is None else time_constant
-        return other
-
-    def learn(self, sums: WindowSums, unit: float, elapsed: float) -> Innovations:
-        """Test the innovations of a frame, and learn from them.
-
-        Args:
-            sums: of the windows.
-            unit: D [m].
-            elapsed: since the last measurement [s].
-        """
-        mean, variance, expected = (np.empty(WINDOWS) for _ in range(3))
-        self.scale, self.ratio = match_innovations(
-            sums,
-            unit,
-            self.scale,
-            self.ratio,
-            elapsed,
-            self._learned_for,
-            self._last_mean,
-            self._last_variance,
-            mean,
-            variance,
-            expected,
-        )
-        self._last_mean, self._last_variance = mean, variance
-        learn(self.bank, GRID, mean, sums.own * unit**2, elapsed, self._time_constant)
-        # Where the bank knows of an error that the last correction left, the noise was too low: as if it came at once.
-        intensity_with_excess(self.bank, mean, max(elapsed, MIN_INTERVAL), self.intensity)
-        self._learned_for += elapsed
-        return Innovations(mean, expected)

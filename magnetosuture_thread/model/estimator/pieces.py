@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +12,9 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.association import (
     Vector,
-    clean_path,
     project,
+    read_piece,
     search_start,
-    usable_points,
 )
 from magnetosuture_thread.model.estimator.correction import MeasuredPoints
 from magnetosuture_thread.model.estimator.options import EstimatorOptions
@@ -26,6 +26,7 @@ MAX_COORDINATE = 10.0  # m
 DETOUR = 8.0  # standard deviations that noise may lengthen the path by at a point
 STEP = 20.0  # standard deviations; steps of a path over which its length is measured
 WHOLE = 0.05  # of the length, by which a piece from the tail to the free end may differ and still be the thread
+WHOLE_ENDS = ((PieceEnd.TAIL, PieceEnd.FREE), (PieceEnd.FREE, PieceEnd.TAIL))
 LENGTH_ERROR = 0.005  # of the length, by which a thread is known to be longer or shorter than told
 GATE = 4.0  # standard deviations; a piece of unknown arc length that is farther from the prior is another thread's
 OVERLAP = 0.5  # of a piece; if so much of it lies where another one does already, it is that one again or not ours
@@ -58,11 +59,9 @@ class PlacedPiece:
     free_end: bool
     square: float
 
-    def projected(self, nodes: Points) -> tuple[Vector, Vector]:
-        """Return arc length and innovation of each point on a thread, nan where it lies beyond an end."""
-        place, innovation = np.full(len(self.points), np.nan), np.zeros(len(self.points))
-        project(nodes, self.points, self.arcs, self.start, self.slack, place, innovation)
-        return place, innovation
+    def projected(self, nodes: Points) -> tuple[Vector, Vector, int]:
+        """Return what `project` makes of its points on a thread."""
+        return project(nodes, self.points, self.arcs, self.start, self.slack)
 
 
 def place_pieces(
@@ -85,18 +84,20 @@ def place_pieces(
     """
     segments = len(nodes) - 1
     covered = np.zeros(segments, dtype=np.bool_)
-    placed = []
+    placed: list[PlacedPiece] = []
     if len(observation.pieces) > MAX_PIECES:
         problems.append(f"{len(observation.pieces)} pieces, more than {MAX_PIECES}; the others are ignored")
     # What is known to be where it is comes first, whatever the order in which it was given.
-    order = sorted(observation.pieces[:MAX_PIECES], key=lambda piece: (*_rank(piece), _first_arc(piece)))
+    order: Sequence[ThreadPiece] = observation.pieces
+    if len(order) > 1:
+        order = sorted(order[:MAX_PIECES], key=lambda piece: (*_rank(piece), _first_arc(piece)))
     for piece in order:
         found = _place(piece, nodes, variance, unit, options)
         if isinstance(found, str):
             problems.append(found)
             continue
         low, high = max(int(found.start), 0), min(math.ceil(found.start + found.arcs[-1]), segments)
-        if high > low and np.count_nonzero(covered[low:high]) > OVERLAP * (high - low):
+        if placed and high > low and np.count_nonzero(covered[low:high]) > OVERLAP * (high - low):
             problems.append("a piece lies where another one shows the thread already")
             continue
         covered[low:high] = True
@@ -124,13 +125,19 @@ def _place(
     deviation = np.ascontiguousarray(piece.deviation, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
         return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
-    max_points = MAX_POINTS * segments
-    points, deviation, finite = usable_points(
-        points, deviation, MAX_COORDINATE, options.min_deviation, unit, max_points
+    points, squares, arcs, share, mean, finite = read_piece(
+        points,
+        deviation,
+        MAX_COORDINATE,
+        options.min_deviation,
+        unit,
+        MAX_POINTS * segments,
+        DETOUR,
+        STEP,
+        options.point_correlation / unit,
     )
     if finite < FRESH_POINTS:
         return "a piece has fewer than two finite points"
-    points, deviation, arcs, share = clean_path(points, deviation, DETOUR, STEP, options.point_correlation / unit)
     if len(points) < FRESH_POINTS:
         return "a piece has fewer than two points on a path"
     if not arcs[-1] > 0.0:
@@ -138,7 +145,7 @@ def _place(
     if arcs[-1] * (1.0 - WHOLE) > segments:
         return f"a piece {arcs[-1] * unit * 1e3:.1f} mm long, longer than the thread"
     ends = (piece.first_end, piece.last_end)
-    if set(ends) == {PieceEnd.TAIL, PieceEnd.FREE} and abs(arcs[-1] / segments - 1.0) < WHOLE:
+    if ends in WHOLE_ENDS and abs(arcs[-1] / segments - 1.0) < WHOLE:
         arcs *= segments / arcs[-1]
     low, high = (value / unit for value in piece.arc_length)
     attached = piece.first_end is PieceEnd.TAIL
@@ -156,13 +163,13 @@ def _place(
             best, turned = other, True
     if turned:
         points, arcs = np.ascontiguousarray(points[::-1]), np.ascontiguousarray(arcs[-1] - arcs[::-1])
-        deviation, share, ends = deviation[::-1], share[::-1], ends[::-1]
+        squares, share, ends = np.ascontiguousarray(squares[::-1]), np.ascontiguousarray(share[::-1]), ends[::-1]
     # A place that was searched for is as good as the prior lets it be.
-    slack = 2.0 * float(deviation.mean()) + (0.25 if high > low else 0.0)
+    slack = 2.0 * mean + (0.25 if high > low else 0.0)
     found = PlacedPiece(
         points,
-        np.ascontiguousarray(deviation**2),
-        np.ascontiguousarray(share),
+        squares,
+        share,
         arcs,
         best[0],
         slack,
@@ -177,7 +184,7 @@ def _place(
 
 def _not_ours(piece: PlacedPiece, nodes: Points, variance: Vector) -> str:
     """Return why a piece of unknown arc length cannot be of this thread, or nothing."""
-    place, innovation = piece.projected(nodes)
+    place, innovation, _ = piece.projected(nodes)
     on = np.isfinite(place)
     if on.sum() < max(FRESH_POINTS, 0.5 * len(place)):
         return "a piece lies beyond the thread's ends"
@@ -238,7 +245,11 @@ def measured_points(
     """
     found = []
     for piece in placed:
-        place, innovation = piece.projected(nodes)
+        place, innovation, count = piece.projected(nodes)
+        variance = scale * piece.variance
+        if count == len(place) and not len(workspace.shapes):
+            found.append((place, innovation, variance, piece.share))
+            continue
         good = np.isfinite(place)
         if len(workspace.shapes) and (far := good & (np.abs(innovation) > 0.5)).any():
             at = np.minimum(place[far].astype(np.int64), len(nodes) - 2)
@@ -249,9 +260,9 @@ def measured_points(
                 problems.append(f"{int(parted.sum())} points lie beyond an obstacle")
                 good[np.flatnonzero(far)[parted]] = False
         if good.all():
-            found.append((place, innovation, scale * piece.variance, piece.share))
+            found.append((place, innovation, variance, piece.share))
         elif good.any():
-            found.append((place[good], innovation[good], scale * piece.variance[good], piece.share[good]))
+            found.append((place[good], innovation[good], variance[good], piece.share[good]))
     if not found:
         return None
     if len(found) == 1:

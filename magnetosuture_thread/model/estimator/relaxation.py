@@ -70,10 +70,10 @@ def relax(amount: float, clamped: bool, slope: Vector, displacement: Points) -> 
 
 
 @compiled
-def significances(
-    displacement: Points, normals: Points, variance: Vector, response: Points, deviations: Vector, result: Vector
-) -> None:
-    """Write how significant a displacement across the thread is in each window, against what needs no disturbance.
+def add_displacement(
+    displacement: Points, moved: Points, normals: Points, variance: Vector, response: Points, deviations: Vector
+) -> float:
+    """Add to a displacement; return how significant it is in its worst window, against what needs no disturbance.
 
         z = |mean displacement| / (2 r + sum_j (g_j s_j)^2)^(1/2)
 
@@ -81,14 +81,15 @@ def significances(
     the points alone, r; and g_j s_j are what errors of the needle's pose displace it by.
 
     Args:
-        displacement: shape (n + 1, 2).
+        displacement: shape (n + 1, 2); written.
+        moved: what is added, shape (n + 1, 2).
         normals: of the nodes, shape (n + 1, 2).
         variance: r of the mean of a window's points, inf where nothing is measured, shape (w,).
         response: g, displacement of each node across the thread by each error of the pose, shape (n + 1, p).
         deviations: s, standard deviation of each error of the pose, shape (p,).
-        result: z, written, shape (w,).
     """
-    windows, nodes = len(variance), len(displacement)
+    windows, nodes, largest = len(variance), len(displacement), 0.0
+    displacement += moved
     explained = np.empty(len(deviations))
     for w in range(windows):
         total, count = 0.0, 0
@@ -102,9 +103,9 @@ def significances(
                 count += 1
                 for j in range(len(deviations)):
                     explained[j] += response[i, j] * deviations[j]
-        result[w] = 0.0
         if count > 0 and np.isfinite(variance[w]):
             expected = 2.0 * variance[w]
             for j in range(len(deviations)):
                 expected += (explained[j] / count) ** 2
-            result[w] = abs(total) / count / np.sqrt(expected)
+            largest = max(largest, abs(total) / count / np.sqrt(expected))
+    return largest

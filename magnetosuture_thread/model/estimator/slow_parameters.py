@@ -78,6 +78,16 @@ class SlowParameter:
     high: float
     excited: bool
 
+    def __str__(self) -> str:
+        """Return value and interval in words.
+
+        >>> str(SlowParameter("drag_anisotropy", "", 0.512, 0.47, 0.55, False))
+        '0.512, 95 % in 0.47 to 0.55, frozen: not excited'
+        """
+        value = f"{self.value:.3g} {self.unit}".strip()
+        frozen = "" if self.excited else ", frozen: not excited"
+        return f"{value}, 95 % in {self.low:.3g} to {self.high:.3g}{frozen}"
+
 
 @dataclass(frozen=True)
 class LearnedState:

@@ -57,3 +57,30 @@ def test_a_pose_that_is_a_little_off_is_no_disturbance(material: str, attachment
         estimate = estimator.start(measured, truth[0]) if k == 0 else estimator.step(measured, seen)
         found += estimate.disturbances
     assert not found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bent_thread_that_is_held_is_estimated_where_it_is_and_the_hold_is_reported(seed: int) -> None:
+    """As in `hernia_ring` before the first current: left alone the thread would straighten, and the model's does."""
+    pinned = Attachment.PINNED
+    thread = Thread.of(MATERIALS["silk_6_0"], length=0.05, segments=40, attachment=pinned, viscosity=0.3)
+    turn = np.cumsum(np.full(40, 60.0 * thread.segment_length))
+    along = -thread.segment_length * np.column_stack([np.cos(turn), np.sin(turn)])
+    held = np.vstack([np.zeros(2), np.cumsum(along, axis=0)])
+    estimator, alone = ThreadEstimator(ThreadPredictor(thread)), ThreadPredictor(thread)
+    way = [NeedlePose(k / RATE, np.zeros(2), np.array([1.0, 0.0])) for k in range(round(4.0 * RATE))]
+    alone.start_at(way[0], held)
+    shown = [
+        ThreadObservation((piece_of(held, 1000 * seed + k, end=thread.length),), complete=True) for k in range(len(way))
+    ]
+    estimator.start_observed(way[0], shown[0])
+    reported = []
+    for k, pose in enumerate(way[1:], 1):
+        estimate, predicted = estimator.step(pose, shown[k]), alone.step(pose).positions
+        off = np.linalg.norm(estimate.positions - held, axis=1) / thread.length
+        assert off.mean() < 1e-3
+        assert off.max() < 3e-3
+        reported.append(bool(estimate.disturbances))
+    assert np.linalg.norm(predicted - held, axis=1).max() > 0.05 * thread.length
+    assert any(reported[: round(0.5 * RATE)])
+    assert all(reported[round(RATE) :])

@@ -228,3 +228,15 @@ def test_what_the_estimator_cannot_correct_is_refused() -> None:
         ThreadEstimator(ThreadPredictor(thread_of(), Workspace((), 5e-3, dimension=3)))
     with pytest.raises(ConfigurationError, match="noise_time"):
         EstimatorOptions(noise_time=0.0)
+
+
+def test_a_given_shape_that_the_first_frame_contradicts_is_given_up_without_a_report() -> None:
+    way = poses(40)
+    truth = true_shapes(thread_of(), way)
+    estimator = estimator_of(thread_of())
+    wrong = truth[0] + np.column_stack([np.zeros(26), 0.2 * LENGTH * np.linspace(0.0, 1.0, 26)])
+    estimator.start(way[0], wrong)
+    for k, pose in enumerate(way[1:], 1):
+        estimate = estimator.step(pose, whole(truth[k], k))
+        assert error_percent(estimate.positions, truth[k]) < 0.3
+        assert not estimate.disturbances
