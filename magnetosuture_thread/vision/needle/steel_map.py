@@ -17,6 +17,7 @@ GLARE, GLARE_REACH_PX = (
     0.07,
     4,
 )  # of the floor's brightness, that the lamp's reflection is brighter by; looked for so near
+LINE_WAYS = 16  # directions of lines along which gaps are filled
 SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
 
 
@@ -56,6 +57,20 @@ class SteelMap:
         return replace(
             self, surely=surely, perhaps=perhaps, hidden=hidden if self.hidden is None else self.hidden | hidden
         )
+
+    def bridged(self, coloured: NDArray[np.bool_], gap_px: float) -> SteelMap:
+        """Return the map with steel below what is coloured wherever there is steel on both of its sides.
+
+        An opaque line across a needle, as a program draws it into frames, cuts the needle in two. Below it is what
+        `closed_along_lines` fills; elsewhere below it anything may be.
+
+        Args:
+            coloured: where the image has a colour that neither steel nor floor has, shape (rows, columns).
+            gap_px: greatest length of such a gap along a needle [px].
+        """
+        closed = np.asarray(closed_along_lines(self.surely, gap_px), dtype=np.float32)
+        perhaps = np.where(coloured, np.float32(1.0), self.perhaps)
+        return replace(self, surely=np.where(coloured, closed, self.surely), perhaps=perhaps)
 
     def share_hidden(self, points: np.ndarray) -> float:
         """Return which share of some points, in the map's own pixels, is hidden."""
@@ -111,6 +126,22 @@ class SteelMap:
         pixels = np.ascontiguousarray(darkest.pixels[box])
         light = np.asarray(cv2.blur(-dark, (LIGHT_PX, LIGHT_PX)), dtype=np.float32)
         return SteelMap(surely, perhaps, dark, depth, light, pixels, (float(left), float(top)), (columns, rows))
+
+
+def closed_along_lines(dark: np.ndarray, gap_px: float) -> np.ndarray:
+    """Return an image in which gaps between bright parts are filled up to a length, in any direction.
+
+    It is the greatest of the closings by straight lines: unlike that by a disc it fills a gap between two narrow ends
+    in all of their width.
+    """
+    reach = int(0.5 * gap_px) + 1
+    result = dark
+    for way in np.arange(LINE_WAYS) * np.pi / LINE_WAYS:
+        line = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
+        end = round(reach * np.cos(way)), round(reach * np.sin(way))
+        cv2.line(line, (reach - end[0], reach - end[1]), (reach + end[0], reach + end[1]), 1)
+        result = cv2.max(result, cv2.morphologyEx(dark, cv2.MORPH_CLOSE, line))
+    return np.asarray(result)
 
 
 def _darkness(channel: Layer, box: tuple[slice, slice], factor: int, wall: Wall) -> NDArray[np.float32]:
