@@ -10,7 +10,7 @@ from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall
 from magnetosuture_thread.vision.needle.measure import measure_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
-from magnetosuture_thread.vision.needle.steel_map import SteelMap, closed_along_lines
+from magnetosuture_thread.vision.needle.steel_map import COLOURED, SteelMap, closed_along_lines
 from magnetosuture_thread.vision.sampling import middle, straighten
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
@@ -26,7 +26,7 @@ BEYOND_PX, BEYOND_ROWS = 14.0, 3  # beyond an end, that is looked at, and rows o
 OTHER = 0.03  # of the floor's brightness, that an opaque line is paler or more coloured
 RIM_REACH_PX = 5.0  # off the wall, from which its rim is not mixed in
 BODY, STEEL = 0.3, 0.75  # of the body's width, to both sides, that is dark there; of its darkness, at least
-COLOURED, COLOUR_EDGE_PX = 0.1, 1  # share of the floor's light by which colours differ in a line, and its blurred edge
+COLOUR_EDGE_PX = 1  # of a coloured line, whose colour is mixed with others
 MAX_GAP = 4.0  # times the needle's width, that an opaque line hides along it
 MAX_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
