@@ -14,9 +14,13 @@ import yaml
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.parameter_files import EVERY_NODE
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
+from magnetosuture_thread.vision.needle.size import FRAMES, SET_TOLERANCE
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import VisionTracker
 
 MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, they are not where they should be
 STRAIGHT_RATIO = (
@@ -40,6 +44,7 @@ class Calibration:
         scatter_px: root of the mean square by which the frames differ from one another [px].
         dish_diameter: inner diameter of the dish [m].
         homography: from a tilted camera's frame to the one in which the view holds, shape (3, 3); None if straight.
+        needle_length: measured [m]; None if it was not asked for. See `measure_needle_length`.
     """
 
     view: DishView
@@ -48,9 +53,10 @@ class Calibration:
     scatter_px: float
     dish_diameter: float
     homography: np.ndarray | None = None
+    needle_length: float | None = None
 
     def to_yaml(self) -> str:
-        """Return a section of a ROS 2 parameter file for the vision tracker."""
+        """Return a section of a ROS 2 parameter file for the vision tracker, and the needle's length for every node."""
         values: dict[str, Any] = {
             "dish_centre_px": [round(float(value), 3) for value in self.view.centre_px],
             "metres_per_pixel": float(f"{self.view.metres_per_pixel:.7g}"),
@@ -58,8 +64,42 @@ class Calibration:
         }
         if self.homography is not None:
             values["straightening"] = [float(f"{value:.12g}") for value in self.homography.ravel()]
-        key = f"{EVERY_NODE}/{VisionTrackerSettings.GROUP}"
-        return yaml.safe_dump({key: {"ros__parameters": values}}, sort_keys=False)
+        sections = {}
+        if self.needle_length is not None:
+            sections[EVERY_NODE] = {"ros__parameters": {"needle_length": round(self.needle_length, 6)}}
+        sections[f"{EVERY_NODE}/{VisionTrackerSettings.GROUP}"] = {"ros__parameters": values}
+        return yaml.safe_dump(sections, sort_keys=False)
+
+
+def measure_needle_length(images: Sequence[np.ndarray], calibration: Calibration, length: float, width: float) -> float:
+    """Return the needle's length as the tracker measures it over its first frames, in a calibrated view [m].
+
+    Args:
+        images: that show both ends of a needle, at least `FRAMES` of them, BGR or grey, uint8.
+        calibration: of the camera that took them.
+        length: of the needle's body, known within `SET_TOLERANCE` [m].
+        width: of it [m].
+
+    Raises:
+        InvalidInputError: too few images show a needle of about that length, or they do not agree on one.
+    """
+    settings = VisionTrackerSettings(
+        needle_length=length,
+        needle_width=width,
+        dish_centre_px=calibration.view.centre_px,
+        metres_per_pixel=calibration.view.metres_per_pixel,
+        camera_rotation=calibration.view.rotation,
+        straightening=() if calibration.homography is None else tuple(calibration.homography.ravel().tolist()),
+        confirm_frames=1,
+    )
+    tracker = VisionTracker(settings, Scene(dish=Dish(calibration.dish_diameter)))
+    apart = 2.0 * settings.forget_after  # Frames of a calibration may be of any time: the needle is found anew in each.
+    for index, image in enumerate(images):
+        found = tracker.track(image, apart * index).needle_length
+        if found is not None:
+            return found
+    expected = f"both ends of a needle of {1e3 * length:.3g} mm, known within {SET_TOLERANCE:.0%}, in {FRAMES} of them"
+    raise InvalidInputError("frames", f"no needle's length in {len(images)} frames", expected)
 
 
 def calibrate_by_dish(images: Sequence[np.ndarray], dish_diameter: float) -> Calibration:

@@ -12,7 +12,7 @@ import numpy as np
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.untrusted import MAX_PIXELS
 from magnetosuture_thread.vision.image_header import image_header
-from magnetosuture_thread.vision.sampling import distances, sample_inside
+from magnetosuture_thread.vision.sampling import distances, median_of_windows, sample_inside
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
@@ -114,8 +114,9 @@ def _channel(pixels: np.ndarray, factor: int, mask: SceneMask | None) -> Layer:
     rough = cv2.resize(small, cells, interpolation=cv2.INTER_AREA)
     if mask is not None:
         rough = mask.show_floor(rough)
-    rough = cv2.medianBlur(rough, FLOOR_CELLS)
-    return Layer(pixels, small, cv2.resize(rough, small.shape[::-1], interpolation=cv2.INTER_LINEAR))
+    floor = np.empty_like(rough)
+    median_of_windows(np.ascontiguousarray(rough), FLOOR_CELLS // 2, floor)
+    return Layer(pixels, small, cv2.resize(floor, small.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -13,8 +14,8 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.dish.ellipse import find_ellipse
-from magnetosuture_thread.vision.dish.find import Guess, find_dish
+from magnetosuture_thread.vision.dish.ellipse import circle_through, find_ellipse
+from magnetosuture_thread.vision.dish.find import Guess, find_cut_dish, find_dish
 from magnetosuture_thread.vision.dish.tilt import MIN_ANGLE, Tilt, find_tilt, tilt_of, unseen_tilt_covariance
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
@@ -36,6 +37,7 @@ SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the
 ELLIPSE_ERROR = 0.01  # of a scale by an edge of the wall in a photograph: which one it is, and where light moves it
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
 MAX_SCALE_SLACK = 0.1  # the same, beyond which it is another dish; between, the dish's own size gives the scale
+MAX_TILT = math.radians(10.0)  # of a camera over a dish that is seen in part, and looks tilted
 DARK_ELLIPSE = 64.0  # grey levels; a floor whose median is below is dark: steel is no darker
 
 
@@ -202,20 +204,21 @@ def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: 
     ellipse = find_ellipse(image)
     if ellipse is None:
         return None
-    given = _with_given(DishView(ellipse.centre_px, 0.5 * diameter / ellipse.major), settings)
-    if given is None:
+    gray, found = measured_channel(image), DishView(ellipse.centre_px, 0.5 * diameter / ellipse.major)
+    tilt, unseen_tilt = tilt_of(ellipse, settings.camera_rotation), MIN_ANGLE
+    if tilt is not None and ellipse.is_cut(image.shape):  # The part that is seen does not determine a tilt.
+        cut = find_cut_dish(gray, circle_through(image, ellipse), diameter)
+        if cut is None:
+            return None
+        found, tilt, unseen_tilt = cut, None, MAX_TILT
+    if (given := _with_given(found, settings)) is None:
         return None
     view, remark = given
-    gray = measured_channel(image)
-    inside = np.zeros(gray.shape, np.uint8)
-    points, _ = ellipse.points(60)
-    cv2.fillPoly(inside, [np.round(points).astype(np.int32)], 1)
-    cut = not ((points > 0.0) & (points < np.array(gray.shape[::-1]) - 1.0)).all()
-    if cut and tilt_of(ellipse, 0.0) is not None:  # The part that is seen does not determine a tilt.
-        return None
+    outline = np.round(ellipse.points(60)[0]).astype(np.int32)
+    inside = np.asarray(cv2.fillPoly(np.zeros(gray.shape, np.uint8), [outline], 1))
     dark_field = middle(gray[::4, ::4][inside[::4, ::4] > 0]) < DARK_ELLIPSE
-    tilt = tilt_of(ellipse, view.rotation) if not settings.dish_centre_px and not settings.metres_per_pixel else None
-    return FoundDish(view, dark_field, tilt, ELLIPSE_ERROR, 0.0 if tilt is not None else MIN_ANGLE, remark)
+    tilt = None if settings.dish_centre_px or settings.metres_per_pixel else tilt
+    return FoundDish(view, dark_field, tilt, ELLIPSE_ERROR, 0.0 if tilt is not None else unseen_tilt, remark)
 
 
 def picture_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,12 @@ from benchmarks.vision.frames import tilted
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.parameter_files import load_setup
-from magnetosuture_thread.vision.calibration import CORNERS, calibrate_by_dish, calibrate_by_markers
+from magnetosuture_thread.vision.calibration import (
+    CORNERS,
+    calibrate_by_dish,
+    calibrate_by_markers,
+    measure_needle_length,
+)
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -113,6 +119,22 @@ def test_what_is_written_is_a_set_up(tmp_path: Path):
     np.testing.assert_allclose(read.centre_px, found.view.centre_px, atol=1e-3)
     assert read.metres_per_pixel == pytest.approx(found.view.metres_per_pixel, rel=1e-6)
     assert read.rotation == pytest.approx(found.view.rotation, abs=1e-6)
+
+
+@pytest.mark.parametrize("share", [0.93, 1.07])
+def test_the_needles_length_is_measured_over_frames_and_written_for_every_node(share: float, tmp_path: Path):
+    poses = [Pose(np.array([-0.004 + 0.0008 * index, 0.003 - 0.0006 * index]), 0.5 * index) for index in range(10)]
+    images = [render(pose) for pose in poses]
+    found = calibrate_by_dish(images, 0.035)
+    length = measure_needle_length(images, found, share * 0.007, 0.0004)
+    assert length == pytest.approx(0.007, rel=0.01)
+    file = tmp_path / "camera.yaml"
+    file.write_text(replace(found, needle_length=length).to_yaml())
+    assert load_setup(file, (VisionTrackerSettings,))["vision_tracker"].needle_length == pytest.approx(length, abs=1e-6)
+    with pytest.raises(InvalidInputError, match="both ends of a needle of 9 mm"):
+        measure_needle_length(images, found, 0.009, 0.0004)
+    with pytest.raises(InvalidInputError, match="no needle's length in 5 frames"):
+        measure_needle_length(images[:5], found, 0.007, 0.0004)
 
 
 @pytest.mark.parametrize("degrees", [5.0, 10.0, 20.0])

@@ -113,6 +113,20 @@ def test_needles_of_other_lengths_and_bends_are_measured(name: str):
     assert row(name).found - row(name).unknown >= FRAMES - 1
 
 
+def test_a_rod_below_a_coloured_line_is_found_and_its_heading_unknown():
+    """The line that a program draws cuts it in two; no thread tells its tail."""
+    rods = row("rod_in_path")
+    assert rods.found >= FRAMES - 1
+    assert (rods.unknown, rods.wrong, rods.dishonest) == (rods.found, 0, 0)
+
+
+def test_of_a_dish_that_the_frame_cuts_off_needle_and_thread_are_where_they_are():
+    cut = row("cut_dish_far")
+    assert cut.found >= FRAMES // 2
+    assert (cut.wrong, cut.unknown, cut.dishonest) == (0, 0, 0)
+    assert (cut.tail_px or 0.0) < 0.6
+
+
 def test_of_two_needles_the_one_that_a_thread_leaves_is_taken():
     assert row("second_needle").found >= FRAMES - 1
     assert row("second_needle").wrong == 0

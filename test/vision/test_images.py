@@ -12,6 +12,7 @@ import pytest
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.vision.image_header import ImageHeader, image_header
 from magnetosuture_thread.vision.images import decode_image, glare_mask, prepare, unpack_image
+from magnetosuture_thread.vision.sampling import median_of_windows
 
 
 def test_bytes_that_are_no_image_are_refused():
@@ -98,3 +99,12 @@ def test_pixels_are_read_as_they_are_stored_whatever_the_orientation(orientation
     turned = oriented_jpeg(image, orientation)
     assert image_header(turned) == ImageHeader(64, 48, orientation)
     assert (decode_image(turned) == decode_image(cv2.imencode(".jpg", image)[1])).all()
+
+
+@pytest.mark.parametrize("shape", [(60, 80), (9, 5), (2, 2)])
+@pytest.mark.parametrize("greatest", [255, 3])
+def test_median_of_windows_is_opencvs(shape: tuple[int, int], greatest: int):
+    image = np.random.default_rng(5).integers(0, greatest, shape, np.uint8, endpoint=True)
+    result = np.empty_like(image)
+    median_of_windows(image, 4, result)
+    np.testing.assert_array_equal(result, cv2.medianBlur(image, 9))

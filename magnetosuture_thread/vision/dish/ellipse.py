@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.vision.dish.edges import fit_harmonics, ring_support, steepest, thin_edges, vote
+from magnetosuture_thread.vision.dish.robust_fits import fit_circle
 from magnetosuture_thread.vision.images import measured_channel
 
 COARSE_SIDE = 160  # rows or columns, whichever are fewer, of the image in which ellipses are looked for
@@ -66,6 +67,11 @@ class Ellipse:
         normals = circle * (self.major, self.minor) @ axes
         return points, normals / np.hypot(*normals.T)[:, None]
 
+    def is_cut(self, shape: tuple[int, ...]) -> bool:
+        """Say whether a part of it lies outside of an image of a shape (rows, columns)."""
+        points, _ = self.points(60)
+        return not ((points > 0.0) & (points < np.array(shape[1::-1]) - 1.0)).all()
+
     def scaled(self, factor: float) -> Ellipse:
         """Return the ellipse in an image enlarged by a factor."""
         shift = 0.5 * (factor - 1.0)
@@ -111,6 +117,22 @@ def find_ellipse(image: np.ndarray) -> Ellipse | None:
     inner = _innermost(edges, small.shape[:2], best[1])
     scaled = image.shape[1] / small.shape[1]
     return _refined(image, inner.scaled(scaled))
+
+
+def circle_through(image: np.ndarray, cut: Ellipse) -> tuple[float, float, float] | None:
+    """Return u, v and radius of the circle that most of an ellipse's edge lies on [px]; None if there is none.
+
+    A part of an ellipse does not determine its axes: an edge that is off by a pixel looks like a tilt.
+
+    Args:
+        image: in which the ellipse was found, uint8.
+        cut: the ellipse, a part of which the frame cuts off [px].
+    """
+    points = _edge_along(measured_channel(image), cut, FINE_REACH * cut.major)
+    circle = np.empty(3)
+    if not fit_circle(points, max(1.0, FINE_AGREEMENT * cut.major), circle):
+        return None
+    return float(circle[0]), float(circle[1]), float(circle[2])
 
 
 def _edges(image: np.ndarray) -> np.ndarray:
@@ -299,19 +321,25 @@ def _refined(image: np.ndarray, ellipse: Ellipse) -> Ellipse | None:
         gray = cv2.resize(gray[: size[1] * factor, : size[0] * factor], size, interpolation=cv2.INTER_AREA)
     at = ellipse.scaled(1.0 / factor)
     for share in (FINE_REACH, 0.5 * FINE_REACH):
-        reach = max(4.0, share * at.major)
-        points, normals = at.points(NORMALS)
-        found = np.zeros((NORMALS, 2))
-        steepest(gray, points, normals, reach, 0.5, 0, found)
-        sign = 1 if np.sum(np.sign(found[:, 1]) * np.sqrt(np.abs(found[:, 1]))) > 0.0 else -1
-        steepest(gray, points, normals, reach, 0.5, sign, found)
-        seen = np.abs(found[:, 1]) > 0.5
-        fitted = _fitted_robustly(points[seen] + found[seen, :1] * normals[seen], at)
+        points = _edge_along(gray, at, share * at.major)
+        fitted = _fitted_robustly(points, at)
         if fitted is None:
             break
         at = fitted
     at = Ellipse(at.centre_px, at.major, at.minor, at.direction, ellipse.support)
     return at.scaled(float(factor)) if at.minor > MIN_RATIO * at.major else None
+
+
+def _edge_along(gray: np.ndarray, at: Ellipse, reach: float) -> np.ndarray:
+    """Return where an image changes most along the normals of an ellipse, in the stronger sign, shape (m, 2)."""
+    reach = max(4.0, reach)
+    points, normals = at.points(NORMALS)
+    found = np.zeros((NORMALS, 2))
+    steepest(gray, points, normals, reach, 0.5, 0, found)
+    sign = 1 if np.sum(np.sign(found[:, 1]) * np.sqrt(np.abs(found[:, 1]))) > 0.0 else -1
+    steepest(gray, points, normals, reach, 0.5, sign, found)
+    seen = np.abs(found[:, 1]) > 0.5
+    return np.asarray(points[seen] + found[seen, :1] * normals[seen])
 
 
 def _fitted_robustly(points: np.ndarray, begin: Ellipse) -> Ellipse | None:

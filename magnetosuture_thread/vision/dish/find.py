@@ -7,10 +7,12 @@ import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.robust_fits import fit_circle
-from magnetosuture_thread.vision.sampling import rim_along_rays
+from magnetosuture_thread.vision.sampling import middle, rim_along_rays
 
 RAYS = 180
 SHARE_OF_RAYS = 0.6  # of the rays must meet the fitted circle
+SHARE_OF_CUT_RAYS, MIN_INSIDE = 0.75, 0.4  # of the rays in the frame, where the dish is cut off; that these are of all
+GUESS_REACH = 0.12  # of the radius, in which the rim is looked for by a first guess
 AGREEMENT_PX = 2.0
 GUESS_SIDES = (60, 120)  # the first guess is made in images of about this many rows; the second only if the first fails
 EDGE_LEVEL = 60  # of the circle transform, as of Canny's upper threshold; the lower one is half of it
@@ -54,7 +56,7 @@ def find_dish(gray: np.ndarray, diameter: float, guesses: dict[int, Guess | None
             continue
         u, v, radius = guess
         fitted = None
-        for reach, step in ((0.12, 1.0), (REACH, 0.5)):
+        for reach, step in ((GUESS_REACH, 1.0), (REACH, 0.5)):
             edges, darkest = _edge_points(gray, u, v, radius, reach * radius, step, RAYS)
             fitted = _fit_circle(edges, AGREEMENT_PX)
             if fitted is None:
@@ -69,6 +71,38 @@ def find_dish(gray: np.ndarray, diameter: float, guesses: dict[int, Guess | None
             continue
         return DishView((u, v), 0.5 * diameter / radius)
     return None
+
+
+def find_cut_dish(gray: np.ndarray, guess: Guess | None, diameter: float) -> DishView | None:
+    """Find a dish that the frame cuts off by what is seen of its rim: its darkest ring, and its inner edge around that.
+
+    Args:
+        gray: image, shape (rows, columns), uint8.
+        guess: a circle near it [px]; None if none is known.
+        diameter: the dish's inner diameter [m].
+
+    Returns:
+        The view, or None if too few rays agree on a circle, of those that meet it in the frame.
+    """
+    if guess is None:
+        return None
+    u, v, radius = guess
+    edges = darkest = np.empty((0, 2))
+    for reach, step in ((GUESS_REACH, 1.0), (REACH, 0.5)):
+        edges, darkest = _edge_points(gray, u, v, radius, reach * radius, step, RAYS)
+        fitted = _fit_circle(edges, AGREEMENT_PX)
+        if fitted is None:
+            return None
+        u, v, radius, _ = fitted
+    turns = 2.0 * np.pi * np.arange(RAYS) / RAYS
+    rim = np.array([u, v]) + radius * np.column_stack([np.cos(turns), np.sin(turns)])
+    inside = ((rim > 0.0) & (rim < np.array(gray.shape[::-1]) - 1.0)).all(axis=1).sum()
+    ring = _fit_circle(darkest, 0.5 * AGREEMENT_PX)
+    if ring is None or ring[3] < SHARE_OF_CUT_RAYS * inside or inside < MIN_INSIDE * RAYS:
+        return None
+    # By an edge that light shifts, a part of a circle tells its centre and its radius apart badly.
+    radius = middle(np.hypot(*(edges - ring[:2]).T))
+    return DishView((ring[0], ring[1]), 0.5 * diameter / radius)
 
 
 def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> tuple[float, int]:

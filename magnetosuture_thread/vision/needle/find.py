@@ -10,7 +10,7 @@ from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall
 from magnetosuture_thread.vision.needle.measure import measure_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
-from magnetosuture_thread.vision.needle.steel_map import SteelMap
+from magnetosuture_thread.vision.needle.steel_map import COLOURED, SteelMap, closed_along_lines
 from magnetosuture_thread.vision.sampling import middle, straighten
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
@@ -26,6 +26,8 @@ BEYOND_PX, BEYOND_ROWS = 14.0, 3  # beyond an end, that is looked at, and rows o
 OTHER = 0.03  # of the floor's brightness, that an opaque line is paler or more coloured
 RIM_REACH_PX = 5.0  # off the wall, from which its rim is not mixed in
 BODY, STEEL = 0.3, 0.75  # of the body's width, to both sides, that is dark there; of its darkness, at least
+COLOUR_EDGE_PX = 1  # of a coloured line, whose colour is mixed with others
+MAX_GAP = 4.0  # times the needle's width, that an opaque line hides along it
 MAX_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
 
@@ -57,6 +59,9 @@ def find_needles(
         # What of a dark shape the tolerance leaves may have grown together with the needle, or the wall is beside it.
         needles, again = _measured(picture, view, dish_radius, size, toward, tight=True)
         refused = [reason for reason in refused if reason != AT_WALL] or again or refused
+    if not needles and refused and picture.darkest is not picture.brightest:
+        # A program may have drawn an opaque line across it.
+        needles, _ = _measured(picture, view, dish_radius, size, toward, bridged=True)
     return needles, refused
 
 
@@ -68,8 +73,12 @@ def _measured(
     toward: np.ndarray | None,
     *,
     tight: bool = False,
+    bridged: bool = False,
 ) -> tuple[list[MeasuredNeedle], list[str]]:
-    """Find the needles of a size, shapes and wall cut out up to their very outlines if `tight`."""
+    """Find the needles of a size, shapes and wall cut out up to their very outlines if `tight`.
+
+    If `bridged`, what a coloured line cuts in two is one; see `SteelMap.bridged`.
+    """
     radius = dish_radius / view.metres_per_pixel
     radius = radius - RIM_PX if tight else INSIDE * radius
     wall = Wall(view.centre_px, radius)
@@ -77,7 +86,8 @@ def _measured(
     needles: list[MeasuredNeedle] = []
     refused: list[str] = []
     mask, factor = picture.mask, picture.factor
-    candidates = _dark_components(picture, view, radius, size.length_px * size.width_px, tight)
+    gap = MAX_GAP * size.width_px if bridged else 0.0
+    candidates = _dark_components(picture, view, radius, size.length_px * size.width_px, tight, gap)
     if len(candidates) > MAX_CANDIDATES:
         return [], [f"{len(candidates)} dark things"]
     for points in candidates:
@@ -88,6 +98,8 @@ def _measured(
         near = mask is not None and mask.deepest(low, high) > 0.0
 
         steel = SteelMap.around(points, picture.brightest, picture.darkest, factor, wall)
+        if bridged:
+            steel = steel.bridged(_coloured(picture, steel.box), gap)
         if mask is not None and near:
             steel = steel.hidden_where(mask.depth[steel.box] > (0.0 if tight else mask.tolerance_px))
         if tight:
@@ -104,8 +116,25 @@ def _measured(
     return needles, refused
 
 
-def _dark_components(picture: Picture, view: DishView, radius_px: float, area: float, tight: bool) -> list[np.ndarray]:
-    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2)."""
+def _coloured(picture: Picture, box: tuple[slice, slice]) -> np.ndarray:
+    """Return where a part of a picture is of a colour that neither floor nor steel has, with a line's blurred edge."""
+    differs = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.float32)
+    factor, shape = picture.factor, differs.shape
+    for layer, sign in ((picture.brightest, 1.0), (picture.darkest, -1.0)):
+        rows, columns = (slice(side.start // factor, -(-side.stop // factor)) for side in box)
+        floor = cv2.resize(layer.floor[rows, columns], shape[::-1], interpolation=cv2.INTER_LINEAR)
+        differs += sign * layer.pixels[box] / np.maximum(floor, 1)
+    line = cv2.compare(differs, COLOURED, cv2.CMP_GT)
+    return cv2.dilate(line, np.ones((3, 3), np.uint8), iterations=COLOUR_EDGE_PX) > 0
+
+
+def _dark_components(
+    picture: Picture, view: DishView, radius_px: float, area: float, tight: bool, gap_px: float
+) -> list[np.ndarray]:
+    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2).
+
+    Parts of it may be apart by a coloured line, up to `gap_px`.
+    """
     factor = picture.factor
     shift = 0.5 * (factor - 1)
     u, v = ((c - shift) / factor for c in view.centre_px)
@@ -117,6 +146,12 @@ def _dark_components(picture: Picture, view: DishView, radius_px: float, area: f
     )
     if dark is None or dark.size == 0:
         return []
+    if gap_px:
+        closed = closed_along_lines(dark, gap_px / factor)
+        rows, columns = picture.brightest.pixels.shape
+        line = _coloured(picture, (slice(0, rows), slice(0, columns))).astype(np.uint8)
+        small = cv2.resize(line, picture.brightest.small.shape[::-1], interpolation=cv2.INTER_NEAREST)[window]
+        dark = cv2.bitwise_or(dark, cv2.bitwise_and(closed, 255 * small))
     mask = np.zeros(dark.shape, np.uint8)
     cv2.circle(mask, (round((u - left) * 16), round((v - top) * 16)), round(radius * 16), 255, -1, cv2.LINE_8, 4)
     if picture.mask is not None:

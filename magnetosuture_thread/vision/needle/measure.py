@@ -142,6 +142,9 @@ def _checked(
         if settled is None:
             return ALIKE
         fit, is_known = settled
+    if steel.is_bridged:  # What lies over it may hide the shape of an end, or look like a thread that leaves one.
+        is_known = toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD
+        fit = _pointing(fit, toward) if toward is not None and is_known else fit
     reason = _what_prolongs(steel, fit, width, is_known)
     if reason:
         return reason
@@ -256,9 +259,9 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
 
 
 def _bluntness(steel: SteelMap, arc: Arc, length: float, width: float) -> tuple[float, float]:
-    """Return how blunt tail and tip may be, steel below a coloured thread counted as steel; see `bluntness`."""
+    """Return how blunt tail and tip may be, what is below something coloured counted as steel; see `bluntness`."""
     result = np.empty((2, 2))
-    bluntness(steel.perhaps, _state(arc, width), length, 0.5 * width, result)
+    bluntness(steel.below, _state(arc, width), length, 0.5 * width, result)
     return float(result[0].min()), float(result[1].min())
 
 
@@ -322,7 +325,7 @@ def _settled(
     blunt = np.empty((2, 2))
     bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
     bound = PASSES * rod.width + PASSES_PX
-    is_pointed = rod.cost > CLEARLY * fit.cost  # else it may be a rod that something beside it makes look so
+    is_pointed = _is_pointed(steel, fit, rod)
     for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
         here, there = offsets[end], offsets[1 - end]
         leaves = is_rod and there is None and here is not None and here < bound
@@ -332,6 +335,16 @@ def _settled(
     if toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD:
         return _pointing(fit, toward), True
     return fit, False
+
+
+def _is_pointed(steel: SteelMap, fit: TemplateFit, rod: TemplateFit) -> bool:
+    """Say whether a needle is no rod that something beside or over it makes look pointed, however pale that is."""
+    if rod.cost <= CLEARLY * fit.cost:
+        return False
+    shown = replace(steel, perhaps=steel.below)
+    pointed = fit_template(shown, fit.arc, fit.length, fit.width, rounds=FIRST_ROUNDS)
+    blunt = fit_template(shown, rod.arc, rod.length, rod.width, rod=True, rounds=FIRST_ROUNDS)
+    return blunt.cost > CLEARLY * pointed.cost
 
 
 def _pointing(fit: TemplateFit, toward: np.ndarray) -> TemplateFit:

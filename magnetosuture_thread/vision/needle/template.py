@@ -15,7 +15,7 @@ import numpy as np
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.steel_map import SHADOW, STEEL, SteelMap
-from magnetosuture_thread.vision.sampling import straighten
+from magnetosuture_thread.vision.sampling import straighten, straighten_both
 
 TAPER = 0.2  # of the length, towards the tip
 BLUR_PX = 1.03  # of an edge, lens and sensor together
@@ -28,6 +28,7 @@ BLOOM_PX = 0.22  # that shadow and lens let an edge seem to lie outside of where
 WIDTH_SLACK_PX, WIDTH_SLACK = 0.2, 0.03  # standard deviation of the body's width, and share of it
 MAX_STEP_PX, LAST_STEP_PX = 1.5, 0.02  # of a round; after a smaller one the fit is done
 FIRST_ROUNDS = 4  # that tell which of several fits is worth more
+ROUND_GAIN = 1.5  # by which each of these may lower the cost of a fit that begins at the axis of another
 PULL = 3.5  # times the variance by noise alone, as a thread beside the needle pulls all rows to one side
 DAMPING = 0.05  # of places along and aside, that of all others accordingly
 PARAMETERS = 6
@@ -199,31 +200,6 @@ def _draw_with_slopes(along, aside, length, half, bloom, thin, drawn, wider, lon
 
 
 @compiled
-def _sample_both(surely, perhaps, state, along, aside, least, most):
-    """Fill in two images along and aside of the arc that a state begins with; see `straighten`."""
-    u, v, angle, curvature = state[0], state[1], state[2], state[3]
-    rows, columns = surely.shape
-    for index in range(len(along)):
-        s = along[index]
-        half = 0.5 * curvature * s
-        chord = s if abs(half) < 1e-9 else s * math.sin(half) / half
-        x, y = u + chord * math.cos(angle + half), v + chord * math.sin(angle + half)
-        across, down = -math.sin(angle + 2.0 * half), math.cos(angle + 2.0 * half)
-        for place in range(len(aside)):
-            at_u = min(max(x + aside[place] * across, 0.0), columns - 1.001)
-            at_v = min(max(y + aside[place] * down, 0.0), rows - 1.001)
-            column, row = int(at_u), int(at_v)
-            right, below = at_u - column, at_v - row
-            left, above = 1.0 - right, 1.0 - below
-            least[index, place] = above * (left * surely[row, column] + right * surely[row, column + 1]) + below * (
-                left * surely[row + 1, column] + right * surely[row + 1, column + 1]
-            )
-            most[index, place] = above * (left * perhaps[row, column] + right * perhaps[row, column + 1]) + below * (
-                left * perhaps[row + 1, column] + right * perhaps[row + 1, column + 1]
-            )
-
-
-@compiled
 def sample_along(steel, state, along, aside, values):
     """Fill in the image along and aside of the arc that a state begins with."""
     straighten(steel, (state[0], state[1], state[2], state[3]), along, aside, values)
@@ -265,6 +241,29 @@ def _add_row(own, right, turned, bent, shape, end, rest):
 
 
 @compiled
+def _solve(normal, right, result):
+    """Solve normal equations by a Cholesky decomposition; so small a system takes LAPACK longer to begin with."""
+    size = len(right)
+    lower = np.zeros((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            total = normal[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            lower[i, j] = math.sqrt(max(total, 1e-12)) if i == j else total / lower[j, j]
+    for i in range(size):
+        total = right[i]
+        for k in range(i):
+            total -= lower[i, k] * result[k]
+        result[i] = total / lower[i, i]
+    for i in range(size - 1, -1, -1):
+        total = result[i]
+        for k in range(i + 1, size):
+            total -= lower[k, i] * result[k]
+        result[i] = total / lower[i, i]
+
+
+@compiled
 def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeless, normal):
     """Fit; `state` (u, v, angle, curvature, half width, length) is changed, `normal` filled.
 
@@ -284,7 +283,7 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
     all_least, all_most = np.empty((most_rows, columns)), np.empty((most_rows, columns))
     all_drawn, all_wider = np.empty((most_rows, columns)), np.empty((most_rows, columns))
     all_longer = np.empty((most_rows, columns))
-    right, own = np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
+    right, change, own = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
     best, best_missing, best_state, samples = np.inf, 0.0, state.copy(), 1
     prior = OTHER * OTHER / (deviations[0] * deviations[0])
     length_prior = OTHER * OTHER / (deviations[1] * deviations[1]) if free else 1.0
@@ -295,7 +294,7 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         along = np.arange(rows) - BESIDE_PX
         least, most, drawn = all_least[:rows], all_most[:rows], all_drawn[:rows]
         wider, longer = all_wider[:rows], all_longer[:rows]
-        _sample_both(surely, perhaps, state, along, aside, least, most)
+        straighten_both(surely, perhaps, (state[0], state[1], state[2], state[3]), along[0], aside, least, most)
         _draw_with_slopes(along, aside, own_length, half, bloom, thin, drawn, wider, longer)
         own[:], right[:] = 0.0, 0.0
         cost, missing = 0.0, 0.0
@@ -303,20 +302,21 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
             # Slopes along (a), aside (b), by the width (w) and by the end of the length (e).
             aa = ab = bb = aw = bw = ww = ae = be = we = ee = ra = rb = rw = re = 0.0
             for column in range(1, columns - 1):
-                seen, weight = least, 1.0
+                weight = 1.0
                 apart = least[row, column] - drawn[row, column]
                 if apart > 0.0:
                     share = 1.0 / (1.0 + apart * apart * (1.0 / OTHER**2))
                     weight = share * share
                     cost += share * apart * apart
+                    a = least[row + 1, column] - least[row - 1, column]
+                    b = least[row, column + 1] - least[row, column - 1]
                 else:
-                    seen = most
                     apart = min(most[row, column] - drawn[row, column], 0.0)
                     cost += apart * apart
                     missing -= apart
-                a = 0.5 * (seen[row + 1, column] - seen[row - 1, column])
-                b = (seen[row, column + 1] - seen[row, column - 1]) * (0.5 / STEP_PX)
-                w = -wider[row, column]
+                    a = most[row + 1, column] - most[row - 1, column]
+                    b = most[row, column + 1] - most[row, column - 1]
+                a, b, w = 0.5 * a, b * (0.5 / STEP_PX), -wider[row, column]
                 if a == 0.0 and b == 0.0 and w == 0.0:
                     continue  # as on most of the floor, and in the middle of the body
                 by_a, by_b, by_w = weight * a, weight * b, weight * w
@@ -350,9 +350,9 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
             best, best_missing, samples = cost, missing * STEP_PX, rows * columns
             best_state[:] = state
             normal[:] = own
-        if done >= FIRST_ROUNDS and best > hopeless:
+        if best > hopeless * max(1.0, ROUND_GAIN ** (FIRST_ROUNDS - done)):
             break
-        change = np.linalg.solve(own, right)
+        _solve(own, right, change)
         largest = max(abs(change[0]), abs(change[1]), abs(change[2]) * middle, abs(change[3]) * 0.5 * middle * middle)
         largest = max(largest, abs(change[5]))
         if largest > MAX_STEP_PX:

@@ -218,10 +218,10 @@ class ThreadSearch:
         What is wide keeps its contrast in a shrunk image, what is thin loses it.
         """
         contrast = None
+        factor = self._picture.factor
+        box = tuple(slice(side.start // factor, -(-side.stop // factor)) for side in self._box)
         for layer in (self._picture.darkest, self._picture.brightest):
-            small = shrunk(layer.pixels[self._box], COARSE)
-            factor = self._picture.factor
-            box = tuple(slice(side.start // factor, -(-side.stop // factor)) for side in self._box)
+            small = shrunk(layer.small[box], COARSE // factor)
             floor = cv2.resize(layer.floor[box], small.shape[::-1], interpolation=cv2.INTER_LINEAR)
             differs = cv2.absdiff(small, floor)
             contrast = differs if contrast is None else cv2.max(contrast, differs)

@@ -32,8 +32,10 @@ FORCED = 4  # steps that a walk is held to the other way
 @compiled
 def is_hidden(hidden, factor, u, v):
     """Say whether a point is hidden."""
-    c, r = int(u + 0.5) // factor, int(v + 0.5) // factor
-    if c < 0 or r < 0 or c >= hidden.shape[1] or r >= hidden.shape[0]:
+    scale = 1.0 / factor  # Dividing whole numbers for each point would take longer than all else.
+    x, y = (u + 0.5) * scale, (v + 0.5) * scale
+    c, r = int(x), int(y)
+    if x < 0.0 or y < 0.0 or c >= hidden.shape[1] or r >= hidden.shape[0]:
         return False
     return hidden[r, c] != 0
 
