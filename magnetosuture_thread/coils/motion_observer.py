@@ -13,7 +13,7 @@ from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
 
-GAIN = 4.0  # 1/s; of the velocities, well below the rate and the delay of a camera's poses
+GAIN = 8.0  # 1/s; of the velocities, well below the rate and the delay of a camera's poses
 ANGLE_GAIN = 0.3  # of the angle, for each pose
 MAX_INTERVAL = 0.2  # s; two poses farther apart say nothing of the motion between them
 MAX_SPEED = 0.006  # m/s; compensated at most

@@ -247,12 +247,13 @@ def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_no
     case, image = frame_of("distortion", 2, 31)
     lens = case.lens
     assert lens is not None
-    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    node = graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
     message = CameraInfo(width=lens.size[0], height=lens.size[1], distortion_model=lens.model)
     message.k, message.d = lens.matrix.ravel().tolist(), lens.coefficients.tolist()
 
     graph.publish(topics.CAMERA_INFO, message)
+    graph.wait(lambda: node._lens is not None, "the lens")  # messages of two topics come in either order
     graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
     position = poses[-1].pose.pose.position

@@ -90,7 +90,9 @@ def render(
 ) -> np.ndarray:
     """Draw a frame."""
     what = CameraScene(needle_curvature=pose.curvature, **scene)
-    return camera_for(seed, lighting, what).render(pose.tail, pose.heading, thread, covers, gain)
+    camera = camera_for(seed, lighting, what)
+    camera._random = np.random.default_rng(seed)  # a frame is the same whatever was drawn before it
+    return camera.render(pose.tail, pose.heading, thread, covers, gain)
 
 
 def line_error(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
