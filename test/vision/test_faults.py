@@ -11,18 +11,7 @@ from magnetosuture_thread.vision.dish import find as dish
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
-from test.vision.scenes import (
-    PIXEL,
-    RIGHT_ANGLE,
-    RIGHT_PX,
-    SCENE,
-    Pose,
-    blob,
-    finger,
-    random_pose,
-    random_thread,
-    render,
-)
+from test.vision.scenes import PIXEL, SCENE, Pose, blob, finger, random_pose, random_thread, render
 
 TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 WHITE = (255.0, 255.0, 255.0)
@@ -35,19 +24,9 @@ COLOURS = {
 }
 
 
-def check(pose: Pose, frame: np.ndarray, *, tail_is_hidden: bool = False) -> str:
-    """Look at a frame; fail on a wrong pose, return why there is none.
-
-    A hidden tail follows from the needle's length, which is known to a few percent in one frame: it may be off by as
-    much as it is said to be.
-    """
+def check(pose: Pose, frame: np.ndarray) -> str:
+    """Look at a frame; fail on a wrong pose, return why there is none."""
     seen = TRACKER.look(frame)
-    if tail_is_hidden and not seen.reason:
-        deviation = float(np.sqrt(np.linalg.eigvalsh(seen.covariance[:2, :2]).max())) / PIXEL
-        apart, turned = pose.error(seen)
-        assert apart < max(RIGHT_PX, deviation)
-        assert abs(turned) < RIGHT_ANGLE
-        return ""
     assert seen.reason or pose.is_right(seen), f"off by {pose.error(seen)}"
     return seen.reason
 
@@ -58,8 +37,8 @@ def test_glare_over_a_part_of_the_needle(share: float, opacity: float):
     for seed in range(2):
         pose = random_pose(np.random.default_rng(seed), curved=seed > 0)
         for radius in (0.0003, 0.0008):
-            frame = render(pose, covers=(blob(pose.at(share), radius, WHITE, opacity),))
-            reason = check(pose, frame, tail_is_hidden=share < 0.0)
+            frame = render(pose, seed=1, covers=(blob(pose.at(share), radius, WHITE, opacity),))
+            reason = check(pose, frame)
             assert not reason or opacity > 0.1
     assert check(pose, render(pose, covers=(blob(pose.at(0.5), 0.0008, WHITE, 1.0),)))
 
