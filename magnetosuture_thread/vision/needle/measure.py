@@ -33,6 +33,7 @@ MAX_MISSING_TIP, TIP = 0.2, 0.2  # of the steel of this last part of the length
 SURE, SURE_ROWS = 0.75, 0.97  # share of steel that some place of a row has, and of the rows that have one
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
 MAX_BOTH = 0.2  # of it beyond both ends, which a thread leaves or passes at one only
+LONGER = 0.2  # of the length beyond a tail, before whose end what is as wide as the body is more of the needle
 SHARP = 0.2  # bluntness of both sides of a tip if the thread is so thick
 AXIS_POINTS, MAX_HIDDEN = 100, 0.02  # along the axis, and the share of them that wall and shapes may hide
 MAX_BESIDE = 0.1  # of the rows with something as dark as steel off the body's side
@@ -293,9 +294,20 @@ def _what_prolongs(steel: SteelMap, fit: TemplateFit, width: float, is_known: bo
     if beyond_tail > MAX_BEYOND:
         blunt = np.empty((2, 2))
         bluntness(steel.surely, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, blunt)
-        if not is_known or blunt[1].max() > SHARP:
+        if not is_known or blunt[1].max() > SHARP or _ends_beyond(steel, fit):
             return "something at its tail"
     return ""
+
+
+def _ends_beyond(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether what goes on beyond a tail, as wide as the body, ends soon: more of a needle, and no thick thread."""
+    beyond = -np.arange(1.0, LONGER * fit.length)
+    aside = np.arange(-1.5 * fit.width, 1.5 * fit.width + 0.1, 0.5)
+    dark = np.empty((len(beyond), len(aside)))
+    axis = float(fit.arc.start[0]), float(fit.arc.start[1]), fit.arc.angle, fit.arc.curvature
+    straighten(steel.surely, axis, beyond, aside, dark)
+    light = np.flatnonzero(dark[:-2, len(aside) // 2] < 0.5)  # A thick thread that bends away is dark beside it.
+    return len(light) > 0 and bool(0.5 * (dark[light[0] + 2] > 0.5).sum() < 0.5 * fit.width)
 
 
 def _state(arc: Arc, width: float) -> np.ndarray:

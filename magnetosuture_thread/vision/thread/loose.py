@@ -47,8 +47,8 @@ def has_loose_thread(
     if picture.mask is not None:
         strong[np.abs(picture.mask.depth) < picture.mask.band_px] = 0
         strong[picture.mask.depth > 0.0] = 0
-    # What leaves the tail may be its own thread, of which nothing was followed, and so may one line that leaves its
-    # side, folded below it. One that leaves it on two sides, or passes close by, passes it.
+    # What leaves the tail in one direction may be its own thread, of which nothing was followed, and so may one line
+    # that leaves its side, folded below it. One that leaves either on two sides, or passes close by, passes it.
     axis = needle.arc.at(np.linspace(-COVERED_PX, needle.length_px + COVERED_PX, 24))
     at = np.round(axis * 16.0).astype(np.int32)
     width = round(needle.width_px + 2.0 * COVERED_PX)
@@ -58,8 +58,12 @@ def has_loose_thread(
     leaves = cv2.dilate(strong & covered, np.ones((3, 3), np.uint8))
     strong[covered > 0] = 0
     u, v = np.round(needle.tail_px).astype(int)
-    cv2.circle(strong, (int(u), int(v)), round(0.5 * needle.width_px + COVERED_PX + TAIL_PX), 1, -1)
-    cv2.floodFill(strong, None, (int(u), int(v)), 0, flags=8)
+    tail, radius = (int(u), int(v)), round(0.5 * needle.width_px + COVERED_PX + TAIL_PX)
+    cv2.circle(strong, tail, radius, 1, -1)
+    at_tail = strong.copy()
+    cv2.floodFill(strong, None, tail, 0, flags=8)
+    at_tail -= strong
+    cv2.circle(at_tail, tail, radius + SPLIT_PX, 0, -1)
     outlines, _ = cv2.findContours(strong, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     touching = np.zeros_like(strong)
     for index, outline in enumerate(outlines):
@@ -67,8 +71,8 @@ def has_loose_thread(
             cv2.drawContours(touching, outlines, index, 1, -1)
         elif _extent(outline) > length:
             return True
-    touching &= strong & ~around
-    branches, _ = cv2.findContours(touching, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    lines = (touching & strong | at_tail) & ~around
+    branches, _ = cv2.findContours(lines, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     extents = [extent for extent in map(_extent, branches) if extent > BRANCH * length]
     return len(extents) > 1 and sum(extents) > length
 
