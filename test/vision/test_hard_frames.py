@@ -144,6 +144,17 @@ def test_a_thread_that_passes_a_tail_does_not_leave_it():
     assert any("no thread leaves" in reason for reason in decoys.reasons)
 
 
+@pytest.mark.parametrize(
+    ("name", "index", "seed"),
+    [("decoy_at_thread", 21, 280001), ("length_off_10", 0, 270001), ("thread_black_6px", 2, 290001)],
+)
+def test_needles_that_were_wrong_once_are_not(name: str, index: int, seed: int):
+    result = measure(*frame_of(name, index, seed))
+    assert not result.is_wrong
+    assert not result.is_reversed
+    assert result.found == (name != "decoy_at_thread")
+
+
 @pytest.mark.parametrize("name", ["width_320", "width_1280", "width_1920", "dark_field"])
 def test_small_and_large_frames_and_a_dark_floor_are_tracked(name: str):
     figures = row(name)
