@@ -88,7 +88,8 @@ def find_self_contacts(
         value: written, h [m], shape (r,).
 
     Returns:
-        The number of rows, -1 if there is no room; and of these, how many have passed.
+        The number of rows, -1 if there is no room; and how many nodes have passed through a segment on the way, those
+        that came back included: they have no row with the side -1, but no thread moves so.
     """
     count, passed, last, farthest = 0, 0, len(after) - 1, 0.0
     for i in range(last + 1):
@@ -109,13 +110,15 @@ def find_self_contacts(
             rx, ry = after[k, 0] - after[j, 0], after[k, 1] - after[j, 1]
             size = math.sqrt(ex * ex + ey * ey)
             s = (rx * ex + ry * ey) / (size * size)
-            through = _passes(before, after, k, j) % 2 == 1
+            passes = _passes(before, after, k, j)
+            through = passes % 2 == 1
             crossed = _crosses(before, k, j) or _crosses(before, k - 1, j)
             if crossed:
                 if not crossing:
                     continue
                 through = True
-            elif not through and not (0.0 <= s <= 1.0) and ((s > 1.0 and j < last - 1) or (s < 0.0 and k < j)):
+            passed += passes > 0 or through
+            if not through and not (0.0 <= s <= 1.0) and ((s > 1.0 and j < last - 1) or (s < 0.0 and k < j)):
                 continue  # a corner: the next segment's, or the row of the other node
             s = min(max(s, 0.0), 1.0)
             px, py = rx - s * ex, ry - s * ey
@@ -137,7 +140,6 @@ def find_self_contacts(
                 n = nx if a == 0 else ny
                 gradient[count, 0, a], gradient[count, 1, a], gradient[count, 2, a] = -(1.0 - s) * n, -s * n, n
             count += 1
-            passed += through
     return count, passed
 
 
@@ -170,7 +172,7 @@ class SelfContact(CompiledBarrier):
         return self._rows(before, positions, False)[0]
 
     def passed(self, before: Points, positions: Points) -> bool:
-        """Return whether any segment has passed through another between two shapes of the thread [m]."""
+        """Return whether any segment passes through another, even there and back, between two shapes [m]."""
         return self._rows(before, positions, False)[1] > 0
 
     def crossings(self, positions: Points) -> list[tuple[int, int]]:

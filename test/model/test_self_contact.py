@@ -83,10 +83,23 @@ def test_a_node_that_passed_through_a_segment_is_on_its_wrong_side():
     assert (barrier.rows_after(before, around).value > 0.0).all()
 
 
-@pytest.mark.parametrize("seed", range(6))
+def test_a_node_that_passes_through_a_segment_and_back_has_passed():
+    """Node 4 enters the segment that turns about node 0 at 0.28 of the way and leaves it at 0.72."""
+    before = 1e-3 * np.array([(0.0, 0.0), (1.0, 0.0), (1.6, 0.8), (1.0, 1.5), (0.5, 0.1)])
+    after = before.copy()
+    after[1], after[4] = (1e-3, 1e-3), (0.0, 1e-4)
+    barrier = SelfContact(soft(4, 4e-3))
+    assert not barrier.crossings(before)
+    assert not barrier.crossings(after)
+    assert barrier.crossings(0.5 * (before + after))
+    assert barrier.passed(before, after)
+    assert (barrier.rows_after(before, after).value > 0.0).all()
+
+
+@pytest.mark.parametrize("seed", [*range(6), 92, 106])
 def test_no_random_motion_takes_a_thread_through_itself(seed: int):
     """`python -m benchmarks contact` does a thousand of them."""
-    done = move_model(seed, True, 200)
+    done = move_model(seed, True, 300)
     assert done.crossed == 0
     assert done.unconverged + done.refused <= 0.1 * done.steps
 
