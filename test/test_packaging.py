@@ -51,7 +51,7 @@ def test_every_message_package_that_the_nodes_import_is_declared():
     "name", ["scene_server", "vision_tracker", "thread_model", "perception", "coil_bridge", "needle_planner", "console"]
 )
 def test_every_node_is_an_executable_and_launched(name: str):
-    assert f'{name} = "magnetosuture_thread.nodes.{name}:main"' in PYPROJECT
+    assert f'{name} = "magnetosuture_thread.nodes.program:main"' in PYPROJECT
     if name in ("vision_tracker", "thread_model"):
         return  # launched in one process: `perception`
     launch = ast.parse((ROOT / "launch" / "magnetosuture.launch.py").read_text())
