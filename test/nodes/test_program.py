@@ -16,7 +16,9 @@ import pytest
 from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
 
 ROOT = Path(__file__).parent.parent.parent
-PROGRAMS = re.findall(r'^(\w+) = "magnetosuture_thread\.nodes\.program:main"$', (ROOT / "pyproject.toml").read_text(), re.M)
+PROGRAMS = re.findall(
+    r'^(\w+) = "magnetosuture_thread\.nodes\.program:main"$', (ROOT / "pyproject.toml").read_text(), re.M
+)
 # As an installed script does. It says when it loads: while Python itself starts, nobody can catch a signal.
 SCRIPT = """
 import sys
