@@ -33,12 +33,15 @@ def generate_launch_description() -> LaunchDescription:
     def argument(name: str, default: str, description: str, **options: object) -> DeclareLaunchArgument:
         return DeclareLaunchArgument(name, default_value=default, description=description, **options)
 
+    def switch(name: str, description: str) -> DeclareLaunchArgument:
+        return argument(name, "false", description, choices=["true", "false"])
+
     def nodes(context: LaunchContext) -> list[Node]:
         given = LaunchConfiguration("setup_file").perform(context)
         file = Path(given).expanduser() if given else folder / f"{LaunchConfiguration('setup').perform(context)}.yaml"
         if not file.is_file():
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
-        planner = LaunchConfiguration("planner").perform(context).lower() in ("true", "1")
+        planner = LaunchConfiguration("planner").perform(context) == "true"
         return started(str(file.resolve()), planner)
 
     return LaunchDescription(
@@ -46,10 +49,10 @@ def generate_launch_description() -> LaunchDescription:
             argument("setup", DEFAULT_SETUP, "name of a setup that ships with the package", choices=names),
             argument("setup_file", "", "path of a setup of your own, in place of setup"),
             argument("namespace", "", "namespace of all nodes"),
-            argument("use_sim_time", "false", "take the time from /clock"),
-            argument("simulated", "false", "with a rig in software"),
-            argument("planner", "false", "with the needle planner, in place of the path follower"),
-            argument("console", "false", "with the operator's page"),
+            switch("use_sim_time", "take the time from /clock"),
+            switch("simulated", "with a rig in software"),
+            switch("planner", "with the needle planner, in place of the path follower"),
+            switch("console", "with the operator's page"),
             OpaqueFunction(function=nodes),
         ]
     )

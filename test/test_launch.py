@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.interface import PROCESSES, RIG_NODES
+from magnetosuture_thread.interface import NEEDLE_COMMAND, OPERATOR_COMMAND, PROCESSES, RIG_NODES
 
 ROOT = Path(__file__).parent.parent
 SHIPPED = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
@@ -71,6 +71,21 @@ def test_a_setup_is_one_of_those_that_ship(description):
     (setup,) = (entry for entry in description if entry.kind == "argument" and entry.given[0] == "setup")
     assert setup.choices == SHIPPED
     assert setup.default_value in setup.choices
+
+
+def test_every_switch_names_its_choices(description):
+    switches = {entry.given[0]: entry for entry in description if entry.kind == "argument"}
+    for name in ("use_sim_time", "simulated", "planner", "console"):
+        assert switches[name].choices == ["true", "false"]
+        assert switches[name].default_value == "false"
+
+
+def test_nobody_but_one_node_commands_on_the_topic_below_the_operator(description):
+    """The operator's page has a topic of its own, above that of planner and path follower."""
+    for planner in ("true", "false"):
+        started = {node.executable for node in nodes(description, simulated="true", console="true", planner=planner)}
+        assert len(started & {"path_follower", "needle_planner"}) == 1
+    assert OPERATOR_COMMAND.name != NEEDLE_COMMAND.name
 
 
 def test_every_node_gets_the_same_file_and_namespace(description):

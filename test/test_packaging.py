@@ -8,7 +8,9 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+import yaml
 
+import magnetosuture_thread
 from magnetosuture_thread.resources import share_directory
 
 ROOT = Path(__file__).parent.parent
@@ -25,7 +27,11 @@ def test_the_version_is_the_same_everywhere():
     assert version is not None
     for path in (ROOT / "package.xml", ROOT / "msg_defs" / "package.xml"):
         assert package_xml(path).findtext("version") == version[1]
-    assert f"## {version[1]}" in (ROOT / "CHANGELOG.md").read_text()
+    assert magnetosuture_thread.__version__ == version[1]
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version[1]
+    assert re.search(
+        rf"^## \[{re.escape(version[1])}\] - \d{{4}}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE
+    )
 
 
 def test_every_message_is_built():
@@ -51,7 +57,7 @@ def test_every_message_package_that_the_nodes_import_is_declared():
     "name", ["scene_server", "vision_tracker", "thread_model", "perception", "coil_bridge", "needle_planner", "console"]
 )
 def test_every_node_is_an_executable_and_launched(name: str):
-    assert f'{name} = "magnetosuture_thread.nodes.{name}:main"' in PYPROJECT
+    assert f'{name} = "magnetosuture_thread.nodes.program:main"' in PYPROJECT
     if name in ("vision_tracker", "thread_model"):
         return  # launched in one process: `perception`
     launch = ast.parse((ROOT / "launch" / "magnetosuture.launch.py").read_text())

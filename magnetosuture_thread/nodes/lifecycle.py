@@ -69,6 +69,11 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         return str(self._state_machine.current_state[1])
 
     @property
+    def has_ended(self) -> bool:
+        """Whether the node is finalized."""
+        return self.stage == "finalized"
+
+    @property
     def clock_is_fixed(self) -> bool:
         """Whether the node keeps the clock that it has: while it is configured."""
         return self.settings is not None
@@ -99,7 +104,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
             self.require(self.trigger_configure)
             if self.get_parameter("autostart").value != "inactive" and self.may_start():
                 self.require(self.trigger_activate)
-        except Exception:
+        except BaseException:  # an interruption too: the driver may be open
             self.destroy_node()
             raise
 
@@ -152,7 +157,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
 
     def finish(self) -> None:
         """Shut down by the lifecycle, so that everything is given back while the graph is still there."""
-        if self.stage != "finalized":
+        if not self.has_ended:
             self.trigger_shutdown()
 
     def destroy_node(self) -> None:

@@ -46,6 +46,11 @@ class GuardedNode(Node):
         """Whether the node keeps the clock that it has: stamps of two clocks cannot be compared."""
         return True
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether the node was shut down for good, so that its process can end."""
+        return False
+
     def refuse(self, problem: Exception) -> None:
         """Report a message that was refused."""
         self.get_logger().warning(f"refused: {problem}", throttle_duration_sec=LOG_PERIOD)

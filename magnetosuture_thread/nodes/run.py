@@ -26,8 +26,8 @@ from rclpy.task import Future
 from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.parameter_files import init
+from magnetosuture_thread.nodes.program import STOPS
 
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 DELIVERY_TIMEOUT = 0.2  # s for the last messages of all nodes to be acknowledged
 
 
@@ -128,18 +128,21 @@ class _Ending(Future):
     def __init__(self) -> None:
         super().__init__()
         self._asked = self._deferred = False
+        self._nodes: tuple[Node, ...] = ()
         for which in end_signals():
             signal.signal(which, self._on_signal)
 
     def done(self) -> bool:
-        """Return whether the process is to end."""
-        return self._asked
+        """Return whether the process is to end: it was asked to, or its nodes were shut down by their lifecycle."""
+        ended = [isinstance(node, GuardedNode) and node.has_ended for node in self._nodes]
+        return self._asked or (bool(ended) and all(ended))
 
     def add_done_callback(self, callback: Callable[..., None]) -> None:
         """Leave a callback out: an executor adds one in each turn, and `defer` wakes it."""
 
-    def defer(self, executor: SingleThreadedExecutor) -> None:
+    def defer(self, executor: SingleThreadedExecutor, nodes: tuple[Node, ...]) -> None:
         """From now on raise nothing, and wake an executor instead: Python runs no handler while it waits."""
+        self._nodes = nodes
         woken, written = os.pipe2(os.O_CLOEXEC)
         os.set_blocking(written, False)
         signal.set_wakeup_fd(written, warn_on_full_buffer=False)
@@ -162,7 +165,7 @@ class _Ending(Future):
 def run(
     make: Callable[[], N], arguments: Sequence[str] | None = None, made: Callable[[N], None] = lambda node: None
 ) -> int:
-    """Run a node, or several in one process, until it is interrupted, terminated or hung up.
+    """Run a node, or several in one process, until it is interrupted, terminated, hung up, or shut down.
 
     A node then publishes its final messages while the graph is still there: see `GuardedNode.finish`.
 
@@ -175,12 +178,14 @@ def run(
         0 when it was asked to end, 1 when it could not start.
     """
     nodes: tuple[Node, ...] = ()
-    executor = None
+    executor = ended = None
     try:
         ended = _Ending()
         try:
             init(arguments, signal_handler_options=SignalHandlerOptions.NO)
         except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
+            if ended.done():
+                return 0
             print(f"error: {_one_line(error)}", file=sys.stderr)
             return 1
         result = make()
@@ -193,19 +198,22 @@ def run(
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
-        ended.defer(executor)
+        ended.defer(executor, nodes)
         executor.spin_until_future_complete(ended)
         _finish(nodes)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        _finish(nodes)
     except rclpy_implementation.RCLError:
-        if rclpy.ok():
+        amid_start = not nodes and ended is not None and ended.done()
+        if rclpy.ok() and not amid_start:
             raise  # else a callback was still at work when the node was asked to end
-    except (MagnetosutureError, ParameterException) as error:
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        return 1
-    except ValueError as error:
-        if nodes:
+    except (MagnetosutureError, ParameterException, ValueError, RuntimeError, SystemError) as error:
+        if not nodes and ended is not None and ended.done():
+            return 0  # amid its start: the library behind rclpy makes other errors of a KeyboardInterrupt
+        if isinstance(error, (MagnetosutureError, ParameterException)):
+            print(f"error: {_one_line(error)}", file=sys.stderr)
+            return 1
+        if nodes or not isinstance(error, ValueError):
             raise
         # rclpy's own word for a parameter that has no value, as an empty list.
         print(f"error: a parameter cannot be declared: {_one_line(error)}", file=sys.stderr)

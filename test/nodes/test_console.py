@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from magnetosuture_msgs.msg import CoilBridgeState, CoilCurrents
+from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 
 from magnetosuture_thread.console.settings import ConsoleSettings
@@ -464,3 +465,27 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     assert commands == []
     console.blocked = "starting"
     assert asyncio.run(console.execute_procedure("plan", near, False)) == "starting"
+
+
+def test_the_node_answers_the_services_of_its_parameters(graph):
+    with joined(domain=graph.domain) as other:
+        client = other.create_client(GetParameters, "console/get_parameters")
+        command = [sys.executable, "-m", "magnetosuture_thread.nodes.console", "--ros-args", "-p", "port:=0"]
+        process = subprocess.Popen(command, env=graph_environment(graph.domain))
+        answers = []
+
+        def answered() -> bool:
+            if client.service_is_ready():
+                with client.handle:
+                    client.handle.send_request(GetParameters.Request(names=["port"]))
+                    answers.append(client.handle.take_response(GetParameters.Response)[1])
+            return any(answer is not None for answer in answers)
+
+        try:
+            graph.wait(answered, "an answer", 30.0)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30.0) == 0
+        finally:
+            process.kill()
+    (values, *_) = (answer.values for answer in answers if answer is not None)
+    assert [value.integer_value for value in values] == [0]

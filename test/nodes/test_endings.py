@@ -115,6 +115,26 @@ def test_the_last_messages_of_a_bridge_that_is_ended_are_zeros_and_why(graph, wh
     graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
 
 
+def test_a_second_interruption_takes_nothing_from_the_last_messages(graph):
+    heard = last(graph)
+    with process(graph) as bridge:
+        armed_and_driving(graph, heard)
+        bridge.send_signal(signal.SIGINT)
+        bridge.send_signal(signal.SIGTERM)
+        bridge.send_signal(signal.SIGINT)
+        assert bridge.wait(TIMEOUT) == 0
+    graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
+
+
+def test_a_bridge_that_is_shut_down_by_its_lifecycle_ends_its_process(graph):
+    heard = last(graph)
+    with process(graph) as bridge:
+        armed_and_driving(graph, heard)
+        assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert bridge.wait(TIMEOUT) == 0
+    graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
+
+
 @pytest.mark.parametrize(
     ("transitions", "ending"),
     [

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import Any
 
 import rclpy
@@ -21,13 +23,15 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.interface import PAUSE_REPLAY, PAUSE_RIG
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.diagnostics import PERIOD, Health
+from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.parameter_files import init, node_options
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import end_signals
 
 NAME = "console"
 RIG = "rig_simulator"
-# Without an executor no service of the node could answer.
+REQUEST_PERIOD = 0.05  # s between two looks for requests to the node's parameter services
+# rclpy's own service of types is answered by an executor only.
 NO_SERVICE = [Parameter("start_type_description_service", value=False)]
 
 
@@ -103,19 +107,60 @@ class GraphHost:
         return next(ready, "")
 
 
-async def serve(node: Node, settings: ConsoleSettings) -> None:
+class _Termination:
+    """Whether the process was asked to end, at any time; asyncio would give signals their default action back."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._tell: Callable[[], object] = bool
+        for which in end_signals():
+            signal.signal(which, self._on_signal)
+
+    def event(self) -> asyncio.Event:
+        """Return what is set from then on, for the running loop."""
+        loop, event = asyncio.get_running_loop(), asyncio.Event()
+
+        def tell() -> None:
+            with suppress(RuntimeError):  # the loop is closed already
+                loop.call_soon_threadsafe(event.set)
+
+        self._tell = tell
+        if self._asked:
+            event.set()
+        return event
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True
+        self._tell()
+
+
+def answer_requests(node: Node) -> None:
+    """Answer what waits at the node's services, those of its parameters: no executor does."""
+    for service in node.services:
+        with service.handle:
+            request, header = service.handle.service_take_request(service.srv_type.Request)
+            if header is not None:
+                service.send_response(service.callback(request, service.srv_type.Response()), header)
+
+
+async def _keep_answering(node: Node) -> None:
+    while True:
+        answer_requests(node)
+        await asyncio.sleep(REQUEST_PERIOD)
+
+
+async def serve(node: Node, settings: ConsoleSettings, termination: _Termination) -> None:
     """Serve the page until the process is terminated; the needle is stopped first."""
-    loop, terminated = asyncio.get_running_loop(), asyncio.Event()
-    for which in end_signals():
-        loop.add_signal_handler(which, terminated.set)
+    terminated = termination.event()
     graph = ConsoleGraph(node, settings)
     server = ConsoleServer(settings, graph, GraphHost(graph))
     url = await server.start()
     print(f"the operator's page: {url}", flush=True)
     health = Health(node)
     health.ok(f"serving on {settings.address}")
+    answering = asyncio.create_task(_keep_answering(node))
     try:
-        while not terminated.is_set():
+        while not terminated.is_set() and not answering.done():
             graph.now()  # sets the clock for the stamp
             health.publish()
             try:
@@ -123,22 +168,23 @@ async def serve(node: Node, settings: ConsoleSettings) -> None:
             except asyncio.TimeoutError:
                 continue
     finally:
+        answering.cancel()
         await server.stop()
+    with suppress(asyncio.CancelledError):
+        await answering  # raises what ended it
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node as a program; return 0 when it was terminated, 1 when it could not start."""
     node = None
+    termination = _Termination()
     try:
         init(arguments, signal_handler_options=SignalHandlerOptions.NO)
-        options = {"start_parameter_services": False, "parameter_overrides": NO_SERVICE}
-        node = rclpy.create_node(NAME, **node_options(NAME, options))
-        asyncio.run(serve(node, declare(node, ConsoleSettings)))
+        node = GuardedNode(NAME, **node_options(NAME, {"parameter_overrides": NO_SERVICE}))
+        asyncio.run(serve(node, declare(node, ConsoleSettings), termination))
     except (MagnetosutureError, ParameterException, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        pass  # before the page was there
     finally:
         if node is not None:
             node.destroy_node()

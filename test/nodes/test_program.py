@@ -1,0 +1,64 @@
+"""Every node as its program: a terminal's Ctrl-C reaches it twice, at any time, and it ends in order."""
+
+from __future__ import annotations
+
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
+
+ROOT = Path(__file__).parent.parent.parent
+PROGRAMS = re.findall(
+    r'^(\w+) = "magnetosuture_thread\.nodes\.program:main"$', (ROOT / "pyproject.toml").read_text(), re.M
+)
+# As an installed script does. It says when it loads: while Python itself starts, nobody can catch a signal.
+SCRIPT = """
+import sys
+from magnetosuture_thread.nodes import program
+sys.argv[0] = sys.argv.pop(1)
+begin = program.import_module
+def reported(name):
+    print("begins", flush=True)
+    return begin(name)
+program.import_module = reported
+sys.exit(program.main())
+"""
+WITHIN = 4.0  # s after the beginning: amid imports, the making of a node, or its work
+TIMEOUT = 90.0  # s; kernels compile meanwhile, and a signal waits for one
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
+    """An environment on a domain of its own."""
+    with reserved_domain() as domain:
+        yield {**graph_environment(domain), "XDG_STATE_HOME": str(tmp_path)}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_two_interruptions_at_any_time_end_a_node_in_order(name: str, environment: dict[str, str]):
+    moments = random.Random(name)
+    for _ in range(2):
+        command = [sys.executable, "-c", SCRIPT, name, "--ros-args", "-p", "scene:=dish_35mm"]
+        process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "begins\n"
+            time.sleep(moments.uniform(0.0, WITHIN))
+            process.send_signal(signal.SIGINT)
+            time.sleep(moments.uniform(0.0, 0.5))
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=TIMEOUT)
+        finally:
+            process.kill()
+        assert process.returncode == 0, output
+        assert "Traceback" not in output
