@@ -72,6 +72,7 @@ def play_tracked(frames: list[TrackedFrame], estimator: ThreadEstimator) -> dict
 def measure_rendered(count: int, seed: int, progress: Callable[[], None]) -> dict[str, Any]:
     """Return how many unknown contacts were found in time, and false reports, with a post and without."""
     case, runs, found, late, early, alarms, free = CASES["unknown post"], 0, 0, 0, 0, 0, 0
+    untracked = 0
     errors = []
     for number in range(seed, seed + count):
         for material, attachment in THREADS:
@@ -86,6 +87,7 @@ def measure_rendered(count: int, seed: int, progress: Callable[[], None]) -> dic
                 first = min((index for index in reports if index >= contact), default=len(run.threads))
                 early += any(index < contact for index in reports)
                 found += first <= contact + FOUND_TIME * RATE
+                untracked += frames[contact].pose is None
                 late += contact + FOUND_TIME * RATE < first < len(run.threads)
             run = free_run(material, attachment, number, 25.0)
             estimates = play_tracked(track(run, number, len(run.threads)), estimator_of(run.thread, run))
@@ -99,6 +101,7 @@ def measure_rendered(count: int, seed: int, progress: Callable[[], None]) -> dic
         "runs": runs,
         "found": found,
         "late": late,
+        "untracked_at_contact": untracked,
         "early": early,
         "runs_without_post": free,
         "false_reports": alarms,

@@ -118,6 +118,14 @@ class RodFormulation(Formulation):
         self._use(self._buffers)
 
     @property
+    def nodes_in_contact(self) -> NDArray[np.bool_]:
+        """Which nodes shapes or wall pushed in the last step, at a node or on a chord beside it, shape (n + 1,)."""
+        at_nodes, on_chords = self._buffers.push > 0.0
+        at_nodes |= on_chords
+        at_nodes[1:] |= on_chords[:-1]
+        return np.asarray(at_nodes)
+
+    @property
     def rod(self) -> RodProperties:
         """The thread, for compiled code."""
         return self._rod
