@@ -91,7 +91,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         found = more["rendered"]
         log(
             f"rendered frames: {found['found']} of {found['runs']} posts found within 0.5 s, {found['late']} later"
-            f" (needle not tracked at {found['untracked_at_contact']} contacts), {found['early']} reports before contact;"
+            f" (needle not tracked at {found['untracked_at_contact']} contacts), {found['early']} before;"
             f" {found['false_reports']} of {found['runs_without_post']} runs without a post with a false report;"
             f" estimate {found['estimate_mean']:.3f}, {found['estimate_maximum']:.2f}"
         )

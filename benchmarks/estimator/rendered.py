@@ -47,9 +47,7 @@ def track(run: Run, seed: int, frames: int) -> list[TrackedFrame]:
             continue
         deviation = pose_deviation(np.diag(seen.track.covariance))
         found.append(
-            TrackedFrame(
-                NeedlePose(pose.stamp, seen.track.tail, seen.track.heading, deviation), seen.track.observation
-            )
+            TrackedFrame(NeedlePose(pose.stamp, seen.track.tail, seen.track.heading, deviation), seen.track.observation)
         )
     return found
 

@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier, CompiledBarrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
