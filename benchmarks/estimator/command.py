@@ -24,6 +24,7 @@ from benchmarks.estimator.measurements import (
     measure_long,
     measure_references,
 )
+from benchmarks.estimator.rendered import measure_rendered
 from benchmarks.estimator.slow import measure_slow
 from magnetosuture_thread.cli.terminal import make_log, progress
 
@@ -39,6 +40,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--references", type=Path, metavar="DIR", help="also on the reference trajectories of a folder")
     parser.add_argument("--slow", action="store_true", help="also what is learned on line of thread and liquid")
+    parser.add_argument(
+        "--rendered", type=int, default=0, metavar="N", help="also N seeds of unknown posts, by rendered frames"
+    )
     parser.add_argument("--long", type=float, default=0.0, metavar="MINUTES", help="also one long run")
 
 
@@ -62,6 +66,8 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
             more["references"] = measure_references(options.references, options.seed, lambda: None)
         if options.slow:
             more["slow_parameters"] = measure_slow(options.count, options.seed, lambda: None)
+        if options.rendered:
+            more["rendered"] = measure_rendered(options.rendered, options.seed, lambda: None)
         if options.long > 0.0:
             more["long"] = measure_long(options.long, options.seed, options.segments)
     console.print(_table(figures, options.trackers))
@@ -80,6 +86,14 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         log(
             f"{found['case']}, {found['material']}: {found['parameter']} off by {found['error_mean']:.2g} in the mean,"
             f" half interval {found['half_interval_mean']:.2g}, {100.0 * found['coverage']:.0f} % inside"
+        )
+    if "rendered" in more:
+        found = more["rendered"]
+        log(
+            f"rendered frames: {found['found']} of {found['runs']} posts found within 0.5 s, {found['late']} later"
+            f" (needle not tracked at {found['untracked_at_contact']} contacts), {found['early']} before;"
+            f" {found['false_reports']} of {found['runs_without_post']} runs without a post with a false report;"
+            f" estimate {found['estimate_mean']:.3f}, {found['estimate_maximum']:.2f}"
         )
     if "long" in more:
         found = more["long"]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator.relaxation import add_displacement, relax
+from magnetosuture_thread.model.estimator.relaxation import relax, significance
 from magnetosuture_thread.model.thread import Attachment, Thread
 
 Vector = NDArray[np.float64]
@@ -19,6 +19,7 @@ Vector = NDArray[np.float64]
 FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
 STRAIGHT = np.zeros(2)  # a heading that is right
 CONFIRMED = 0.25  # of the averaging time, for which it must last
+CONTACT_MEMORY = 3.0  # averaging times, in which what a known contact did is forgotten
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,11 @@ class DisturbanceTest:
     needle, a shape or a camera that is a little off, that stays about as much: a sum of the corrections alone would
     count the same error anew with every frame.
 
+    Where shapes or wall that the model knows pushed the thread within the last times T, they may push more or less than
+    the model says, or earlier or later: a free end that is braced against the wall slips at a force that a few
+    micrometres of the needle's pose decide. So forces at such nodes explain what they can of e, by least squares, and
+    what is left of it is tested.
+
     Args:
         thread: the thread.
         time: T, over which corrections are added up [s].
@@ -159,7 +165,10 @@ class DisturbanceTest:
     def __init__(self, thread: Thread, time: float) -> None:
         self._use(thread, time)
         self._displacement = np.zeros((thread.segments + 1, 2))  # e [m]
+        self._explained = np.zeros_like(self._displacement)  # of it, by forces of known contacts [m]
+        self._untouched = np.full(thread.segments + 1, np.inf)  # time since a contact pushed each node [s]
         self._since, self._significance = math.nan, 0.0
+        self._gap = False
 
     def _use(self, thread: Thread, time: float) -> None:
         self._thread, self._time = thread, time
@@ -173,7 +182,8 @@ class DisturbanceTest:
     def copied(self) -> DisturbanceTest:
         """Return a copy."""
         other = copy.copy(self)
-        other._displacement = self._displacement.copy()
+        other._displacement, other._explained = self._displacement.copy(), self._explained.copy()
+        other._untouched = self._untouched.copy()
         return other
 
     def resampled(self, thread: Thread, time: float) -> DisturbanceTest:
@@ -183,28 +193,77 @@ class DisturbanceTest:
         nodes = self._thread.segment_length * np.arange(self._thread.segments + 1)
         at = thread.segment_length * np.arange(thread.segments + 1)
         other._displacement = np.column_stack([np.interp(at, nodes, along) for along in self._displacement.T])
+        other._explained = np.column_stack([np.interp(at, nodes, along) for along in self._explained.T])
+        nearest = np.rint(at / self._thread.segment_length).astype(np.int64)
+        other._untouched = self._untouched[np.minimum(nearest, self._thread.segments)]
         return other
 
-    def decay(self, interval: float) -> None:
-        """Let time pass [s]."""
+    def decay(self, interval: float, in_contact: NDArray[np.bool_]) -> None:
+        """Let time pass.
+
+        Args:
+            interval: [s]
+            in_contact: nodes that known shapes or the wall pushed meanwhile, shape (n + 1,).
+        """
+        # Nobody knows which way the needle went in a gap between poses, so the next correction says nothing.
+        self._gap = self._gap or interval > self._time
         self._displacement *= math.exp(-interval / self._time)
         relax(interval * self._stiffness, self._clamped, STRAIGHT, self._displacement)
+        self._untouched += interval
+        self._untouched[in_contact] = 0.0
 
-    def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, deviations: Vector) -> None:
+    def add(
+        self, positions: Points, moved: Points, normals: Points, variance: Vector, stamp: float, deviations: Vector
+    ) -> None:
         """Add a correction.
 
         Args:
+            positions: of the nodes after it, shape (n + 1, 2) [m].
             moved: by it, shape (n + 1, 2) [m].
             normals: of the nodes, shape (n + 1, 2).
             variance: of the mean of each window's points, inf where nothing is measured, shape (w,) [m^2].
             stamp: [s]
             deviations: standard deviations of the needle's tail [m] and heading [rad].
         """
-        self._significance = add_displacement(self._displacement, moved, normals, variance, self._response, deviations)
+        if self._gap:
+            self._gap = False
+            return
+        self._displacement += moved
+        self._explained[:] = 0.0
+        self._significance = significance(self._displacement, normals, variance, self._response, deviations)
+        if self._significance > LOST:
+            self._explained = self._by_contacts(positions, normals)
+            left = self._displacement - self._explained
+            self._significance = significance(left, normals, variance, self._response, deviations)
         if self._significance > FOUND:
             self._since = stamp if math.isnan(self._since) else self._since
         elif self._significance < LOST:
             self._since = math.nan
+
+    def _by_contacts(self, positions: Points, normals: Points) -> Points:
+        """Return the displacement by forces at the nodes of known contacts that comes closest to e, shape (n + 1, 2).
+
+        A force on node c displaces as `relax` says of a load there; what of it is along the thread is a tension from
+        there to the needle, and a load along the second differences of the nodes between.
+        """
+        touched = np.flatnonzero(self._untouched <= CONTACT_MEMORY * self._time)
+        touched = touched[touched > 0]
+        if not len(touched):
+            return np.zeros_like(positions)
+        runs = np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1)
+        columns = []
+        for node in sorted({int(end) for run in runs for end in (run[0], run[-1])}):
+            loads = np.zeros((len(positions), 4))
+            loads[node, 0] = loads[node, 1] = 1.0
+            loads[1:node, 2:] = (positions[2:] - 2.0 * positions[1:-1] + positions[:-2])[: node - 1]
+            relax(self._time * self._stiffness, self._clamped, np.zeros(4), loads)
+            columns += [loads[:, :1] * (1.0, 0.0), loads[:, 1:2] * (0.0, 1.0), loads[:, 2:]]
+        responses = np.array(columns)
+        responses /= np.maximum(np.linalg.norm(responses, axis=(1, 2)), 1e-12)[:, None, None]
+        across = np.einsum("ij,kij->ik", normals, responses)
+        aside = np.einsum("ij,ij->i", normals, self._displacement)
+        forces = np.linalg.lstsq(across, aside, rcond=1e-3)[0]
+        return np.asarray(np.einsum("k,kij->ij", forces, responses))
 
     def found(self, stamp: float, positions: Points) -> tuple[Disturbance, ...]:
         """Return the forces that explain what the camera moves the thread by, if it does so for long."""
@@ -212,6 +271,6 @@ class DisturbanceTest:
             return ()
         thread = self._thread
         drag, bending = thread.medium, thread.bending_stiffness * self._time
-        rate = self._displacement / self._time
+        rate = (self._displacement - self._explained) / self._time
         force = force_density(rate, positions, drag.drag_across, drag.drag_along, bending)
         return (strongest(force, positions, thread.segment_length, self._significance, self._since),)

@@ -172,7 +172,7 @@ class ThreadEstimator:
             self._variance,
             self._density,
         )
-        self._test.decay(self._prediction.interval)
+        self._test.decay(self._prediction.interval, self._formulation.nodes_in_contact)
         return self.correct(observation) if observation is not None else self._estimate(())
 
     def correct(self, observation: ThreadObservation) -> ThreadEstimate:
@@ -274,13 +274,15 @@ class ThreadEstimator:
         work = self._corrector.work
         hidden = take_correction(points, weights, work, unit, self._noise.bank, density, self._variance)
         self._slow.correct(self._corrector, self._variance)
+        positions = work.about * unit
         # What of a point's variance does not change from frame to frame is of the dish's place in the image: the points
         # of a window share it, and so do both times that the test compares.
         shared = max(1.0 - self._noise.scale, MIN_SHARED) / self._noise.scale * self._sums.independent
         variance = self._sums.own * (1.0 + 0.5 * shared) * unit**2
         if math.isfinite(self._measured_at):  # else there is no earlier time to compare with
-            self._test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
-        corrected = ThreadState(work.about * unit, state.velocities, state.interval)
+            deviations = np.asarray(pose.deviation)
+            self._test.add(positions, work.moved * unit, work.normals, variance, pose.stamp, deviations)
+        corrected = ThreadState(positions, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True
         self._unknown = False

@@ -70,10 +70,10 @@ def relax(amount: float, clamped: bool, slope: Vector, displacement: Points) -> 
 
 
 @compiled
-def add_displacement(
-    displacement: Points, moved: Points, normals: Points, variance: Vector, response: Points, deviations: Vector
+def significance(
+    displacement: Points, normals: Points, variance: Vector, response: Points, deviations: Vector
 ) -> float:
-    """Add to a displacement; return how significant it is in its worst window, against what needs no disturbance.
+    """Return how significant a displacement is in its worst window, against what needs no disturbance.
 
         z = |mean displacement| / (2 r + sum_j (g_j s_j)^2)^(1/2)
 
@@ -81,15 +81,13 @@ def add_displacement(
     the points alone, r; and g_j s_j are what errors of the needle's pose displace it by.
 
     Args:
-        displacement: shape (n + 1, 2); written.
-        moved: what is added, shape (n + 1, 2).
+        displacement: shape (n + 1, 2).
         normals: of the nodes, shape (n + 1, 2).
         variance: r of the mean of a window's points, inf where nothing is measured, shape (w,).
         response: g, displacement of each node across the thread by each error of the pose, shape (n + 1, p).
         deviations: s, standard deviation of each error of the pose, shape (p,).
     """
     windows, nodes, largest = len(variance), len(displacement), 0.0
-    displacement += moved
     explained = np.empty(len(deviations))
     for w in range(windows):
         total, count = 0.0, 0

@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier, CompiledBarrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
@@ -116,6 +117,14 @@ class RodFormulation(Formulation):
         self._rubs = knows_friction(self._near.data)
         self._motion = MotionBuffers.of(thread.segments + 1, dimension)
         self._use(self._buffers)
+
+    @property
+    def nodes_in_contact(self) -> NDArray[np.bool_]:
+        """Which nodes shapes or wall pushed in the last step, at a node or on a chord beside it, shape (n + 1,)."""
+        at_nodes, on_chords = self._buffers.push > 0.0
+        at_nodes |= on_chords
+        at_nodes[1:] |= on_chords[:-1]
+        return np.asarray(at_nodes)
 
     @property
     def rod(self) -> RodProperties:

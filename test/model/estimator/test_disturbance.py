@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimator
+from magnetosuture_thread.model.estimator.disturbance import DisturbanceTest
 from magnetosuture_thread.model.estimator.relaxation import relax
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
@@ -84,3 +85,44 @@ def test_a_bent_thread_that_is_held_is_estimated_where_it_is_and_the_hold_is_rep
     assert np.linalg.norm(predicted - held, axis=1).max() > 0.05 * thread.length
     assert any(reported[: round(0.5 * RATE)])
     assert all(reported[round(RATE) :])
+
+
+def pushed(thread: Thread, node: int, size: float) -> np.ndarray:
+    """Return by how much a force at a node displaces a straight thread across it in a frame, at most by a size [m]."""
+    aside = np.zeros((thread.segments + 1, 2))
+    aside[node, 1] = 1.0
+    stiffness = thread.bending_stiffness / (thread.medium.drag_across * thread.segment_length**4)
+    relax(stiffness / RATE, False, np.zeros(2), aside)
+    return np.asarray(size / np.abs(aside).max() * aside)
+
+
+def forces_found(contact: int | None, held: int, first_interval: float = 1.0 / RATE) -> list[tuple[Disturbance, ...]]:
+    """Return what is found of a thread held at a node, where the model knows of a contact of the node `contact`."""
+    thread = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
+    positions = np.column_stack([-thread.segment_length * np.arange(26.0), np.zeros(26)])
+    normals = np.tile([0.0, -1.0], (26, 1))
+    touched = np.zeros(26, dtype=np.bool_)
+    touched[[] if contact is None else contact] = True
+    test, found = DisturbanceTest(thread, 0.4), []
+    for k in range(15):
+        test.decay(first_interval if k == 0 else 1.0 / RATE, touched)
+        stamp, moved = k / RATE, pushed(thread, held, 4e-5)
+        test.add(positions, moved, normals, np.full(16, 1e-11), stamp, np.array([1e-5, 1e-3]))
+        found.append(test.found(stamp, positions))
+    return found
+
+
+def test_what_a_known_contact_could_push_with_is_no_disturbance() -> None:
+    assert any(forces_found(None, 25))
+    assert not any(forces_found(25, 25))
+
+
+def test_a_force_elsewhere_than_at_a_known_contact_is_found_where_it_is() -> None:
+    (found,) = forces_found(25, 12)[-1]
+    assert found.arc_length == pytest.approx(12 / 25 * 0.019, abs=2e-3)
+
+
+def test_the_first_frame_after_a_gap_between_poses_says_nothing_of_disturbances() -> None:
+    in_time, late = (forces_found(None, 12, interval) for interval in (1.0 / RATE, 3.0))
+    first = [next(k for k, each in enumerate(found) if each) for found in (in_time, late)]
+    assert first[1] == first[0] + 1
