@@ -23,7 +23,7 @@ ALIGN_WEIGHT = 0.1
 DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
-COIL_ERROR = 0.05  # of a calibrated coil's field
+COIL_ERROR = 0.025  # of a coil's field, with its gain estimated
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
@@ -131,6 +131,7 @@ class CoilAllocation:
         self._needle = needle
         self._field = aligning_field
         self._max_current = max_current
+        self.gains = np.ones(len(self.names))
 
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
@@ -166,16 +167,13 @@ class CoilAllocation:
         e = needle.chord_direction(heading)
         n = np.array([-e[1], e[0]])
         lever = 0.5 * needle.chord
-        field_e, field_n = e, n  # to which the field is to be set
-        if disturbance is not None:
-            c, s = math.cos(disturbance.angle), math.sin(disturbance.angle)
-            field_e, field_n = c * e - s * n, c * n + s * e
-        at_tail, at_tip = self._coils.per_current(tail), self._coils.per_current(tail + needle.chord * e)
+        at_tail = self.gains * self._coils.per_current(tail)
+        at_tip = self.gains * self._coils.per_current(tail + needle.chord * e)
         mean = 0.5 * (at_tail + at_tip)
         pull = needle.pole * (at_tip - at_tail)
         along = e @ pull / needle.drag
         drifting = n @ pull / needle.drag_across
-        turning = lever * needle.pole * needle.chord / needle.turning_drag * (field_n @ mean)
+        turning = lever * needle.pole * needle.chord / needle.turning_drag * (n @ mean)
         # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
         sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n)))
@@ -184,13 +182,13 @@ class CoilAllocation:
         if disturbance is not None:
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
             # the needle takes large currents whose fields cancel each other, and their errors do not.
-            turned = lever / CORRECTION_TIME * (field_n @ mean) / self._field
+            turned = lever / CORRECTION_TIME * (n @ mean) / self._field
             effort = np.hypot(effort, DRIFT_WEIGHT / reference_speed * COIL_ERROR * np.hypot(drifting, turned))
         system = np.vstack(
             [
                 DRIVE_WEIGHT / reference_speed * along,
                 TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drifting),
-                ALIGN_WEIGHT / self._field * (field_e @ mean),
+                ALIGN_WEIGHT / self._field * (e @ mean),
                 DRIFT_WEIGHT / reference_speed * drifting,
                 np.diag(effort),
             ]

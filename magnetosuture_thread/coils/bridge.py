@@ -132,6 +132,7 @@ class CoilBridge:
         self.feedforward = settings.feedforward()
         self._observer = MotionObserver(settings.needle().kinematics) if settings.motion_compensation else None
         self._settings = settings
+        self._gains = settings.gain_estimator()
         self._coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
         self._filter: NeedleSafetyFilter | None = None
         self._losses = 0
@@ -194,6 +195,8 @@ class CoilBridge:
         self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance)
         if self._observer is not None:
             self._observer.update(tail, heading, stamp)
+            self._gains.update(tail, heading, stamp)
+            self._coils.set_gains(self._gains.gains)
 
     def on_margins(self, stamp: float, valid: bool, slowdown: float, scene_version: str, arrival: float) -> None:
         """Register the thread model's margins; see `PredictionMonitor.update`."""
@@ -296,7 +299,8 @@ class CoilBridge:
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
         self.extrapolator.apply_velocity(expected, now, arrival)
         if self._observer is not None:
-            self._observer.apply(now, pose.heading, float(e @ allocation.velocity), allocation.drift, elapsed)
+            self._observer.apply(pose.heading, float(e @ allocation.velocity), allocation.drift, elapsed)
+            self._gains.apply(now, allocation.currents)
         return self._output(selected, (), True, active, filtered.slowdown)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
@@ -379,4 +383,4 @@ class CoilBridge:
         """Restart the limits on change from zero current and velocity."""
         self._previous, self._velocity = self._coils.zero(), np.zeros(2)
         if self._observer is not None:
-            self._observer.stop()
+            self._gains.stop()

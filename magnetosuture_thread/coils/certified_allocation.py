@@ -43,6 +43,10 @@ class CertifiedAllocation:
         """Return zero currents."""
         return self._coils.zero()
 
+    def set_gains(self, gains: Vector) -> None:
+        """Set by which factor each coil's field differs from its calibration, shape (m,)."""
+        self._coils.gains = gains
+
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
         return self._coils.chord_direction(heading)

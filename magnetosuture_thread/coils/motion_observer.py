@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +13,8 @@ from magnetosuture_thread.safety import NeedleKinematics
 Vector = NDArray[np.float64]
 
 GAIN = 8.0  # 1/s; of the velocities, well below the rate and the delay of a camera's poses
-ANGLE_GAIN = 0.3  # of the angle, for each pose
 MAX_INTERVAL = 0.2  # s; two poses farther apart say nothing of the motion between them
 MAX_SPEED = 0.006  # m/s; compensated at most
-MAX_ANGLE = 0.3  # rad; compensated at most
 
 
 class MotionDisturbance(NamedTuple):
@@ -26,12 +23,10 @@ class MotionDisturbance(NamedTuple):
     Attributes:
         along: velocity of the whole needle along its chord [m/s].
         drift: velocity of the whole needle across its chord, to the left [m/s].
-        angle: by which the needle is turned from the direction that the field was set for, to the left [rad].
     """
 
     along: float = 0.0
     drift: float = 0.0
-    angle: float = 0.0
 
     def velocity(self, e: Vector) -> Vector:
         """Return the velocity of the whole needle for the unit vector from tail to tip, shapes (2,) [m/s]."""
@@ -47,12 +42,8 @@ class MotionObserver:
 
         d' = g (m - c - d)
 
-    A needle turns into the field within hundredths of a second, and where coils are weaker than their calibration the
-    field has another direction than it was set for. The angle a follows the measured heading, beside the heading that
-    the field was set for at the pose's stamp, by a <- a + k (measured - set).
-
-    Source: disturbance observers of first order, Ohnishi, Shibata and Murakami 1996. Deviation: of velocities and an
-    angle, not of forces, as inertia has no part. Pure: times come in, in seconds.
+    Source: disturbance observers of first order, Ohnishi, Shibata and Murakami 1996. Deviation: of velocities, not of
+    forces, as inertia has no part. Pure: times come in, in seconds.
 
     Args:
         needle: its kinematics.
@@ -60,10 +51,9 @@ class MotionObserver:
 
     def __init__(self, needle: NeedleKinematics) -> None:
         self._needle = needle
-        self._velocity, self._angle = np.zeros(2), 0.0
+        self._velocity = np.zeros(2)
         self._last: tuple[float, Vector, Vector] | None = None
         self._applied, self._duration = np.zeros(2), 0.0
-        self._set: deque[tuple[float, Vector]] = deque()
 
     def update(self, tail: Vector, heading: Vector, stamp: float) -> None:
         """Take a measured pose.
@@ -78,36 +68,24 @@ class MotionObserver:
         last, self._last = self._last, (stamp, middle, e)
         applied = self._applied / self._duration if self._duration > 0.0 else np.zeros(2)
         self._applied, self._duration = np.zeros(2), 0.0
-        while len(self._set) > 1 and self._set[1][0] <= stamp:
-            self._set.popleft()
-        if self._set and self._set[0][0] <= stamp:
-            wanted = self._set[0][1]
-            off = math.atan2(wanted[0] * e[1] - wanted[1] * e[0], float(wanted @ e))
-            self._angle = min(MAX_ANGLE, max(-MAX_ANGLE, self._angle + ANGLE_GAIN * off))
         if last is None or not 0.0 < stamp - last[0] <= MAX_INTERVAL:
             self._velocity = np.zeros(2)
             return
         interval, moved = stamp - last[0], middle - last[1]
         self._velocity += min(1.0, GAIN * interval) * (moved / interval - applied - self._velocity)
 
-    def apply(self, now: float, heading: Vector, along: float, drift: float, duration: float) -> None:
+    def apply(self, heading: Vector, along: float, drift: float, duration: float) -> None:
         """Register what currents are set for.
 
         Args:
-            now: time of the stamps' clock [s].
             heading: that the field is set for, at the tail, shape (2,).
             along: velocity along the chord that the currents give, by the bridge's model [m/s].
             drift: the same across it, to the left [m/s].
             duration: since the last currents [s].
         """
         e = self._needle.chord_direction(heading)
-        self._set.append((now, e))
         self._applied += duration * np.array([along * e[0] - drift * e[1], along * e[1] + drift * e[0]])
         self._duration += duration
-
-    def stop(self) -> None:
-        """Register that the currents are zero: nothing holds the needle's direction."""
-        self._set.clear()
 
     def disturbance(self, heading: Vector) -> MotionDisturbance:
         """Return what to compensate.
@@ -117,4 +95,4 @@ class MotionObserver:
         """
         e = self._needle.chord_direction(heading)
         x, y = self._velocity * min(1.0, MAX_SPEED / max(math.hypot(*self._velocity), 1e-12))
-        return MotionDisturbance(float(e[0] * x + e[1] * y), float(e[0] * y - e[1] * x), self._angle)
+        return MotionDisturbance(float(e[0] * x + e[1] * y), float(e[0] * y - e[1] * x))

@@ -13,7 +13,8 @@ from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
 from magnetosuture_thread.coils.feedforward import ThreadFeedforward
-from magnetosuture_thread.coils.field import CoilProperties, coils_around, make_coils
+from magnetosuture_thread.coils.field import CoilModel, CoilProperties, coils_around, make_coils
+from magnetosuture_thread.coils.gain_estimator import CoilGainEstimator
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
@@ -220,9 +221,16 @@ class CoilBridgeSettings(Configuration):
 
     def allocation(self) -> CoilAllocation:
         """Return the allocation of velocities to currents."""
+        return CoilAllocation(self.coil_field(), self.needle(), self.aligning_field, self.max_current)
+
+    def coil_field(self) -> CoilModel:
+        """Return the coils' field, as calibrated or by their geometry."""
         model = self.coil_model if self._calibration is None else self._calibration.model
-        coils = make_coils(model, self.coils_properties())
-        return CoilAllocation(coils, self.needle(), self.aligning_field, self.max_current)
+        return make_coils(model, self.coils_properties())
+
+    def gain_estimator(self) -> CoilGainEstimator:
+        """Return what estimates the coils' gains."""
+        return CoilGainEstimator(self.coil_field(), self.needle().kinematics)
 
     @property
     def hold_time(self) -> float:
