@@ -36,7 +36,7 @@ MAX_CURVATURE = 800.0  # 1/m, of the path where it turns back from the wall
 SPEED = 8e-3  # m/s
 STEPS = 300
 TOLERANCE = 1e-6  # of residuals
-INSTANTS = np.linspace(0.0, 1.0, 9)[1:]  # of each part of a step, at which it is checked that the thread does not cross itself
+INSTANTS = np.linspace(0.0, 1.0, 9)[1:]  # of each part of a step, when the thread may not cross itself
 TOUCHING = 1e-6  # m
 RIG_SHARE = 10  # of the motions, one in so many is the rig's too
 

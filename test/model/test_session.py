@@ -469,8 +469,9 @@ def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, 
         margins = prediction.margins["obstacle"]
         if isinstance(obstacle, Disc):
             distance = obstacle.signed_distance(prediction.positions)[0] - 30e-6
-            np.testing.assert_allclose(margins.clearance, distance[margins.node], atol=1e-12)
-        assert margins.clearance.min(initial=0.0) > -1e-7
+            np.testing.assert_allclose(margins.value, distance[margins.node], atol=1e-12)
+        assert margins.value.min(initial=0.0) > -1e-7
+        assert (margins.clearance <= margins.value).all()
     assert (proven > 0) == (isinstance(obstacle, Polygon) or obstacle == Disc((-0.01, 1e-4), 0.001))
 
 
