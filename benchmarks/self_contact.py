@@ -12,12 +12,15 @@ import numpy as np
 import shapely
 from rich.table import Table
 
-from magnetosuture_thread import NeedlePose, Scene, SolverError, ThreadPredictor
+from magnetosuture_thread import NeedlePose, SolverError, ThreadPredictor
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
+from magnetosuture_thread.model.formulations import PrescribedMotion, RodFormulation, StepResult, ThreadState
+from magnetosuture_thread.model.self_contact import SelfContact
+from magnetosuture_thread.model.solvers import make_solver
 from magnetosuture_thread.model.thread import Attachment, Medium, Thread
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.scene import Dish
 
 RATE = 60.0
 LENGTH = 0.019  # m
@@ -32,7 +35,8 @@ PATH = (600.0, 0.6)  # standard deviation of the path's curvature [1/m] and its 
 MAX_CURVATURE = 800.0  # 1/m, of the path where it turns back from the wall
 SPEED = 8e-3  # m/s
 STEPS = 300
-INSTANTS = np.linspace(0.0, 1.0, 9)[1:]  # of each step, at which it is checked that the thread does not cross itself
+TOLERANCE = 1e-6  # of residuals
+INSTANTS = np.linspace(0.0, 1.0, 9)[1:]  # of each part of a step, when the thread may not cross itself
 TOUCHING = 1e-6  # m
 RIG_SHARE = 10  # of the motions, one in so many is the rig's too
 
@@ -43,7 +47,7 @@ class RandomMotion:
 
     Attributes:
         steps: of the needle.
-        crossed: steps in which the thread crossed itself at one of `INSTANTS`.
+        crossed: steps in which the thread crossed itself at one of `INSTANTS`, on the way that its nodes took.
         touched: steps at whose end it touched itself.
         refused: steps that were refused.
         unconverged: steps that did not converge.
@@ -80,18 +84,39 @@ def start_nodes() -> Points:
     return chain_along(arc, SEGMENTS, LENGTH / SEGMENTS)
 
 
+class RecordingFormulation(RodFormulation):
+    """Records where the thread was at the end of each part of a step, as the predictor divides some.
+
+    Attributes:
+        path: all nodes at those instants, each of shape (n + 1, 2) [m].
+    """
+
+    path: list[Points]
+
+    def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
+        """Record the step, unless the predictor divides it; see `RodFormulation`."""
+        done = super().step(state, drive, interval)
+        if not done.passed:
+            self.path.append(done.state.positions)
+        return done
+
+
 def move_model(seed: int, self_contact: bool, steps: int = STEPS) -> RandomMotion:
     """Return what a motion of the thread model comes to, in a scene where the thread touches itself or crosses."""
     thread = Thread("soft", LENGTH, SEGMENTS, DIAMETER, STIFFNESS, Medium(DRAG, 0.5 * DRAG), Attachment.PINNED)
-    predictor = ThreadPredictor(thread, Scene(Dish(DISH, self_contact=self_contact)))
+    barriers = (SelfContact(thread),) if self_contact else ()
+    dish, solver = Workspace((), 5e-3, wall_radius=0.5 * DISH), make_solver("banded", TOLERANCE)
+    formulation = RecordingFormulation(thread, dish, solver, TOLERANCE, barriers)
+    predictor = ThreadPredictor(thread, dish, formulation=formulation)
     predictor.start(NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0])), start_nodes())
     result = RandomMotion()
 
-    def step(k: int, tail: Points, angle: float) -> tuple[Points, float]:
+    def step(k: int, tail: Points, angle: float) -> tuple[list[Points], float]:
+        formulation.path = []
         prediction = predictor.step(NeedlePose(k / RATE, tail, np.array([math.cos(angle), math.sin(angle)])))
         result.unconverged += not prediction.converged
         clearance = prediction.margins["self_contact"].minimum_clearance if self_contact else math.inf
-        return prediction.positions, clearance
+        return formulation.path, clearance
 
     return _moved(result, step, seed, steps)
 
@@ -111,31 +136,33 @@ def move_rig(seed: int, self_contact: bool, steps: int = STEPS) -> RandomMotion:
     surface, body = Surface(wall_radius=0.5 * DISH, self_contact=self_contact), NeedleBody(2e-4, 5e-5, 0.0, 0.0, 1.0)
     rig = RigDynamics(body, thread, surface, None, np.zeros(2), 0.0, start_nodes(), largest_step=4e-3)
 
-    def step(k: int, tail: Points, angle: float) -> tuple[Points, float]:
+    def step(k: int, tail: Points, angle: float) -> tuple[list[Points], float]:
         rig.drive(tail, angle, 1.0 / RATE)
-        return rig.thread, math.inf
+        return [rig.thread], math.inf
 
     return _moved(RandomMotion(), step, seed, steps)
 
 
 def _moved(
-    result: RandomMotion, step: Callable[[int, Points, float], tuple[Points, float]], seed: int, steps: int
+    result: RandomMotion, step: Callable[[int, Points, float], tuple[list[Points], float]], seed: int, steps: int
 ) -> RandomMotion:
     before = start_nodes()
     for k, (tail, angle) in enumerate(random_path(seed, steps), 1):
         result.steps += 1
         began = time.process_time()
         try:
-            after, clearance = step(k, tail, angle)
+            path, clearance = step(k, tail, angle)
         except SolverError:
             result.refused += 1
             continue
         touches = clearance < TOUCHING
         result.times[int(touches)].append(time.process_time() - began)
         result.touched += touches
-        between = [before + part * (after - before) for part in INSTANTS]
+        between = []
+        for after in path:
+            between += [before + part * (after - before) for part in INSTANTS]
+            before = after
         result.crossed += not shapely.is_simple(shapely.linestrings(between)).all()
-        before = after
     return result
 
 

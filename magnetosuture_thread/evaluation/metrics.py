@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -197,6 +197,7 @@ class MinimumMargin:
     Attributes:
         kind: name of the barrier.
         clearance: as a distance [m].
+        value: least h of all rows at all times, which may be another row's, in the unit of its barrier.
         node: index.
         obstacle: index, -1 where there is none.
         time: since the bag's start [s].
@@ -204,6 +205,7 @@ class MinimumMargin:
 
     kind: str
     clearance: float
+    value: float
     node: int
     obstacle: int
     time: float
@@ -271,10 +273,13 @@ class RunMetrics:
         """Add the prediction of a frame; its errors are set when they are computed."""
         if frame.margins is not None:
             for row in frame.margins.minima:
-                held = self._minimum.get(row.barrier)
+                held, value = self._minimum.get(row.barrier), frame.margins[row.barrier].minimum
                 if held is None or row.clearance[0] < held.clearance:
                     place = int(row.node[0]), int(row.obstacle[0]), self._time(frame.stamp)
-                    self._minimum[row.barrier] = MinimumMargin(row.barrier, float(row.clearance[0]), *place)
+                    value = value if held is None else min(value, held.value)
+                    self._minimum[row.barrier] = MinimumMargin(row.barrier, float(row.clearance[0]), value, *place)
+                elif value < held.value:
+                    self._minimum[row.barrier] = replace(held, value=value)
             self.contact_frames += frame.in_contact
         self.disturbances.add(self._time(frame.stamp), frame)
         if self._fresh and len(frame.vertices) != len(self._fresh[0].vertices):  # the model's segments have changed

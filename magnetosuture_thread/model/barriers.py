@@ -175,15 +175,22 @@ class _ContactBarrier(CompiledBarrier):
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
-        return self.rows_of(self.workspace.near(positions))
+        contacts = self.workspace.near(positions)
+        return self.rows_of(contacts, contacts.distance)
 
-    def rows_of(self, contacts: Contacts) -> BarrierRows:
-        """Return the same rows from what is known to be near."""
+    def rows_of(self, contacts: Contacts, distance: NDArray[np.float64]) -> BarrierRows:
+        """Return the same rows from what is known to be near.
+
+        Args:
+            contacts: of the nodes.
+            distance: that the clearance is of, as of the segments beside a node, shape (k,).
+        """
         chosen = np.flatnonzero(contacts.nearest & ((contacts.obstacle == DISH_WALL) == (self.name == WALL)))
         signed, normal = contacts.distance[chosen], contacts.normal[chosen]
         value, gradient = self._function(signed, normal)
         node, obstacle = contacts.node[chosen][:, None], contacts.obstacle[chosen]
-        return BarrierRows(self.name, node, obstacle, value, gradient[:, None, :], signed - self.distance)
+        clearance = distance[chosen] - self.distance
+        return BarrierRows(self.name, node, obstacle, value, gradient[:, None, :], clearance)
 
     def _function(self, signed: NDArray[np.float64], normal: Points) -> tuple[NDArray[np.float64], Points]:
         """Return h and its gradient for signed distances and their gradients."""

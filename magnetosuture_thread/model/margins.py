@@ -74,7 +74,8 @@ class BarrierMargins:
         obstacle: index of the scene's shape, -1 where there is none, shape (m,).
         value: h, safe at >= 0, shape (m,); [m] for an obstacle and the wall, [m^4] for stiffness, [m^2] for
             connectivity and compression, else the barrier's own unit.
-        clearance: the same margin as a distance, shape (m,) [m].
+        clearance: the same margin as a distance, shape (m,) [m]; of an obstacle and the wall that of the node and the
+            half segments beside it, so that the least is that of the whole thread.
         bound: the clearance is greater than this with a probability of 99 %, shape (m,) [m]; -inf where the thread's
             covariance is not known.
     """
@@ -239,7 +240,7 @@ class FrictionLaw:
         threshold: of h_obs,i,O, a distance [m].
         beta: 0 < beta <= 1.
         stuck_speed: a node that is not faster rests [m/s].
-        by_bound: whether the bound of a clearance counts where there is one, in place of the clearance.
+        by_bound: whether h less what the 99 % bound is below the clearance counts in place of h, where there is one.
     """
 
     threshold: float
@@ -255,10 +256,10 @@ class FrictionLaw:
             speeds: of each node, shape (n + 1,) [m/s].
         """
         obstacle = margins[OBSTACLE]
-        clearance = obstacle.clearance
+        value = obstacle.value
         if self.by_bound:
-            clearance = np.where(np.isfinite(obstacle.bound), obstacle.bound, clearance)
-        close = np.bincount(obstacle.node[clearance < self.threshold], minlength=len(speeds))
+            value = np.where(np.isfinite(obstacle.bound), value - (obstacle.clearance - obstacle.bound), value)
+        close = np.bincount(obstacle.node[value < self.threshold], minlength=len(speeds))
         close[0] = 0  # the needle: what holds it back is no friction of the thread
         index = np.flatnonzero(close >= 2)
         if not len(index):

@@ -92,7 +92,8 @@ class ThreadPredictor:
             workspace = scene
         elif scene is not None:
             check_scene(thread, scene)
-            reach = margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
+            # Margins are of the thread's surface, and of the half segments beside a node.
+            reach = margin_range + 0.5 * (thread.diameter + thread.segment_length)
             workspace = Workspace(
                 scene.obstacles,
                 reach,

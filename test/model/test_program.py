@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.model.program import ChainProgram, Residuals, as_quadratic_program, residuals_of
+from magnetosuture_thread.model.program import ChainProgram, Residuals, WideRows, as_quadratic_program, residuals_of
 
 
 def random_program(seed: int, nodes: int = 9, dimension: int = 2, soft: bool = False) -> ChainProgram:
@@ -79,6 +79,42 @@ def test_a_soft_row_gives_way_by_its_compliance():
 )
 def test_the_residuals_see_every_fault(u: np.ndarray, multipliers: list[float], which: str):
     assert getattr(residuals_of(one_node(), u, np.array(multipliers)), which) > 0.03
+
+
+def rubbing(limit: float, pull: float) -> ChainProgram:
+    """Return: minimise x^2 + y^2 - pull x - 6 y with y <= 0, so N = 6, and friction of at most `limit` on x."""
+    gradient = np.zeros((2, 3, 2))
+    gradient[0, 0], gradient[1, 0] = (0.0, 1.0), (1.0, 0.0)
+    return one_node()._replace(
+        linear=np.array([[-pull, -6.0], [0.0, 0.0], [0.0, 0.0]]),
+        gradient=gradient,
+        lower=np.array([-np.inf, 0.0]),
+        upper=np.zeros(2),
+        limit=np.array([np.inf, limit]),
+    )
+
+
+@pytest.mark.parametrize("pull", [-4.0, -1.0, 1.0, 4.0])
+def test_residuals_vanish_where_friction_holds_and_where_it_slides(pull: float):
+    """The balance on x is 2 x - pull = F: F = -pull holds the node, else it slides against mu N = 1.8."""
+    force = -float(np.clip(pull, -1.8, 1.8))
+    found = residuals_of(rubbing(0.3 * 6.0, pull), at(0.5 * (pull + force), 0.0), np.array([-6.0, force]))
+    assert found.largest < 1e-15
+
+
+@pytest.mark.parametrize("excess", [1e-5, 0.1, 2.0])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_multiplier_beyond_the_friction_cone_is_seen(excess: float, sign: float):
+    """Friction beyond mu N holds the node with all forces in balance and no bound missed: only the cone tells."""
+    limit = 0.3 * 6.0
+    pull = sign * (limit + excess)
+    multipliers = np.array([-6.0, -pull])
+    assert residuals_of(rubbing(abs(pull), pull), at(0.0, 0.0), multipliers).largest < 1e-15
+    found = residuals_of(rubbing(limit, pull), at(0.0, 0.0), multipliers)
+    assert found.dual == pytest.approx(excess / 6.0, rel=1e-6)  # of the largest multiplier
+    assert (found.primal, found.complementarity) == (0.0, 0.0)
+    wide = WideRows(np.array([[0, 2]]), np.zeros((1, 2, 2)), np.full(1, -1.0), np.zeros(1))
+    assert residuals_of(rubbing(limit, pull), at(0.0, 0.0), np.append(multipliers, 0.0), wide) == found
 
 
 def test_a_far_bound_does_not_make_light_of_the_others():

@@ -469,9 +469,43 @@ def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, 
         margins = prediction.margins["obstacle"]
         if isinstance(obstacle, Disc):
             distance = obstacle.signed_distance(prediction.positions)[0] - 30e-6
-            np.testing.assert_allclose(margins.clearance, distance[margins.node], atol=1e-12)
-        assert margins.clearance.min(initial=0.0) > -1e-7
+            np.testing.assert_allclose(margins.value, distance[margins.node], atol=1e-12)
+        assert margins.value.min(initial=0.0) > -1e-7
+        assert (margins.clearance <= margins.value).all()
     assert (proven > 0) == (isinstance(obstacle, Polygon) or obstacle == Disc((-0.01, 1e-4), 0.001))
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize(
+    ("offsets", "leaves"),
+    [
+        ([(0.0, 4e-4)], True),  # of posts of 0.6 mm from the node
+        ([(0.0, 0.0)], True),
+        ([(3e-4, 4e-4), (-3e-4, 4e-4), (0.0, 9e-4)], True),
+        ([(0.0, 4e-4), (0.0, -4e-4)], False),  # in both at once, each pushes it into the other
+        ([(3e-4 * np.cos(k), 3e-4 * np.sin(k)) for k in range(7)], True),  # more shapes than it has friction with
+    ],
+)
+def test_shapes_that_appear_around_a_moving_node_are_resolved_or_reported(
+    formulation: str, offsets: list[tuple[float, float]], leaves: bool
+):
+    """No step hangs or raises, and no margins are given of a thread of which a node is still inside."""
+    session = straight(formulation=formulation)
+    node = on_a_curve(session, 0, 30)[-1].positions[12]
+    posts = [Disc(tuple(node + offset), 6e-4) for offset in offsets]
+    session.change(session.settings, scene_with(*posts))
+    given = []
+    for k in range(30, 45):
+        outcome = go(session, 1.0 + k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0)
+        given.append(outcome.margins is not None)
+        if outcome.margins is None:
+            assert outcome.reason
+            continue
+        nodes = predicted(outcome).positions[1:]
+        least = min(float(post.signed_distance(nodes)[0].min()) for post in posts) - 30e-6
+        assert least > -1e-6
+        assert outcome.margins["obstacle"].minimum_clearance <= least + 1e-12
+    assert sum(given) > 10 if leaves else sum(given) < 5
 
 
 def test_no_kernel_is_compiled_by_a_change():

@@ -252,7 +252,7 @@ def test_a_scene_that_appears_pushes_the_estimate_out():
     result = session.on_pose(stamp_of(WAY[30]), at(WAY[30]))
     assert result.margins is not None
     assert result.margins.scene_version == scene.version
-    assert result.margins["obstacle"].minimum_clearance > -1e-6
+    assert result.margins["obstacle"].minimum > -1e-6
 
 
 def test_an_observation_waits_for_its_pose_while_settings_change():

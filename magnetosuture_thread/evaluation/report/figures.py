@@ -299,7 +299,8 @@ def _min_clearance(about: BagDetails, least: MinimumMargin) -> float:
 
 
 def _holds(about: BagDetails, least: MinimumMargin) -> bool:
-    return least.clearance >= _min_clearance(about, least)
+    # What the program keeps outside of something solid is h, of nodes; on a disc the chord between two lies deeper.
+    return (least.value if least.kind in SOLID else least.clearance) >= _min_clearance(about, least)
 
 
 def margin_state(about: BagDetails, margin: MinimumMargin) -> str:

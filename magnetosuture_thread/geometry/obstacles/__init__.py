@@ -9,6 +9,7 @@ from magnetosuture_thread.geometry.obstacles.contacts import (
     find_contacts,
     wall_contact,
 )
+from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distances
 from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
 from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
 from magnetosuture_thread.geometry.obstacles.workspace import MAX_FRICTION, Contacts, Workspace
@@ -26,6 +27,7 @@ __all__ = [
     "Workspace",
     "WorkspaceData",
     "find_contacts",
+    "half_segment_distances",
     "triangulate",
     "wall_contact",
 ]

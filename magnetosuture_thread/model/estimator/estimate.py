@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import OBSTACLE, WALL, BarrierRows
+from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.model.estimator.innovations import Innovations
@@ -18,7 +18,7 @@ from magnetosuture_thread.model.estimator.options import EstimatorOptions
 from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameter
 from magnetosuture_thread.model.formulations import ThreadState
 from magnetosuture_thread.model.formulations.step import WarmStart
-from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.margins import SOLID, Margins
 from magnetosuture_thread.model.prediction import NeedlePose, Prediction
 from magnetosuture_thread.model.thread import Thread
 
@@ -95,23 +95,29 @@ class ThreadEstimate:
 
             clearance - 2.33 sum_k (g_k' C_k g_k)^(1/2) / |g|
 
-        with the covariances C_k of the nodes that the row depends on, taken as fully correlated.
+        with the covariances C_k of the nodes that the row depends on, taken as fully correlated. Of obstacles and wall
+        the clearance is that of the half segments beside a node too, and the greatest deviation along g of the node
+        and its neighbours counts: that of a point between two nodes is not greater.
         """
         bounds = {}
         for rows in self._rows:
-            if rows.name in (OBSTACLE, WALL) or rows.name not in _OWN:
-                bounds[rows.name] = _bound(rows, self.covariance)
+            if rows.name in SOLID or rows.name not in _OWN:
+                bounds[rows.name] = _bound(rows, self.covariance, rows.name in SOLID)
         return bounds
 
 
-_OWN = ("connectivity", "compression", "enhanced_connectivity", "stiffness", OBSTACLE, WALL)
+_OWN = ("connectivity", "compression", "enhanced_connectivity", "stiffness", *SOLID)
 
 
-def _bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
+def _bound(rows: BarrierRows, covariance: NDArray[np.float64], of_segments: bool) -> Vector:
     if not len(rows.clearance):
         return rows.clearance
-    spread = np.einsum("rkab,rkb->rka", covariance[rows.nodes], rows.gradient)
-    deviation = np.sqrt(np.maximum(np.einsum("rka,rka->rk", rows.gradient, spread), 0.0)).sum(axis=1)
+    deviation = np.zeros(len(rows.clearance))
+    for apart in (-1, 0, 1) if of_segments else (0,):
+        nodes = np.clip(rows.nodes + apart, 0, len(covariance) - 1)
+        spread = np.einsum("rkab,rkb->rka", covariance[nodes], rows.gradient)
+        single = np.sqrt(np.maximum(np.einsum("rka,rka->rk", rows.gradient, spread), 0.0)).sum(axis=1)
+        deviation = np.maximum(deviation, single)
     slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
     return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
 

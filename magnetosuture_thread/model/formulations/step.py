@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.barrier import Barrier, BarrierRows, CompiledBarrier
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.obstacles import Workspace, half_segment_distances
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.model.barriers import ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.forces import ThreadForces
@@ -378,10 +378,11 @@ class Formulation(ABC):
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
         """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
         contacts = self._workspace.near(positions)
+        distance = half_segment_distances(positions, self._workspace.data, contacts)
         return [
             *(barrier.rows(positions) for barrier in self.segment_barriers(positions, heading)),
-            ObstacleAvoidance(self._workspace, self._radius).rows_of(contacts),
-            WallAvoidance(self._workspace, self._radius).rows_of(contacts),
+            ObstacleAvoidance(self._workspace, self._radius).rows_of(contacts, distance),
+            WallAvoidance(self._workspace, self._radius).rows_of(contacts, distance),
         ]
 
     def _solve(self, contacts: int, known: NDArray[np.bool_], velocities: Points, added: LinearRows | None) -> Solution:

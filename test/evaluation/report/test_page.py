@@ -337,8 +337,8 @@ def test_of_very_many_losses_none_is_left_out():
 
 def test_the_head_shows_the_margin_that_is_broken():
     metrics = made_metrics(3)
-    holds = MinimumMargin("obstacle", 1e-3, 7, 0, 0.1)
-    broken = MinimumMargin("connectivity", -1e-4, 3, -1, 0.2)
+    holds = MinimumMargin("obstacle", 1e-3, 1e-3, 7, 0, 0.1)
+    broken = MinimumMargin("connectivity", -1e-4, -1e-7, 3, -1, 0.2)
     figures = replace(BagFigures.of(metrics), minimum={"connectivity": broken, "obstacle": holds})
     tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
     assert (tile.name, tile.assessment) == ("minimum margin, connectivity", "broken: connectivity")

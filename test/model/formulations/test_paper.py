@@ -131,7 +131,7 @@ def test_no_node_enters_an_obstacle_and_one_inside_is_pushed_out(obstacle: Disc 
     def least(positions: np.ndarray) -> float:
         rows = formulation.margins(positions, east())[-2]
         assert rows.name == "obstacle"
-        return float(rows.clearance[rows.nodes[:, 0] > 0].min(initial=np.inf))
+        return float(rows.value[rows.nodes[:, 0] > 0].min(initial=np.inf))
 
     touched = False
     for done in followed(formulation, straight(thread), lambda k: k * 4e-5 * np.array([0.0, 1.0]), 300):
@@ -152,7 +152,7 @@ def test_a_long_step_does_not_overshoot_a_barrier(interval: float):
     way = 4e-5 / DT * interval * np.array([0.0, 1.0])
     for done in followed(formulation, straight(thread), lambda k: k * way, int(300 * DT / interval), interval):
         rows = formulation.margins(done.state.positions, east())[-2]
-        assert rows.clearance[rows.nodes[:, 0] > 0].min(initial=1.0) > -5e-6
+        assert rows.value[rows.nodes[:, 0] > 0].min(initial=1.0) > -5e-6
         assert stretch(thread, done.state.positions) < 0.3
 
 

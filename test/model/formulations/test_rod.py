@@ -42,7 +42,7 @@ OBSTACLE = 2  # the place of the obstacles among the margins
 def clearance(formulation: Formulation, positions: np.ndarray) -> float:
     """Return the least distance of a node but the needle's from an obstacle."""
     rows = formulation.margins(positions, east(positions.shape[1]))[OBSTACLE]
-    return float(rows.clearance[rows.nodes[:, 0] > 0].min(initial=np.inf))
+    return float(rows.value[rows.nodes[:, 0] > 0].min(initial=np.inf))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -1,0 +1,243 @@
+"""Signed distance of a chain's half segments from obstacles and the wall: of all their points, not of nodes alone."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles.contacts import (
+    BALL,
+    FACES,
+    WALL,
+    WorkspaceData,
+    cell_of,
+    nearest_of,
+    wall_contact,
+)
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_WIDTH
+from magnetosuture_thread.geometry.obstacles.search import (
+    ContactRows,
+    Vector,
+    closest_in_space,
+    closest_on_segment,
+)
+from magnetosuture_thread.geometry.obstacles.workspace import Contacts
+from magnetosuture_thread.geometry.polyline import Points
+
+TOLERANCE = 1e-7
+"""By how much a distance may be given too short; it is never too long but for rounding [m]."""
+
+_MAX_BISECTIONS = 500  # of a half segment that is inside; what is left then has its lower bound
+_MAX_CUTS = 60  # tangents of one feature's distance
+_NO_ROWS = -1.0  # in place of a reach
+
+
+@compiled
+def _along(start: Vector, end: Vector, s: float) -> Vector:
+    return (
+        start[0] + s * (end[0] - start[0]),
+        start[1] + s * (end[1] - start[1]),
+        start[2] + s * (end[2] - start[2]),
+    )
+
+
+@compiled
+def _from_feature(point: Vector, k: int, kind: int, numbers: NDArray[np.float64]) -> tuple[float, Vector]:
+    """Return the distance of a point from an edge or a face, and the vector from there to the point."""
+    x, y, z = point
+    if kind == FACES:
+        a = (numbers[k], numbers[k + 1], numbers[k + 2])
+        b = (numbers[k + 3], numbers[k + 4], numbers[k + 5])
+        c = (numbers[k + 6], numbers[k + 7], numbers[k + 8])
+        qx, qy, qz, _ = closest_in_space(point, a, b, c)
+    else:
+        qx, qy, _ = closest_on_segment(x, y, numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3])
+        qz = z
+    rx, ry, rz = x - qx, y - qy, z - qz
+    return math.sqrt(rx * rx + ry * ry + rz * rz), (rx, ry, rz)
+
+
+@compiled
+def _slope(distance: float, away: Vector, start: Vector, end: Vector) -> float:
+    """Return the derivative of a distance along the way from start to end, by the part of that way."""
+    if not distance > 0.0:
+        return 0.0
+    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    return (away[0] * x + away[1] * y + away[2] * z) / distance
+
+
+@compiled
+def _lowest(start: Vector, end: Vector, k: int, kind: int, numbers: NDArray[np.float64]) -> float:
+    """Return the least distance of a way from an edge or a face, a lower bound within the tolerance.
+
+    The distance from what is convex is convex along a straight way: it is above its tangents, and least between those
+    of opposite slopes, where the next one is taken.
+    """
+    low, high = 0.0, 1.0
+    left, away = _from_feature(start, k, kind, numbers)
+    falls = _slope(left, away, start, end)
+    if falls >= 0.0:
+        return left
+    right, away = _from_feature(end, k, kind, numbers)
+    rises = _slope(right, away, start, end)
+    if rises <= 0.0:
+        return right
+    bound = 0.0
+    for _ in range(_MAX_CUTS):
+        s = (left - right - falls * low + rises * high) / (rises - falls)
+        bound = max(left + falls * (s - low), 0.0)
+        distance, away = _from_feature(_along(start, end, s), k, kind, numbers)
+        if not (low < s < high) or distance - bound <= TOLERANCE:
+            break
+        slope = _slope(distance, away, start, end)
+        if slope == 0.0:
+            return distance
+        if slope < 0.0:
+            low, left, falls = s, distance, slope
+        else:
+            high, right, rises = s, distance, slope
+    return bound
+
+
+@compiled
+def _nearest_feature(
+    point: Vector, kind: int, base: int, width: int, first: int, last: int, data: WorkspaceData
+) -> int:
+    """Return where the numbers of the nearest of some features begin."""
+    best, at = np.inf, base
+    for slot in range(max(first, 0), last):
+        k = base + width * (data.entries[slot] if first >= 0 else slot)
+        distance, _ = _from_feature(point, k, kind, data.numbers)
+        if distance < best:
+            best, at = distance, k
+    return at
+
+
+@compiled
+def _deepest(
+    start: Vector,
+    end: Vector,
+    length: float,
+    obstacle: int,
+    first: int,
+    last: int,
+    data: WorkspaceData,
+    rows: ContactRows,
+) -> float:
+    """Return the least signed distance on a way that is inside in part, a lower bound within the tolerance.
+
+    The depth of a point is at most its distance from any feature, which is convex, so between two points at most the
+    greater of theirs; and it changes by no more than the way. Intervals are halved where this is not enough.
+    """
+    table = data.tables[obstacle + 1]
+    kind, base = int(table[0]), int(table[6])
+    width = FACE_WIDTH if kind == FACES else EDGE_WIDTH
+    lows, highs = np.empty(64), np.empty(64)
+    lows[0], highs[0], pending = 0.0, 1.0, 1
+    best = min(
+        nearest_of(start, _NO_ROWS, obstacle, first, last, data, 0, rows).signed,
+        nearest_of(end, _NO_ROWS, obstacle, first, last, data, 0, rows).signed,
+    )
+    lowest, halvings = best, 0
+    while pending > 0:
+        pending -= 1
+        low, high = lows[pending], highs[pending]
+        p, q = _along(start, end, low), _along(start, end, high)
+        before = nearest_of(p, _NO_ROWS, obstacle, first, last, data, 0, rows).signed
+        after = nearest_of(q, _NO_ROWS, obstacle, first, last, data, 0, rows).signed
+        best = min(best, before, after)
+        bound = 0.5 * (before + after - (high - low) * length)
+        if bound < best - TOLERANCE:
+            for point in (p, q):
+                k = _nearest_feature(point, kind, base, width, first, last, data)
+                one, _ = _from_feature(p, k, kind, data.numbers)
+                other, _ = _from_feature(q, k, kind, data.numbers)
+                bound = max(bound, -max(one, other))
+        if bound >= best - TOLERANCE or halvings >= _MAX_BISECTIONS or pending + 2 > len(lows):
+            lowest = min(lowest, bound)
+            continue
+        middle, halvings = 0.5 * (low + high), halvings + 1
+        lows[pending], highs[pending] = low, middle
+        lows[pending + 1], highs[pending + 1] = middle, high
+        pending += 2
+    return min(lowest, best)
+
+
+@compiled
+def _from_shape(
+    start: Vector, end: Vector, signed: float, obstacle: int, data: WorkspaceData, rows: ContactRows
+) -> float:
+    """Return the least signed distance on a way from a polygon or mesh; `signed` is that of its start."""
+    table = data.tables[obstacle + 1]
+    kind, base = int(table[0]), int(table[6])
+    width = FACE_WIDTH if kind == FACES else EDGE_WIDTH
+    length = math.sqrt((end[0] - start[0]) ** 2 + (end[1] - start[1]) ** 2 + (end[2] - start[2]) ** 2)
+    cell, first, last = cell_of(start, obstacle + 1, data), -1, int(table[5])
+    if cell >= 0 and abs(signed) + 2.0 * length <= data.frames[obstacle + 1, 4]:
+        first, last = int(data.entries[cell]), int(data.entries[cell + 2])  # what is near to any point of the way
+    best = abs(signed)
+    for slot in range(max(first, 0), last):
+        k = base + width * (data.entries[slot] if first >= 0 else slot)
+        distance, _ = _from_feature(start, k, kind, data.numbers)
+        if distance < best + length:
+            best = min(best, _lowest(start, end, k, kind, data.numbers))
+    if signed > 0.0 and best > TOLERANCE:
+        return best
+    return _deepest(start, end, length, obstacle, first, last, data, rows)
+
+
+@compiled
+def _from_ball(start: Vector, end: Vector, centre: NDArray[np.float64], radius: float) -> float:
+    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    rx, ry, rz = centre[0] - start[0], centre[1] - start[1], centre[2] - start[2]
+    square = x * x + y * y + z * z
+    s = min(max((rx * x + ry * y + rz * z) / square, 0.0), 1.0) if square > 0.0 else 0.0
+    return math.sqrt((rx - s * x) ** 2 + (ry - s * y) ** 2 + (rz - s * z) ** 2) - radius
+
+
+@compiled
+def _write(
+    points: Points,
+    data: WorkspaceData,
+    node: NDArray[np.int64],
+    obstacle: NDArray[np.int64],
+    distance: NDArray[np.float64],
+) -> None:
+    """Lower the distances of nodes to those of the half segments beside them."""
+    space, last = points.shape[1] == 3, len(points) - 1
+    rows = ContactRows(np.empty(0), np.empty((0, points.shape[1])))
+    for row in range(len(node)):
+        i, o, signed = node[row], obstacle[row], distance[row]
+        start = (points[i, 0], points[i, 1], points[i, 2] if space else 0.0)
+        for j in (i - 1, i + 1):
+            if not 0 <= j <= last:
+                continue
+            end = _along(start, (points[j, 0], points[j, 1], points[j, 2] if space else 0.0), 0.5)
+            if o == WALL:
+                found, _, _ = wall_contact(end[0], end[1], data.wall_radius)
+            elif data.tables[o + 1, 0] == BALL:
+                found = _from_ball(start, end, data.frames[o + 1], data.frames[o + 1, 5])
+            else:
+                found = _from_shape(start, end, signed, o, data, rows)
+            distance[row] = min(distance[row], found)
+
+
+def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contacts) -> NDArray[np.float64]:
+    """Return the least signed distance of a node and the half segments beside it, for each contact, shape (k,) [m].
+
+        min sd(x_i + s (x_j - x_i) / 2)  over  0 <= s <= 1,  j = i - 1, i + 1
+
+    Exact for discs, balls and the wall, and within 0.1 um below for polygons and meshes: so the least over all nodes is
+    that of the whole polyline, but for shapes that no node is near.
+
+    Args:
+        points: nodes, shape (n + 1, d) [m].
+        data: `Workspace.data`.
+        contacts: of these nodes with it.
+    """
+    distance: NDArray[np.float64] = contacts.distance.copy()
+    _write(np.ascontiguousarray(points, dtype=np.float64), data, contacts.node, contacts.obstacle, distance)
+    return distance
