@@ -115,14 +115,15 @@ def _checked(
     apart = abs(best.length / size.length_px - 1.0)
     shows_ends = size.tolerance > 0.0 and _shows_ends(steel, best, size)
     is_measured = shows_ends and _needs_length(steel, best, size)
+    shown = steel
     if size.tolerance > 0.0 and not is_measured:
-        one, other, rod = _fits(steel, rough, size, 0.0)
+        shown = steel.unknown_in_glare()
+        one, other, rod = _fits(shown, rough, size, 0.0)
         best = min((one, other, rod), key=lambda each: each.cost)
     # An end that is hidden would make the needle look shorter: where it looks as long as it is set, it is so.
     agrees = shows_ends or apart < SAME_LENGTH
     length_error = 0.5 * (min(size.tolerance, max(SAME_LENGTH, apart)) if agrees else size.tolerance)
-    reason = _what_covers(steel, best, width)
-    if reason:
+    if reason := _what_covers(steel, shown, best, width):
         return reason
     if steel.share_hidden(best.arc.at(np.linspace(0.0, best.length, AXIS_POINTS))) > MAX_HIDDEN:
         return "hidden"
@@ -146,8 +147,7 @@ def _checked(
     if steel.is_bridged:  # What lies over it may hide the shape of an end, or look like a thread that leaves one.
         is_known = toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD
         fit = _pointing(fit, toward) if toward is not None and is_known else fit
-    reason = _what_prolongs(steel, fit, width, is_known)
-    if reason:
+    if reason := _what_prolongs(steel, fit, width, is_known):
         return reason
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     covariance = fit.covariance()
@@ -230,10 +230,9 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     if abs(fit.length - size.length_px) > MAX_OFF * size.tolerance * size.length_px:
         return False
     beyond = np.empty(6)
-    excess(steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * size.width_px, beyond)
-    if beyond[2:4].max() > GOES_ON:
-        return False
-    if fading(steel.surely, _state(fit.arc, fit.width), fit.length, fit.width) > FADES_PX:
+    state = _state(fit.arc, fit.width)
+    excess(steel.perhaps, state, fit.length, 0.5 * size.width_px, beyond)
+    if beyond[2:4].max() > GOES_ON or fading(steel.surely, state, fit.length, fit.width) > FADES_PX:
         return False
     return not steel.is_glaring(fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX])))
 
@@ -266,20 +265,22 @@ def _bluntness(steel: SteelMap, arc: Arc, length: float, width: float) -> tuple[
     return float(result[0].min()), float(result[1].min())
 
 
-def _what_covers(steel: SteelMap, fit: TemplateFit, width: float) -> str:
-    """Say what covers a drawn needle; empty if nothing does."""
+def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit, width: float) -> str:
+    """Say what covers a drawn needle; empty if nothing does. Glare, which `shown` leaves out, may hide the tail."""
     if fit.cost > MAX_COST * fit.length:
         return NO_SHAPE
-    rows = np.empty((int(fit.length), 3))
-    steel_rows(steel.surely, steel.perhaps, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, THIN, rows)
-    share, due, greatest = rows.T
+    rows, state = np.empty((int(fit.length), 3)), _state(fit.arc, fit.width)
     tip = int((1.0 - TIP) * len(rows))
+    steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, THIN, rows)
+    at_tip = rows[tip:].copy()
+    steel_rows(shown.surely, shown.perhaps, state, fit.length, 0.5 * fit.width, THIN, rows)
+    share, greatest = rows[:, 0], rows[:, 2]
     even = np.convolve(share[:tip], np.full(MISSING_ROWS, 1.0 / MISSING_ROWS), "valid")
     if even.max() > MAX_MISSING or share[:TAIL_ROWS].mean() > MAX_MISSING_TAIL:
         return "something over it or against it"
     if np.mean(greatest[:tip] > SURE) < SURE_ROWS:
         return "no needle's darkness"
-    if share[tip:] @ due[tip:] > MAX_MISSING_TIP * due[tip:].sum():
+    if at_tip[:, 0] @ at_tip[:, 1] > MAX_MISSING_TIP * at_tip[:, 1].sum():
         return "something over it or against it"
     return ""
 
@@ -374,9 +375,8 @@ def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, flo
     dark = np.empty((len(beyond), len(aside)))
     result: list[float | None] = []
     for arc in (fit.arc, fit.reversed()):
-        straighten(
-            steel.perhaps, (float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature), beyond, aside, dark
-        )
+        axis = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
+        straighten(steel.perhaps, axis, beyond, aside, dark)
         widths = 0.5 * dark.sum(axis=1)
         if middle(widths) < VISIBLE_PX:
             result.append(None)

@@ -13,10 +13,8 @@ from magnetosuture_thread.vision.images import Layer, Wall
 AROUND_PX = 12.0  # around a dark thing, that is measured on
 DARKEST = 0.9  # quantile of its darkness that steel has
 LIGHT_PX = 3  # that the light is averaged over
-GLARE, GLARE_REACH_PX = (
-    0.07,
-    4,
-)  # of the floor's brightness, that the lamp's reflection is brighter by; looked for so near
+GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
+GLARE_REACH_PX = 4  # around a place, that it is looked for, and over which it fades
 COLOURED = 0.1  # share of the floor's light by which the colours of what is coloured differ
 LINE_WAYS = 16  # directions of lines along which gaps are filled
 SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
@@ -92,6 +90,13 @@ class SteelMap:
         v = np.round(points[:, 1:]).astype(int) + reach
         near = self.light[v.clip(0, rows - 1)[:, :, None], u.clip(0, columns - 1)[:, None, :]]
         return float(near.max()) > GLARE
+
+    def unknown_in_glare(self) -> SteelMap:
+        """Return the map in which steel may be anywhere that the lamp is reflected, and at the reflection's edge."""
+        glare = (self.light > GLARE).astype(np.uint8)
+        size = 2 * GLARE_REACH_PX + 1
+        covered = cv2.dilate(glare, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
+        return replace(self, perhaps=np.where(covered, np.float32(1.0), self.perhaps)) if covered.any() else self
 
     @property
     def box(self) -> tuple[slice, slice]:

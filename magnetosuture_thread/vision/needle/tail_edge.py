@@ -30,8 +30,10 @@ def tail_shift(steel: SteelMap, fit: TemplateFit) -> float | None:
 
     over lines at distances d_j aside of the axis, with the darkness D along each. body is its mean within the needle,
     behind that of the floor, whose brightness may change linearly, as in a shadow, continued to the end. The weights w
-    are small where a thread leaves the end.
+    are small where a thread leaves the end. Where the lamp is reflected at the end, the step is the reflection's.
     """
+    if steel.is_glaring(fit.arc.at(np.array([-REACH_PX, 0.0]))):
+        return None
     along = np.arange(-REACH_PX - MAX_SHIFT_PX, REACH_PX + MAX_SHIFT_PX + 0.5 * STEP_PX, STEP_PX)
     count = max(1, int(0.5 * fit.width / SIDE_PX))
     dark = np.empty((len(along), 2 * count + 1))
