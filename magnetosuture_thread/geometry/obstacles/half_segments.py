@@ -30,6 +30,7 @@ from magnetosuture_thread.geometry.polyline import Points
 TOLERANCE = 1e-7
 """By how much a distance may be given too short; it is never too long but for rounding [m]."""
 
+_CUT_TOLERANCE = 1e-10  # of the tangents, which close in on the distance quickly [m]
 _MAX_BISECTIONS = 500  # of a half segment that is inside; what is left then has its lower bound
 _MAX_CUTS = 60  # tangents of one feature's distance
 _NO_ROWS = -1.0  # in place of a reach
@@ -90,7 +91,7 @@ def _lowest(start: Vector, end: Vector, k: int, kind: int, numbers: NDArray[np.f
         s = (left - right - falls * low + rises * high) / (rises - falls)
         bound = max(left + falls * (s - low), 0.0)
         distance, away = _from_feature(_along(start, end, s), k, kind, numbers)
-        if not (low < s < high) or distance - bound <= TOLERANCE:
+        if not (low < s < high) or distance - bound <= _CUT_TOLERANCE:
             break
         slope = _slope(distance, away, start, end)
         if slope == 0.0:

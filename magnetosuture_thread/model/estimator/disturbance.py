@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
 STRAIGHT = np.zeros(2)  # a heading that is right
 CONFIRMED = 0.25  # of the averaging time, for which it must last
-CONTACT_MEMORY = 3.0  # averaging times, in which what a known contact did is forgotten
+CONTACT_TIME = 3.0  # averaging times, in which what a known contact did is forgotten
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ class DisturbanceTest:
 
     Where shapes or wall that the model knows pushed the thread within the last times T, they may push more or less than
     the model says, or earlier or later: a free end that is braced against the wall slips at a force that a few
-    micrometres of the needle's pose decide. So forces at such nodes explain what they can of e, by least squares, and
-    what is left of it is tested.
+    micrometres of the needle's pose decide. So forces at such nodes, by least squares, may explain e: it is a
+    disturbance only where what they leave of it is significant too.
 
     Args:
         thread: the thread.
@@ -232,9 +232,10 @@ class DisturbanceTest:
         self._explained[:] = 0.0
         self._significance = significance(self._displacement, normals, variance, self._response, deviations)
         if self._significance > LOST:
-            self._explained = self._by_contacts(positions, normals)
-            left = self._displacement - self._explained
-            self._significance = significance(left, normals, variance, self._response, deviations)
+            explained = self._by_contacts(positions, normals)
+            left = significance(self._displacement - explained, normals, variance, self._response, deviations)
+            if left <= FOUND:
+                self._explained, self._significance = explained, left
         if self._significance > FOUND:
             self._since = stamp if math.isnan(self._since) else self._since
         elif self._significance < LOST:
@@ -243,21 +244,19 @@ class DisturbanceTest:
     def _by_contacts(self, positions: Points, normals: Points) -> Points:
         """Return the displacement by forces at the nodes of known contacts that comes closest to e, shape (n + 1, 2).
 
-        A force on node c displaces as `relax` says of a load there; what of it is along the thread is a tension from
-        there to the needle, and a load along the second differences of the nodes between.
+        A force on node c displaces as `relax` says of a load there.
         """
-        touched = np.flatnonzero(self._untouched <= CONTACT_MEMORY * self._time)
+        touched = np.flatnonzero(self._untouched <= CONTACT_TIME * self._time)
         touched = touched[touched > 0]
         if not len(touched):
             return np.zeros_like(positions)
         runs = np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1)
         columns = []
         for node in sorted({int(end) for run in runs for end in (run[0], run[-1])}):
-            loads = np.zeros((len(positions), 4))
-            loads[node, 0] = loads[node, 1] = 1.0
-            loads[1:node, 2:] = (positions[2:] - 2.0 * positions[1:-1] + positions[:-2])[: node - 1]
-            relax(self._time * self._stiffness, self._clamped, np.zeros(4), loads)
-            columns += [loads[:, :1] * (1.0, 0.0), loads[:, 1:2] * (0.0, 1.0), loads[:, 2:]]
+            loads = np.zeros((len(positions), 2))
+            loads[node] = 1.0
+            relax(self._time * self._stiffness, self._clamped, STRAIGHT, loads)
+            columns += [loads * (1.0, 0.0), loads * (0.0, 1.0)]
         responses = np.array(columns)
         responses /= np.maximum(np.linalg.norm(responses, axis=(1, 2)), 1e-12)[:, None, None]
         across = np.einsum("ij,kij->ik", normals, responses)

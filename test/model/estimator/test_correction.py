@@ -269,9 +269,12 @@ def test_bound_of_clearance_is_below_the_clearance_by_the_deviation() -> None:
     estimate = estimator.step(way[1], whole(true_shapes(thread_of(), way)[1], 1))
     rows = {each.name: each for each in estimate.compute_rows()}["obstacle"]
     bound = estimate.clearance_bounds["obstacle"]
-    node = rows.nodes[:, -1]
-    expected = rows.clearance - 2.3263 * np.sqrt(
-        np.einsum("ra,rab,rb->r", rows.gradient[:, 0], estimate.covariance[node], rows.gradient[:, 0])
-    )
+    node, last = rows.nodes[:, -1], len(estimate.positions) - 1
+    beside = [np.clip(node + apart, 0, last) for apart in (-1, 0, 1)]  # the half segments' clearance is of these too
+    deviations = [
+        np.sqrt(np.einsum("ra,rab,rb->r", rows.gradient[:, 0], estimate.covariance[at], rows.gradient[:, 0]))
+        for at in beside
+    ]
+    expected = rows.clearance - 2.3263 * np.max(deviations, axis=0)
     np.testing.assert_allclose(bound, expected, rtol=1e-4)
     assert (bound < rows.clearance)[node > 0].all()
