@@ -400,7 +400,8 @@ def test_the_example_bag_is_tracked_in_every_frame(tmp_path: Path):
     assert summary.commands == 240
     assert summary.contact_frames > 100
     obstacle = next(margin for margin in summary.least_margins if margin.kind == "obstacle")
-    assert obstacle.clearance > -1e-6
+    assert obstacle.value > -1e-6
+    assert obstacle.clearance > -25e-6  # the chord's dip between two nodes on the post
     assert summary.error_seen is not None
     assert summary.error_seen["maximum"] < 1.0
     shutil.rmtree(tmp_path / "out")
