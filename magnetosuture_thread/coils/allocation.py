@@ -123,6 +123,10 @@ class CoilAllocation:
         needle: its mechanics.
         aligning_field: B_0 [T].
         max_current: in either direction [A].
+
+    Attributes:
+        names: of the coils, in the order of their currents.
+        gains: by which factor each coil's field differs from its calibration, shape (m,); 1 until something is known.
     """
 
     def __init__(self, coils: CoilModel, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:

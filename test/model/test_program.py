@@ -104,7 +104,7 @@ def test_residuals_vanish_where_friction_holds_and_where_it_slides(pull: float):
 
 @pytest.mark.parametrize("excess", [1e-5, 0.1, 2.0])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_multiplier_beyond_the_friction_cone_is_seen(excess: float, sign: float):
+def test_a_multiplier_beyond_the_friction_cone_is_a_dual_residual(excess: float, sign: float):
     """Friction beyond mu N holds the node with all forces in balance and no bound missed: only the cone tells."""
     limit = 0.3 * 6.0
     pull = sign * (limit + excess)

@@ -105,23 +105,16 @@ def armed_and_driving(graph, heard: dict[str, list[Any]], moves: Callable[[], bo
     graph.wait(drives, "a current", TIMEOUT)
 
 
-@pytest.mark.parametrize("which", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_the_last_messages_of_a_bridge_that_is_ended_are_zeros_and_why(graph, which: signal.Signals):
+@pytest.mark.parametrize(
+    "signals",
+    [(signal.SIGTERM,), (signal.SIGINT,), (signal.SIGHUP,), (signal.SIGINT, signal.SIGTERM, signal.SIGINT)],
+)
+def test_the_last_messages_of_a_bridge_that_is_ended_are_zeros_and_why(graph, signals: tuple[signal.Signals, ...]):
     heard = last(graph)
     with process(graph) as bridge:
         armed_and_driving(graph, heard)
-        bridge.send_signal(which)
-        assert bridge.wait(TIMEOUT) == 0
-    graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
-
-
-def test_a_second_interruption_takes_nothing_from_the_last_messages(graph):
-    heard = last(graph)
-    with process(graph) as bridge:
-        armed_and_driving(graph, heard)
-        bridge.send_signal(signal.SIGINT)
-        bridge.send_signal(signal.SIGTERM)
-        bridge.send_signal(signal.SIGINT)
+        for which in signals:
+            bridge.send_signal(which)
         assert bridge.wait(TIMEOUT) == 0
     graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
 

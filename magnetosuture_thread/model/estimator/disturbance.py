@@ -212,13 +212,10 @@ class DisturbanceTest:
         self._untouched += interval
         self._untouched[in_contact] = 0.0
 
-    def add(
-        self, positions: Points, moved: Points, normals: Points, variance: Vector, stamp: float, deviations: Vector
-    ) -> None:
+    def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, deviations: Vector) -> None:
         """Add a correction.
 
         Args:
-            positions: of the nodes after it, shape (n + 1, 2) [m].
             moved: by it, shape (n + 1, 2) [m].
             normals: of the nodes, shape (n + 1, 2).
             variance: of the mean of each window's points, inf where nothing is measured, shape (w,) [m^2].
@@ -232,7 +229,7 @@ class DisturbanceTest:
         self._explained[:] = 0.0
         self._significance = significance(self._displacement, normals, variance, self._response, deviations)
         if self._significance > LOST:
-            explained = self._by_contacts(positions, normals)
+            explained = self._by_contacts(normals)
             left = significance(self._displacement - explained, normals, variance, self._response, deviations)
             if left <= FOUND:
                 self._explained, self._significance = explained, left
@@ -241,7 +238,7 @@ class DisturbanceTest:
         elif self._significance < LOST:
             self._since = math.nan
 
-    def _by_contacts(self, positions: Points, normals: Points) -> Points:
+    def _by_contacts(self, normals: Points) -> Points:
         """Return the displacement by forces at the nodes of known contacts that comes closest to e, shape (n + 1, 2).
 
         A force on node c displaces as `relax` says of a load there.
@@ -249,11 +246,11 @@ class DisturbanceTest:
         touched = np.flatnonzero(self._untouched <= CONTACT_TIME * self._time)
         touched = touched[touched > 0]
         if not len(touched):
-            return np.zeros_like(positions)
+            return np.zeros_like(normals)
         runs = np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1)
         columns = []
         for node in sorted({int(end) for run in runs for end in (run[0], run[-1])}):
-            loads = np.zeros((len(positions), 2))
+            loads = np.zeros_like(normals)
             loads[node] = 1.0
             relax(self._time * self._stiffness, self._clamped, STRAIGHT, loads)
             columns += [loads * (1.0, 0.0), loads * (0.0, 1.0)]

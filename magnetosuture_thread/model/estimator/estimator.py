@@ -281,7 +281,7 @@ class ThreadEstimator:
         variance = self._sums.own * (1.0 + 0.5 * shared) * unit**2
         if math.isfinite(self._measured_at):  # else there is no earlier time to compare with
             deviations = np.asarray(pose.deviation)
-            self._test.add(positions, work.moved * unit, work.normals, variance, pose.stamp, deviations)
+            self._test.add(work.moved * unit, work.normals, variance, pose.stamp, deviations)
         corrected = ThreadState(positions, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True

@@ -112,7 +112,7 @@ class _Termination:
 
     def __init__(self) -> None:
         self._asked = False
-        self._tell: Callable[[], object] = bool
+        self._notify: Callable[[], object] = bool
         for which in end_signals():
             signal.signal(which, self._on_signal)
 
@@ -120,18 +120,18 @@ class _Termination:
         """Return what is set from then on, for the running loop."""
         loop, event = asyncio.get_running_loop(), asyncio.Event()
 
-        def tell() -> None:
+        def set_event() -> None:
             with suppress(RuntimeError):  # the loop is closed already
                 loop.call_soon_threadsafe(event.set)
 
-        self._tell = tell
+        self._notify = set_event
         if self._asked:
             event.set()
         return event
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._asked = True
-        self._tell()
+        self._notify()
 
 
 def answer_requests(node: Node) -> None:

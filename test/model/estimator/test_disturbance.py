@@ -107,7 +107,7 @@ def forces_found(contact: int | None, held: int, first_interval: float = 1.0 / R
     for k in range(15):
         test.decay(first_interval if k == 0 else 1.0 / RATE, touched)
         stamp, moved = k / RATE, pushed(thread, held, 4e-5)
-        test.add(positions, moved, normals, np.full(16, 1e-11), stamp, np.array([1e-5, 1e-3]))
+        test.add(moved, normals, np.full(16, 1e-11), stamp, np.array([1e-5, 1e-3]))
         found.append(test.found(stamp, positions))
     return found
 
