@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import math
-import os
 import select
 import time
 from typing import Any
 
 import serial
+
+# `os.write` lets another thread have the interpreter first, and may wait for it there: a process that is stopped
+# meanwhile would write an outdated packet when it goes on. This one keeps the interpreter, from the clock to the write.
+_write = ctypes.PyDLL(None).write
+_write.argtypes, _write.restype = (ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t), ctypes.c_ssize_t
 
 
 class DeviceError(Exception):
@@ -82,16 +87,16 @@ class ExchangePort(serial.Serial):
         return data
 
     def _send(self, packet: bytes) -> None:
-        """Write a packet to the kernel in one piece, once there is room.
+        """Write a packet to the kernel in one piece, once its buffer takes it.
 
         The library's own write reports a sent packet as not sent if this thread was delayed after the system call.
         """
-        _, room, _ = select.select([], [self], [], max(0.0, self._until - time.monotonic()))
-        # At the last moment: this process may have been stopped for long, and gone on just now.
-        if time.monotonic() >= min(self._until, self._expires):
-            raise serial.SerialTimeoutException("an outdated packet")
-        if not room or os.write(self.fileno(), packet) < len(packet):
-            raise serial.SerialTimeoutException("no room for a packet")
+        port, until = self.fileno(), min(self._until, self._expires)
+        _, writable, _ = select.select([], [port], [], max(0.0, self._until - time.monotonic()))
+        if not writable:
+            raise serial.SerialTimeoutException("the output buffer is full")
+        if time.monotonic() >= until or _write(port, packet, len(packet)) < len(packet):
+            raise serial.SerialTimeoutException("an outdated packet, or one that the port did not take")
 
 
 def _open_problem(path: str, error: Exception) -> str:
