@@ -193,33 +193,49 @@ def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     assert len(port.answer) < 48  # which the library would wait for
 
 
-def test_currents_that_expire_while_a_packet_waits_for_the_port_are_not_written(peer, port, monkeypatch):
+@pytest.mark.parametrize("stopped_before", [8, 7, 1], ids=["the clock", "the first bytes", "the last byte"])
+def test_a_process_that_is_stopped_while_it_writes_currents_drives_no_board_later(
+    peer, port, monkeypatch, stopped_before: int
+):
+    """As a stop between two instructions cannot be had at will, the thread sleeps there."""
     wait_for(port, 5.0)
-    expires = time.monotonic() + 0.01
-    commanded = iter([(np.array([3.0, -6.0]), expires), (None, math.inf)])
-    writable = select.select
-
-    def late(*arguments: Any) -> Any:
-        while time.monotonic() < expires:
-            time.sleep(0.001)
-        return writable(*arguments)
-
-    peer.answer(lambda _: b"\xff")
-    monkeypatch.setattr(port_module, "select", SimpleNamespace(select=late))
+    there = RoboClawBoard()
+    peer.answer(simulated(there))
     made = board(port)
     made.voltage = 24.0
+    expires = time.monotonic() + 0.2
+    commanded = iter([(np.array([3.0, -6.0]), expires), (None, math.inf)])
+
+    def stopped(size: int) -> None:
+        if size == stopped_before and time.monotonic() < expires:
+            time.sleep(expires - time.monotonic() + 0.02)
+
+    def late_select(*arguments: Any) -> Any:
+        stopped(8)
+        return select.select(*arguments)
+
+    def late_write(file: int, data: bytes, size: int) -> int:
+        stopped(size)
+        return os.write(file, data)
+
+    monkeypatch.setattr(port_module, "select", SimpleNamespace(select=late_select))
+    monkeypatch.setattr(port_module, "_write", late_write)
     made.write(lambda: next(commanded))
-    assert [packet[2:6] for packet in peer.heard] == [bytes(4)]
+    assert next(commanded, None) is None
+    assert not there.timeline
+    assert there.heard > expires
 
 
 def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port, clock, monkeypatch):
     def held_up(file: int, data: bytes, size: int) -> int:
         written = os.write(file, data)
-        assert os.read(peer.host, 100) == data
-        assert file == port.fileno()
         assert size == len(data)
-        os.write(peer.host, b"\xff")
-        clock.hold_up()
+        if size == 1:
+            received = b""
+            while len(received) < 8:
+                received += os.read(peer.host, 8)
+            os.write(peer.host, b"\xff")
+            clock.hold_up()
         return written
 
     monkeypatch.setattr(port_module, "_write", held_up)
