@@ -20,7 +20,7 @@ from magnetosuture_thread.campaign.variation import vary
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.setups import Setup, read_procedure_setup
 from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
 
 FILE, PAGE = "campaign.json", "campaign.html"
@@ -116,11 +116,9 @@ def simulate_campaign(
         BagError: the output exists, or cannot be written.
     """
     procedure = read_procedure(name)
-    if not (setup or procedure.setup):
-        raise ConfigurationError("--setup", "nothing", f"a setup, as the procedure {procedure.name} names none")
     if not set(bags) <= set(seeds):
         raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
-    used = read_setup(setup or procedure.setup)
+    used = read_procedure_setup(procedure, setup)
     runs: dict[int, RunResult] = {}
     died: dict[int, str] = {}
     folders = {seed: f"{BAGS}/seed_{seed}" for seed in sorted(set(bags))}
