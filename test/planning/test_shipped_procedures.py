@@ -29,6 +29,7 @@ def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
     procedure = read_procedure(name)
     setup = read_procedure_setup(procedure)
     setup.rig.check_scene(setup.scene)
+    setup.model.predictor(setup.scene)  # refuses a shape that the thread would pass through
     planner, keep_out = setup.planner.planner(setup.scene), setup.coils.keep_out
     executor = ProcedureExecutor(procedure, planner)
     safety = setup.coils.safety_filter(setup.scene)

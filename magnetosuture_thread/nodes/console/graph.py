@@ -145,6 +145,7 @@ class ConsoleServices:
 
 NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 MEASURED_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
+FORECAST_PERIOD = 0.1  # s; 400 points take a millisecond to read
 SCENE_PERIOD = 0.5  # s; a large scene takes a tenth of that
 MAX_DIAGNOSTICS = 50  # queued messages of /diagnostics
 MAX_NODES = 32  # shown
@@ -157,6 +158,7 @@ READERS = {
     "measured": (topics.MEASURED_THREAD, messages.measured_thread, MEASURED_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
     "estimated": (topics.ESTIMATED_THREAD, messages.estimated, 0.0),
+    "forecast": (topics.FORECAST, messages.forecast, FORECAST_PERIOD),
     "margins": (topics.MARGINS, messages.margins, 0.0),
     "scene": (topics.SCENE, messages.scene, SCENE_PERIOD),
     "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
@@ -175,7 +177,7 @@ ZERO_FILTER_STATE = {
     "age": 0.0,
 }
 LISTED_PARTS = ("measured", "plan")
-AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "filter", "bridge")
+AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "forecast", "filter", "bridge")
 
 
 class ConsoleGraph:
