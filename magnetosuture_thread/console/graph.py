@@ -40,7 +40,7 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
                     "goals_met": int, "progress": share, "reason": str, "resumes": bool, "hold_to_run": bool,
                     "clearance": m | None} | None,   # None where no needle planner runs
       "plan": [[x, y], ...],           # where the middle of the needle is to go, may be empty
-      "procedures": [str],             # names of those that can be planned
+      "procedures": [str],             # names of those whose shapes the scene has
       "nodes": {name: {"level": "ok|warn|error|silent", "message": str, "values": {str: str}, "age": s}},
     }
 

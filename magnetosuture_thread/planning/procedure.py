@@ -164,6 +164,17 @@ class Procedure:
     goals: tuple[Goal, ...]
     limits: tuple[ProcedureLimits, ...]
 
+    @property
+    def shape_names(self) -> frozenset[str]:
+        """Names of the shapes that its goals need."""
+        names: set[str] = set()
+        for goal in self.goals:
+            if isinstance(goal, PassThrough):
+                names.update(goal.between)
+            elif isinstance(goal, Wrap | Tighten) and goal.around:
+                names.add(goal.around)
+        return frozenset(names)
+
 
 def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
     """Return the procedure that a YAML file describes.

@@ -36,6 +36,7 @@ from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
+from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import shipped_procedures
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
@@ -204,7 +205,7 @@ class ConsoleGraph:
         self.services = ConsoleServices(node)
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
-        self._procedures = shipped_procedures()
+        self._procedures = {name: read_procedure(name).shape_names for name in shipped_procedures()}
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
         self._open(settings, _file_scene(settings))
@@ -258,14 +259,16 @@ class ConsoleGraph:
         }
         if self.blocked:
             parts["filter"] = {**ZERO_FILTER_STATE, "reason": self.blocked}
+        shown_scene = parts["scene"] or self._scene
+        shapes = {shape["name"] for shape in shown_scene["shapes"]} if shown_scene else set()
         return {
             "time": self.now().nanoseconds * 1e-9,
             "needle_length": settings.needle_length,
             "needle_curvature": settings.needle_curvature,
             **parts,
             "camera": None if self._camera.value is None else {"age": self._camera.age},
-            "scene": parts["scene"] or self._scene,
-            "procedures": self._procedures,
+            "scene": shown_scene,
+            "procedures": [name for name, needed in self._procedures.items() if needed <= shapes],
             "nodes": self.nodes(),
         }
 
