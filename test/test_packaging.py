@@ -74,6 +74,17 @@ def test_licences_are_annotated_in_one_place():
     assert not [path for path in files if tag in path.read_bytes()]
 
 
+def test_workflows_run_what_is_there_for_every_python_that_is_supported():
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    supported = re.findall(r'^  "Programming Language :: Python :: ([\d.]+)",$', PYPROJECT, re.MULTILINE)
+    assert workflow["jobs"]["python"]["strategy"]["matrix"]["python"] == supported
+    steps = "\n".join(step.get("run", "") for job in workflow["jobs"].values() for step in job["steps"])
+    for path in re.findall(r"\.ci/[\w.]+", steps):
+        assert (ROOT / path).is_file()
+    (installed,) = re.findall(r"^pip install ('.*)$", steps, re.MULTILINE)
+    assert any(installed in page.read_text() for page in (ROOT / "docs").rglob("installation.md"))
+
+
 def test_every_message_is_built():
     listed = set(re.findall(r'"msg/(\w+)\.msg"', (ROOT / "msg_defs" / "CMakeLists.txt").read_text()))
     assert listed == {path.stem for path in (ROOT / "msg_defs" / "msg").glob("*.msg")}
