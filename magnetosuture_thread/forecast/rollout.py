@@ -31,7 +31,7 @@ from magnetosuture_thread.model.formulations.rod_step import (
     accept_step,
     solve_step,
 )
-from magnetosuture_thread.model.formulations.step import program_of
+from magnetosuture_thread.model.formulations.step_buffers import program_of
 from magnetosuture_thread.model.solvers import banded
 from magnetosuture_thread.safety.certificate import PosedNeedle
 from magnetosuture_thread.safety.motion import (
@@ -238,9 +238,9 @@ def record_instant(
     if k > 0 and interval > 0.0:
         tension = np.empty(len(state.positions) - 1)
         scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
-        multipliers, heading = buffers.step.multipliers[: len(tension)], state.pose[2:]
-        points = state.positions / rod.unit
-        write_forces(rod, points, state.velocities, heading, multipliers, scale, tension, record.pull[k])
+        step, points = buffers.step, state.positions / rod.unit
+        heading, internal, load = state.pose[2:], step.internal, step.tail_load
+        write_forces(rod, points, state.velocities, heading, internal, load, scale, tension, record.pull[k])
         record.tension[k] = tension.max()
     return record_margins(model, buffers, state, k, record)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, RodProperties
-from magnetosuture_thread.model.formulations.step import StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.solvers.banded import SolverBuffers
 from magnetosuture_thread.safety.motion import FilterData
 
