@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 from magnetosuture_thread.barrier import Barrier, CompiledBarrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.geometry.obstacles.chords import chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity
@@ -244,12 +243,6 @@ class RodFormulation(Formulation):
             friction, use = friction_of(result.grip)
             friction *= scale
         return ThreadForces(tension, scale * contact, force, moment, friction, use)
-
-    def chords_in_contact(self, positions: Points, tolerance: float) -> tuple[int, ...]:
-        """Return both nodes of each segment that touches an obstacle between them; see `Formulation`."""
-        chords = chord_contacts(positions, self._near.data, self._thread.segment_length, self._radius)
-        first = chords.node[chords.distance - self._radius <= tolerance]
-        return tuple(np.concatenate([first, first + 1]).tolist())
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""

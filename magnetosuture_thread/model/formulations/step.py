@@ -242,15 +242,6 @@ class Formulation(ABC):
     def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
         """Return the built-in barriers of the thread itself, obstacles and wall aside, at these positions."""
 
-    def chords_in_contact(self, positions: Points, tolerance: float) -> tuple[int, ...]:
-        """Return both nodes of each segment that touches an obstacle between them, where contact is enforced there.
-
-        Args:
-            positions: of all nodes, shape (n + 1, d) [m].
-            tolerance: what is closer than this touches [m].
-        """
-        return ()
-
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
         """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
         contacts = self._workspace.near(positions)
