@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.closed_loop_forces import closed_loop_table, measure_closed_loop
+from benchmarks.closed_loop import closed_loop_table, measure_closed_loop, nodes_table
 from benchmarks.friction import friction_table, measure_friction
 from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
@@ -85,6 +85,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     log("the loop closed: the needle moves by the coils, and the poses are noisy")
     loops = measure_closed_loop()
     console.print(closed_loop_table(loops))
+    console.print(nodes_table(loops))
     log("friction by itself")
     friction = measure_friction()
     console.print(friction_table(friction))

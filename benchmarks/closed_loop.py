@@ -1,8 +1,9 @@
-"""The thread's pull on the needle in closed loop: the model's beside that of the simulated rig, which is other code.
+"""The thread in closed loop: the pull on the needle, and where the thread is, beside those of the simulated rig.
 
 The loop of a campaign runs a setup's path follower: the needle moves by the coils' currents, which follow noisy poses.
 The rig's rod has springs, and many more segments than the model. The model follows the needle's poses as the tracker's
-noise leaves them, then exactly, at the frames and at every period of the bridge.
+noise leaves them, then exactly, at the frames and at every period of the bridge. The pull is compared in all three, the
+nodes of prediction and estimate in the first.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from rich.table import Table
 
 from magnetosuture_thread import NeedlePose
 from magnetosuture_thread.campaign.loop import START, ClosedLoop
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.rig import Rig
@@ -74,6 +75,18 @@ def closed_loop_table(figures: list[dict[str, Any]]) -> Table:
     return table
 
 
+def nodes_table(figures: list[dict[str, Any]]) -> Table:
+    """Return the errors of the nodes as a table."""
+    table = Table(title="nodes in closed loop, tracked poses and threads, simulated; % of the length, mean (maximum)")
+    for name in ("setup", "prediction", "estimate"):
+        table.add_column(name, justify="left" if name == "setup" else "right")
+    for row in figures:
+        if "estimate" in row:
+            errors = (row[name] for name in ("prediction", "estimate"))
+            table.add_row(row["setup"], *(f"{e['mean_percent']:.3f} ({e['max_percent']:.2f})" for e in errors))
+    return table
+
+
 def record_loop(setup: Setup, duration: float) -> tuple[list[LoopInstant], dict[int, PredictionResult]]:
     """Return the rig at every period of a loop, and what the model made of the noisy poses by their stamps [ns]."""
     follower, done = setup.follower.follower(), False
@@ -103,18 +116,28 @@ def _measure(setup: Setup, duration: float) -> list[dict[str, Any]]:
     moving = instants[max(begins - 1, 0) :]
     stamps = {round(1e9 * instant.pose.stamp): instant for instant in moving if instant.framed}
     tracked, expected, times = [], [], []
+    errors: dict[str, list[float]] = {"prediction": [], "estimate": []}
     for stamp, result in results.items():
         forces = result.prediction.forces if result.prediction is not None else None
         if stamp in stamps and forces is not None:
             tracked.append(forces.needle_force)
             expected.append(stamps[stamp].pull)
             times.append(1e-9 * stamp)
+        for name, found in (("prediction", result.prediction), ("estimate", result.estimate)):
+            if stamp in stamps and found is not None:
+                truth = stamps[stamp].thread
+                at = np.linspace(0.0, float(arc_lengths(truth)[-1]), len(found.positions))
+                off = np.linalg.norm(found.positions - points_at(truth, at), axis=1)
+                errors[name].append(100.0 * float(off.mean()) / setup.model.thread_length)
     rows = {
         f"tracked, {setup.rig.frame_rate:g} Hz": (times, tracked, expected),
         f"exact, {setup.rig.frame_rate:g} Hz": _follow(setup, [instant for instant in moving if instant.framed]),
         f"exact, {setup.coils.rate:g} Hz": _follow(setup, moving),
     }
-    return [{"setup": setup.name, "poses": poses, **compare_pulls(*found)} for poses, found in rows.items()]
+    figures = [{"setup": setup.name, "poses": poses, **compare_pulls(*found)} for poses, found in rows.items()]
+    for name, each in errors.items():
+        figures[0][name] = {"mean_percent": float(np.mean(each)), "max_percent": float(np.max(each))}
+    return figures
 
 
 def _follow(setup: Setup, instants: list[LoopInstant]) -> tuple[list[float], list[Points], list[Points]]:

@@ -1,11 +1,11 @@
-"""The benchmark of the pull on the needle in closed loop: its figures for a short loop, and how they are computed."""
+"""The benchmark of the thread in closed loop: its figures for a short loop, and how those of the pull are computed."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from benchmarks.closed_loop_forces import SETTLING, compare_pulls, measure_closed_loop
+from benchmarks.closed_loop import SETTLING, compare_pulls, measure_closed_loop
 
 
 def test_figures_of_pulls_that_are_off_in_turns():
@@ -27,3 +27,6 @@ def test_a_short_loop():
     assert periods["rms_percent"] < 5.0  # of a peak that this loop has not reached yet
     assert frames["rms_percent"] < 0.5 * tracked["rms_percent"]
     assert tracked["averaged_rms_percent"] < 0.5 * tracked["rms_percent"]
+    assert 0.0 < tracked["estimate"]["mean_percent"] < 0.1
+    assert tracked["estimate"]["mean_percent"] <= tracked["estimate"]["max_percent"] < 0.5
+    assert 0.0 < tracked["prediction"]["mean_percent"] < 0.3
