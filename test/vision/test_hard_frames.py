@@ -249,6 +249,8 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("decoy_at_thread", 59, 91001),  # the thread passes beyond the tail, and touches nothing
         ("decoy_at_thread", 9, 91001),  # a walk has one edge only, the thread's
         ("rod_in_path", 57, 310001),  # a line over a rod leaves one end through its middle
+        ("rod_in_path", 25, 310004),  # a line hides one end of a rod, whose length is set wrong
+        ("rod_in_path", 89, 310004),
     ],
 )
 def test_poses_that_were_reversed_once_are_not(name: str, index: int, seed: int):

@@ -139,7 +139,7 @@ def _checked(
         if rod.cost > HOPELESS * pointed.cost:  # and so was given up
             tolerance = size.tolerance if is_measured else 0.0
             rod = fit_template(steel, rod.arc, size.length_px, width, tolerance=tolerance, start=rod.length, rod=True)
-        settled = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
+        settled = _settled(steel, rod if is_rod else pointed, rod, size, toward, is_rod=is_rod)
         if settled is None:
             return ALIKE
         fit, is_known = settled
@@ -311,7 +311,7 @@ def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> np.ndarray:
 
 
 def _settled(
-    steel: SteelMap, fit: TemplateFit, rod: TemplateFit, toward: np.ndarray | None, *, is_rod: bool
+    steel: SteelMap, fit: TemplateFit, rod: TemplateFit, size: NeedleSize, toward: np.ndarray | None, *, is_rod: bool
 ) -> tuple[TemplateFit, bool] | None:
     """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
 
@@ -325,7 +325,7 @@ def _settled(
     blunt = np.empty((2, 2))
     bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
     bound = PASSES * rod.width + PASSES_PX
-    is_pointed = _is_pointed(steel, fit, rod)
+    is_pointed = _is_pointed(steel, fit, rod, size)
     for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
         here, there = offsets[end], offsets[1 - end]
         leaves = is_rod and there is None and here is not None and here < bound
@@ -338,14 +338,15 @@ def _settled(
     return fit, False
 
 
-def _is_pointed(steel: SteelMap, fit: TemplateFit, rod: TemplateFit) -> bool:
-    """Say whether a needle is no rod that something beside or over it makes look pointed, however pale that is."""
+def _is_pointed(steel: SteelMap, fit: TemplateFit, rod: TemplateFit, size: NeedleSize) -> bool:
+    """Say whether a needle is no rod that something beside or over it makes look pointed, however pale that is.
+
+    Of the set length, which may be wrong, a rod could look like a worse fit than a needle that tapers.
+    """
     if rod.cost <= CLEARLY * fit.cost:
         return False
-    shown = replace(steel, perhaps=steel.below)
-    pointed = fit_template(shown, fit.arc, fit.length, fit.width, rounds=FIRST_ROUNDS)
-    blunt = fit_template(shown, rod.arc, rod.length, rod.width, rod=True, rounds=FIRST_ROUNDS)
-    return blunt.cost > CLEARLY * pointed.cost
+    one, other, blunt = _fits(replace(steel, perhaps=steel.below), rod, size, size.tolerance)
+    return blunt.cost > CLEARLY * min(one.cost, other.cost)
 
 
 def _pointing(fit: TemplateFit, toward: np.ndarray) -> TemplateFit:
