@@ -251,6 +251,9 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("rod_in_path", 57, 310001),  # a line over a rod leaves one end through its middle
         ("rod_in_path", 25, 310004),  # a line hides one end of a rod, whose length is set wrong
         ("rod_in_path", 89, 310004),
+        ("rod_in_path", 8, 310005),  # beyond a line over a rod lies the rest of it
+        ("rod_in_path", 87, 310005),  # a rod is longer than set, by more than what a thread is wide
+        ("rod_in_path", 88, 310005),  # a line passes one end of a rod
     ],
 )
 def test_poses_that_were_reversed_once_are_not(name: str, index: int, seed: int):

@@ -10,7 +10,7 @@ import numpy as np
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.axis_guesses import axis_guesses
 from magnetosuture_thread.vision.needle.comparison import bluntness, excess, fading, steel_rows
-from magnetosuture_thread.vision.needle.ends import ends_beyond, is_crossed, leaves_sideways, thread_offsets
+from magnetosuture_thread.vision.needle.ends import ends_beyond, leaves_sideways, leaves_tail, thread_offsets
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
@@ -329,7 +329,7 @@ def _settled(
     for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
         here, there = offsets[end], offsets[1 - end]
         leaves = is_rod and there is None and here is not None and here < bound
-        leaves = leaves and not is_crossed(steel, replace(rod, arc=tail_first))
+        leaves = leaves and leaves_tail(steel, replace(rod, arc=tail_first))
         passes = is_pointed and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
         if leaves or passes:
             return _pointing(fit, tail_first.direction(0.5 * rod.length)), True
