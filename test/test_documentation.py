@@ -30,7 +30,7 @@ from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-DOCS = sorted((ROOT / "docs").glob("*.md"))
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [README, *DOCS]
 WITH_COMMANDS = [*PAGES, ROOT / "CONTRIBUTING.md"]
 ALL = [*WITH_COMMANDS, ROOT / "CHANGELOG.md"]
@@ -59,7 +59,7 @@ SERVICES = {
     interface.PAUSE_RIG: "SetBool",
 }
 SETUPS = {path.stem for path in (ROOT / "config").glob("*.yaml")}
-FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
+FENCE = re.compile(r"^( *)```(\w*|\{\w+\}[^\n]*)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 
 pages = pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.name)
 
@@ -292,10 +292,11 @@ def test_links_resolve(page: Path):
 
 
 def test_every_page_and_picture_is_reached():
-    linked = set(re.findall(r"\(docs/([\w.]+)", README.read_text()))
-    assert {page.name for page in DOCS} <= linked
-    shown = {name for page in PAGES for name in re.findall(r"!\[[^]]*\]\((?:docs/)?([\w.]+)\)", page.read_text())}
-    assert {path.name for path in (ROOT / "docs").iterdir() if path.suffix in (".png", ".jpg", ".gif", ".svg")} == shown
+    index = ROOT / "docs/index.md"
+    listed = {line for tree in blocks(index, "{toctree}") for line in tree.splitlines() if line and line[0] != ":"}
+    assert listed == {str(page.relative_to(index.parent).with_suffix("")) for page in DOCS if page != index}
+    shown = {name for page in PAGES for name in re.findall(r"!\[[^]]*\]\([\w./]*pictures/([\w.]+)\)", page.read_text())}
+    assert {path.name for path in (ROOT / "docs/pictures").iterdir()} == shown
 
 
 EXAMPLES = [(page, code) for page in PAGES for code in blocks(page, "python")]
@@ -395,7 +396,7 @@ def topics_of_the_code() -> dict[str, str]:
     return {channel.name: channel.type_name.replace("/msg/", "/") for channel in channels}
 
 
-NODES_PAGE = ROOT / "docs/nodes.md"
+NODES_PAGE = ROOT / "docs/reference/nodes.md"
 
 
 def test_the_topic_table_is_that_of_the_code():
@@ -434,19 +435,23 @@ def test_the_table_of_nodes_is_that_of_the_executables():
 
 
 def test_the_table_of_setups_is_that_of_the_files():
-    rows = {row[0].strip("`") for row in table_at_the_top(ROOT / "docs/configuration.md")}
+    rows = {row[0].strip("`") for row in table_at_the_top(ROOT / "docs/how_to/configuration.md")}
     assert rows == SETUPS
 
 
 def test_every_command_and_target_is_listed():
-    listed = {span.split()[1] for span in spans(ROOT / "docs/commands.md") if span.startswith("magnetosuture ")}
+    listed = {
+        span.split()[1] for span in spans(ROOT / "docs/reference/commands.md") if span.startswith("magnetosuture ")
+    }
     assert set(subparsers(make_parser())) <= listed
-    rows = {row[0].strip("`").split()[1] for row in table(ROOT / "docs/installation.md", "In the clone, with make")}
+    rows = {
+        row[0].strip("`").split()[1] for row in table(ROOT / "docs/how_to/installation.md", "In the clone, with make")
+    }
     assert rows == TARGETS - {"help"}
 
 
 def test_materials_are_listed():
-    assert set(MATERIALS) <= set(spans(ROOT / "docs/configuration.md"))
+    assert set(MATERIALS) <= set(spans(ROOT / "docs/how_to/configuration.md"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
