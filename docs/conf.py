@@ -25,23 +25,27 @@ author = "the authors of magnetosuture_thread"
 copyright = author
 
 extensions = [
-    "generated_reference",
     "myst_parser",
     "sphinx.ext.autodoc",
+    "generated_reference",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
+smartquotes = False  # `--option` stays what it is
 highlight_language = "bash"  # of indented blocks, which hold commands
-nitpicky = True
 
 # Markdown as GitHub reads it: its anchors, its formulas.
 myst_enable_extensions = ["dollarmath"]
 myst_fence_as_directive = ["math"]
 myst_heading_anchors = 4
 
+autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
+add_module_names = False
 autodoc_typehints = "none"  # the signature names the types in words that docstrings explain
+default_role = "literal"  # `name` in docstrings is code
+napoleon_use_ivar = True
 napoleon_use_rtype = False
 
 html_theme = "furo"
