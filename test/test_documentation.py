@@ -316,6 +316,12 @@ def test_python_examples_run(page: Path, code: str, capsys: pytest.CaptureFixtur
         assert -1e-8 < prediction.margins["obstacle"].minimum < 1e-3  # it does lie around the post
 
 
+def test_every_picture_is_made_by_a_command():
+    makers = (ROOT / "docs/make_pictures.py").read_text()
+    for path in (ROOT / "docs/pictures").iterdir():
+        assert f'"{path.name}"' in makers or path.name == "data_flow.svg", path.name
+
+
 def test_there_are_examples():
     assert [page for page, _ in EXAMPLES].count(README) == 1
     assert len(EXAMPLES) >= 2
