@@ -8,7 +8,7 @@ from pathlib import Path
 
 import magnetosuture_thread
 
-sys.path.insert(0, str(Path(__file__).parent))  # for generated_reference.py
+sys.path.insert(0, str(Path(__file__).parent))  # for our own extensions
 
 
 def mathjax_script() -> str:
@@ -27,6 +27,7 @@ copyright = author
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
+    "commits_of_tables",
     "generated_reference",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
