@@ -1,4 +1,4 @@
-"""Writes below each table of the results from which commit its figures are, as git has it; nothing without a history."""
+"""Writes below each table of the results the commit of its figures, as git has it; nothing without a history."""
 
 from __future__ import annotations
 
