@@ -17,6 +17,8 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
+            "campaign/report/page.html",
+            "campaign/report/page.css",
             "evaluation/report/page.html",
             "evaluation/report/page.css",
             "evaluation/report/page.js",

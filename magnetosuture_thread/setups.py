@@ -14,6 +14,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import EVERY_NODE, load_setup
+from magnetosuture_thread.planning.procedure import Procedure
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.rig.settings import RigSettings
@@ -122,3 +123,19 @@ def read_setup(name: str, scene: Scene | None = None) -> Setup:
         except ConfigurationError as error:
             raise ConfigurationError(error.name, error.value, error.expectation, str(path)) from None
     return setup
+
+
+def read_procedure_setup(procedure: Procedure, name: str = "") -> Setup:
+    """Read the setup of a procedure, with the procedure's scene if it names one.
+
+    Args:
+        procedure: to execute.
+        name: of another setup than the procedure's, or the path of its file.
+
+    Raises:
+        ConfigurationError: neither names a setup; or see `read_setup` and `read_scene`.
+    """
+    if not (name or procedure.setup):
+        raise ConfigurationError("setup", "nothing", f"a setup, as the procedure {procedure.name} names none")
+    setup = read_setup(name or procedure.setup)
+    return setup.with_scene(read_scene(procedure.scene)) if procedure.scene else setup

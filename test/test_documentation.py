@@ -26,6 +26,7 @@ from magnetosuture_thread.configuration import ROS_PARAMETERS, configuration_fie
 from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.thread import MATERIALS
 from magnetosuture_thread.planning.procedure import parse_procedure
+from magnetosuture_thread.resources import shipped_procedures
 from magnetosuture_thread.scene import read_scene
 from magnetosuture_thread.setups import SETTINGS_CLASSES
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
@@ -249,7 +250,7 @@ def parameters() -> frozenset[str]:
 @cache
 def words_of_the_code() -> frozenset[str]:
     """Return every word that stands in the package, its messages, setups or build files."""
-    found: set[str] = set(SETUPS)
+    found: set[str] = {*SETUPS, *shipped_procedures()}
     for folder in ("magnetosuture_thread", "msg_defs", "config", "launch", "benchmarks"):
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in (".py", ".msg", ".srv", ".action", ".yaml", ".js", ".html", ".txt", ".cmake"):

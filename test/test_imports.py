@@ -40,7 +40,8 @@ ALLOWED = {
     "planning": {*BASE, "compiled", "geometry", "safety", "scene"},
     "campaign": {
         *BASE,
-        *("coils", "geometry", "model", "planning", "rig", "safety", "scene", "setups", "thread_observation", "vision"),
+        *("bags", "coils", "evaluation", "geometry", "interface", "messages", "model", "planning", "rig", "safety"),
+        *("scene", "setups", "thread_observation", "vision"),
     },
     "console": {*BASE, "geometry", "scene", "shared_parameters"},
     "rig": {*BASE, "compiled", "geometry", "scene", "shared_parameters"},

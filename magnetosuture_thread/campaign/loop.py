@@ -6,11 +6,12 @@ import heapq
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.bridge import NEEDLE, CoilBridge
+from magnetosuture_thread.coils.bridge import NEEDLE, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.errors import InvalidInputError
@@ -38,7 +39,7 @@ Controller = Callable[[float, Vector, Vector, ThreadCondition], Vector]
 
 @dataclass(frozen=True)
 class LoopFrame:
-    """The moment of a frame, as it is and as the nodes have it.
+    """The instant of a frame, as it is and as the nodes have it.
 
     Attributes:
         time: since the loop began [s].
@@ -62,13 +63,37 @@ class LoopFrame:
 
 
 @dataclass(order=True)
-class _Measurement:
+class Measurement:
+    """Needle and thread as measured in a frame.
+
+    Attributes:
+        due: when it reaches the nodes [s].
+        stamp: of the frame [s].
+        tail: of the needle, shape (2,) [m].
+        heading: unit vector, shape (2,).
+        covariance: of x, y [m] and the angle of the heading [rad], shape (3, 3).
+        observation: of the thread; None where none was made.
+    """
+
     due: float
     stamp: float
     tail: Vector = field(compare=False)
     heading: Vector = field(compare=False)
     covariance: Vector = field(compare=False)
     observation: ThreadObservation | None = field(compare=False)
+
+
+class LoopRecorder(Protocol):
+    """Gets what the nodes and the rig would publish. Times are those of the loop's stamps [s]."""
+
+    def on_frame(self, now: float, frame: RigFrame) -> None:
+        """Take a frame with its ground truth."""
+
+    def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
+        """Take a measurement, what the thread model makes of it, and the commanded velocity of the tip [m/s]."""
+
+    def on_bridge(self, now: float, output: BridgeOutput) -> None:
+        """Take a step of the coil bridge."""
 
 
 class ClosedLoop:
@@ -82,6 +107,7 @@ class ClosedLoop:
         camera: whether frames are rendered and tracked; else the tracker's noise is added to the truth.
         losses: share of the frames that get lost, 0 to 1.
         coil_gains: by which the coils are stronger than the bridge believes, shape (m,); all 1 if None.
+        recorder: gets what the nodes would publish; None for nobody.
     """
 
     def __init__(
@@ -94,7 +120,9 @@ class ClosedLoop:
         camera: bool = False,
         losses: float = 0.0,
         coil_gains: Vector | None = None,
+        recorder: LoopRecorder | None = None,
     ) -> None:
+        self._recorder = recorder
         self.setup, self.rig, self._controller = setup, rig, controller
         self._random = np.random.default_rng([seed, 1])
         self._losses = losses
@@ -110,7 +138,7 @@ class ClosedLoop:
         self._period = 1.0 / setup.coils.rate
         self._frame_period = 1.0 / setup.rig.frame_rate
         self._next_frame = START
-        self._waiting: list[_Measurement] = []
+        self._waiting: list[Measurement] = []
         self._count = 0
         self._condition = ThreadCondition(problem="no thread yet")
         self._commanded = np.zeros(2)
@@ -132,12 +160,16 @@ class ClosedLoop:
             self._measured(heapq.heappop(self._waiting))
         output = self.bridge.step(self.now, self.now, self._driver)
         self._reason = output.reason
+        if self._recorder is not None:
+            self._recorder.on_bridge(self.now, output)
         self.rig.apply(self._gains * output.allocation.currents, self.now - START)
         self.now += self._period
         return frame
 
     def _look(self) -> LoopFrame:
         frame = self.rig.look(self.now - START, rendered=self._tracker is not None)
+        if self._recorder is not None:
+            self._recorder.on_frame(self.now, frame)
         lost = self._random.uniform() < self._losses
         measured = None if lost else self._measure(frame)
         if measured is not None:
@@ -153,7 +185,7 @@ class ClosedLoop:
             self._reason,
         )
 
-    def _measure(self, frame: RigFrame) -> _Measurement | None:
+    def _measure(self, frame: RigFrame) -> Measurement | None:
         due = self.now + LATENCY
         if self._tracker is not None:
             if frame.image is None:
@@ -162,12 +194,12 @@ class ClosedLoop:
             if not len(track.tail) or len(track.heading) == 0:
                 return None
             observation = track.observation
-            return _Measurement(due, self.now, track.tail, track.heading, track.covariance, observation)
+            return Measurement(due, self.now, track.tail, track.heading, track.covariance, observation)
         tail = frame.tail + TAIL_DEVIATION * self._random.standard_normal(2)
         angle = frame.heading + HEADING_DEVIATION * self._random.standard_normal()
         covariance = np.diag([TAIL_DEVIATION**2, TAIL_DEVIATION**2, HEADING_DEVIATION**2])
         heading = np.array([math.cos(angle), math.sin(angle)])
-        return _Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
+        return Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
 
     def _observe(self, thread: Points) -> ThreadObservation:
         """Return the thread with the noise of a tracked centreline: alike over `THREAD_CORRELATION`."""
@@ -185,7 +217,7 @@ class ClosedLoop:
         )
         return ThreadObservation((piece,), complete=True)
 
-    def _measured(self, measured: _Measurement) -> None:
+    def _measured(self, measured: Measurement) -> None:
         """Hand a measurement to bridge, thread model and controller, in the order of the graph."""
         self._count += 1
         stamp, now = measured.stamp, self.now
@@ -211,6 +243,8 @@ class ClosedLoop:
         self._condition = condition_of(result)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
         self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
+        if self._recorder is not None:
+            self._recorder.on_measurement(now, measured, result, self._commanded)
 
 
 def condition_of(result: PredictionResult) -> ThreadCondition:

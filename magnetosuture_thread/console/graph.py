@@ -19,6 +19,11 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
                     "prediction_only": bool, "unmeasured_for": s, "hidden": share,
                     "disturbances": [{"position": [x, y], "direction": [x, y], "force": N, "text": str}, ...],
                     "age": s} | None,
+      "forecast": {"horizon": s,        # while the present command is held
+                   "ghosts": [{"time": s, "vertices": [[x, y], ...]}, ...],   # the thread, last at the horizon
+                   "events": [str],     # what happens when
+                   "problem": str,      # why it ends early, empty if it does not
+                   "age": s} | None,
       "margins": {"valid": bool, "of": "estimate|prediction|nothing", "reason": str,
                   "clearance": [float | None, ...],   # of each node, minimum over wall and shapes; None: none near
                   "least": {"connectivity": m, "compression": m, "obstacle": m, ...},   # of the kinds present
@@ -35,7 +40,7 @@ SI units and plain JSON types throughout. `Graph.state` returns, where every par
                     "goals_met": int, "progress": share, "reason": str, "resumes": bool, "hold_to_run": bool,
                     "clearance": m | None} | None,   # None where no needle planner runs
       "plan": [[x, y], ...],           # where the middle of the needle is to go, may be empty
-      "procedures": [str],             # names of those that can be planned
+      "procedures": [str],             # names of those whose shapes the scene has
       "nodes": {name: {"level": "ok|warn|error|silent", "message": str, "values": {str: str}, "age": s}},
     }
 

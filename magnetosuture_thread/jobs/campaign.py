@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Collection
+from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 from magnetosuture_thread import ConfigurationError
+from magnetosuture_thread.campaign.bag import RunBag
+from magnetosuture_thread.campaign.loop import START
+from magnetosuture_thread.campaign.report.page import CampaignDetails, write_campaign_page
 from magnetosuture_thread.campaign.run import RunResult, run_procedure
 from magnetosuture_thread.campaign.variation import vary
 from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.setups import Setup, read_procedure_setup
 from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
 
-FILE = "campaign.json"
+FILE, PAGE = "campaign.json", "campaign.html"
+BAGS = "bags"  # folder of the bags in the output
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -49,8 +56,7 @@ class CampaignResult:
         return sum(run.success for run in self.runs)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures as plain values, in SI units unless a name ends otherwise."""
-        runs = [{key: value for key, value in asdict(run).items() if key != "last_frames"} for run in self.runs]
+        """Return the figures as plain values, in the unit that each name ends with."""
         return {
             "procedure": self.procedure,
             "setup": self.setup,
@@ -58,9 +64,22 @@ class CampaignResult:
             "follower": self.follower,
             "simulated": True,
             "successes": self.successes,
-            "runs": runs,
+            "runs": [run.to_json() for run in self.runs],
             "died": {str(seed): reason for seed, reason in self.died.items()},
         }
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A run to make.
+
+    Attributes:
+        seed: of the run.
+        bag: folder of its bag; None for none.
+    """
+
+    seed: int
+    bag: Path | None
 
 
 def simulate_campaign(
@@ -71,11 +90,14 @@ def simulate_campaign(
     setup: str = "",
     camera: bool = False,
     follower: bool = False,
+    bags: Collection[int] = (),
     workers: int = 1,
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> CampaignResult:
-    """Run a procedure once for each seed, and write `campaign.json` into a new folder.
+    """Run a procedure once for each seed, and write `campaign.json`, a report and bags into a new folder.
+
+    The files are the same for the same seeds, however many processes run them.
 
     Args:
         name: of the procedure, or the path of its file.
@@ -84,38 +106,50 @@ def simulate_campaign(
         setup: name or file of the setup; empty for the procedure's own.
         camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
         follower: whether the setup's path follower runs in place of the procedure, for comparison.
+        bags: seeds whose runs are recorded as bags.
         workers: processes.
         log: called with a line for a person at each run's end.
         progress: called with the share done, 0 to 1.
 
     Raises:
-        ConfigurationError: procedure or setup cannot be used, or do not fit each other.
+        ConfigurationError: procedure or setup cannot be used, or do not fit each other, or a bag is of no run.
         BagError: the output exists, or cannot be written.
     """
     procedure = read_procedure(name)
-    if not (setup or procedure.setup):
-        raise ConfigurationError("--setup", "nothing", f"a setup, as the procedure {procedure.name} names none")
-    used = read_setup(setup or procedure.setup)
+    if not set(bags) <= set(seeds):
+        raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
+    used = read_procedure_setup(procedure, setup)
     runs: dict[int, RunResult] = {}
     died: dict[int, str] = {}
+    folders = {seed: f"{BAGS}/seed_{seed}" for seed in sorted(set(bags))}
     with whole_folder(output) as folder, WorkerPool(partial(_run, procedure, used, camera, follower), workers) as pool:
-        for index, found in pool.run(list(seeds), log, progress):
+        tasks = [_Task(seed, folder / folders[seed] if seed in folders else None) for seed in seeds]
+        for index, found in pool.run(tasks, log, progress):
             seed = seeds[index]
             if isinstance(found, WorkerDiedError):
                 died[seed] = str(found)
                 log(f"seed {seed}: {found}")
                 continue
-            runs[seed] = found
-            log(f"seed {seed}: {'success' if found.success else found.reason}")
+            runs[seed], used_time = found
+            outcome = "success" if runs[seed].success else runs[seed].reason
+            speed = runs[seed].simulated_s / used_time
+            log(f"seed {seed}: {outcome} ({speed:.1f} times real time)")
         ordered = tuple(runs[seed] for seed in seeds if seed in runs)
         result = CampaignResult(procedure.name, used.name, camera, follower, ordered, died)
         (folder / FILE).write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+        details = CampaignDetails(procedure, used, camera, follower, died, folders)
+        (folder / PAGE).write_text(write_campaign_page(details, ordered), encoding="utf-8")
     return result
 
 
 def _run(
-    procedure: Procedure, setup: Setup, camera: bool, follower: bool, seed: int, log: Log, progress: Progress
-) -> RunResult:
-    """Run one seed; the last seconds of the frames stay in this process."""
-    found = run_procedure(procedure, setup, vary(setup, seed), camera=camera, follower=follower)
-    return replace(found, last_frames=())
+    procedure: Procedure, setup: Setup, camera: bool, follower: bool, task: _Task, log: Log, progress: Progress
+) -> tuple[RunResult, float]:
+    """Run one seed; return what came of it, and the processor time that it took [s]."""
+    began = process_time()
+    what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}, seed {task.seed}"
+    notes = {"setup": setup.name, SETUP_NOTE: setup.path.read_text(encoding="utf-8"), "simulated": what}
+    with nullcontext() if task.bag is None else RunBag(task.bag, setup, notes, START, camera=camera) as bag:
+        variation = vary(setup, task.seed)
+        found = run_procedure(procedure, setup, variation, camera=camera, follower=follower, recorder=bag)
+    return found, process_time() - began

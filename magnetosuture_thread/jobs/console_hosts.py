@@ -32,6 +32,7 @@ from magnetosuture_thread.setups import Setup, read_setup
 # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
 # go before the browser and the rig, and behind the bridge.
 PREFERRED, PRIORITY = "perception", 5
+FORECAST_HORIZON = 3.0  # s that the page shows ahead
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
 
 
@@ -270,7 +271,9 @@ class SimulatedHost(RecordingHost):
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
         arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS]
-        arguments += ["-p", f"{PLANNER}:keep_out:={self.setup.coils.keep_out!r}"]
+        keep_out = repr(self.setup.coils.keep_out)
+        arguments += ["-p", f"{PLANNER}:keep_out:={keep_out}", "-p", f"thread_model:forecast_keep_out:={keep_out}"]
+        arguments += ["-p", f"thread_model:forecast_horizon:={FORECAST_HORIZON}"]
         # Here and not in another thread: the nodes end with the thread that has started them.
         processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)
         self._nodes = NodeProcesses(processes, arguments, self._environment, self._logs).__enter__()

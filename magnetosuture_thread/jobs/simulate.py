@@ -36,7 +36,8 @@ from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.recorder import Recorder
 from magnetosuture_thread.nodes.run import Interruption
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.planning.procedure import read_procedure
+from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 
 ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # published while nodes start, for the bag's beginning
 # Topics on which nothing may come before the run begins.
@@ -110,7 +111,7 @@ def simulate(
         GraphError: a node ended or did not come, the needle never got to the end of its path, or the procedure failed.
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
-    setup = read_setup(setup_name)
+    setup = read_procedure_setup(read_procedure(procedure), setup_name) if procedure else read_setup(setup_name)
     execution = ProcedureRun(procedure, setup) if procedure else None
     if execution is None and not setup.follower.waypoints:
         raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
@@ -164,6 +165,8 @@ def _run(
 ) -> str:
     """Run the graph and record it; return what went wrong, so that the bag stays."""
     arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE]
+    if execution is not None:
+        arguments += execution.scene_arguments
     if rate is not None:
         arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(rate)}"]
     notes = {

@@ -12,7 +12,7 @@ from magnetosuture_thread.jobs.replay_inputs import Progress
 from magnetosuture_thread.nodes.procedure_client import DONE, ProcedureClient, ProcedureReport
 from magnetosuture_thread.nodes.recorder import Recorder
 from magnetosuture_thread.planning.procedure import read_procedure
-from magnetosuture_thread.resources import find_procedure_file
+from magnetosuture_thread.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.setups import Setup
 
 MAX_TIME = 600.0  # s of simulated time for a procedure, as in a campaign
@@ -56,6 +56,12 @@ class ProcedureRun:
     def arguments(self) -> tuple[str, ...]:
         """Arguments for the node, after `--ros-args`: it waits for bridge and recorder, and keeps out as the bridge."""
         return "-p", "needle_planner:audience:=2", "-p", f"needle_planner:keep_out:={self._keep_out!r}"
+
+    @property
+    def scene_arguments(self) -> tuple[str, ...]:
+        """Arguments for all nodes: the procedure's own scene, if it names one."""
+        scene = self._procedure.scene
+        return ("-p", f"scene:={find_scene_file(scene).resolve()}") if scene else ()
 
     def execute(
         self, recorder: Recorder, check: Callable[[], None], duration: float | None, rate: float, progress: Progress

@@ -109,19 +109,29 @@ def forecast_markers(builder: MessageBuilder, stamp: Any, forecast: Forecast) ->
 
 
 def forecast_text(forecast: Forecast) -> str:
-    """Return what will happen and when, for a person; empty where nothing does.
+    """Return what will happen and when, for a person; empty where nothing does. See `forecast_events`."""
+    contact = forecast.first_contact
+    time, shape = (math.nan, "") if contact is None else (contact.time, contact.shape)
+    return ", ".join(forecast_events(time, shape, _time(forecast.first_friction), _time(forecast.rest_time)))
 
-    What holds already is not announced.
+
+def forecast_events(contact: float, shape: str, friction: float, rest: float) -> list[str]:
+    """Return what will happen and when, for a person, the first event first. What holds already is not announced.
+
+    Args:
+        contact: when the thread first touches something [s]; NaN for never, as for the other times.
+        shape: that it touches, or "wall".
+        friction: when its first node is under friction [s].
+        rest: when the needle comes to rest although it is commanded to move [s].
     """
-    parts = []
-    contact, friction, rest = forecast.first_contact, forecast.first_friction, forecast.rest_time
-    if contact is not None and contact.time > 0.0:
-        parts.append(f"touches {contact.shape} in {contact.time:.1f} s")
-    if friction is not None and friction > 0.0:
-        parts.append(f"friction in {friction:.1f} s")
-    if rest is not None:
-        parts.append(f"needle rests in {rest:.1f} s" if rest > 0.0 else "needle rests")
-    return ", ".join(parts)
+    events = []
+    if contact > 0.0:
+        events.append((contact, f"touches the {shape.replace('_', ' ')} in {contact:.1f} s"))
+    if friction > 0.0:
+        events.append((friction, f"friction in {friction:.1f} s"))
+    if rest >= 0.0:
+        events.append((rest, f"needle rests in {rest:.1f} s" if rest > 0.0 else "needle rests"))
+    return [text for _, text in sorted(events)]
 
 
 def _instants(forecast: Forecast, count: int) -> NDArray[np.intp]:

@@ -27,6 +27,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.resources import find_procedure_file
 
 MAX_GOALS = 100
+KEYS = {"setup", "scene", "goals", "limits"}
 _PLACE: dict[str, Any] = {"unit": "m", "minimum": -0.5, "maximum": 0.5, "multiple": 2}
 
 
@@ -152,14 +153,27 @@ class Procedure:
     Attributes:
         name: of the procedure.
         setup: name or file of the setup that it is meant for; empty for any.
+        scene: name or file of the scene that it is meant for, in place of the setup's; empty for that.
         goals: what is to be done.
         limits: while each goal is pursued.
     """
 
     name: str
     setup: str
+    scene: str
     goals: tuple[Goal, ...]
     limits: tuple[ProcedureLimits, ...]
+
+    @property
+    def shape_names(self) -> frozenset[str]:
+        """Names of the shapes that its goals need."""
+        names: set[str] = set()
+        for goal in self.goals:
+            if isinstance(goal, PassThrough):
+                names.update(goal.between)
+            elif isinstance(goal, Wrap | Tighten) and goal.around:
+                names.add(goal.around)
+        return frozenset(names)
 
 
 def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
@@ -173,13 +187,14 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
     Raises:
         ConfigurationError: it is no procedure; the message names goal and field.
     """
-    if not isinstance(content, Mapping) or not set(content) <= {"setup", "goals", "limits"} or "goals" not in content:
+    if not isinstance(content, Mapping) or not set(content) <= KEYS or "goals" not in content:
         given: Any = sorted(map(str, content)) if isinstance(content, Mapping) else type(content).__name__
-        expected = "goals, and setup and limits if they differ from the defaults"
+        expected = "goals, and setup, scene and limits if they differ from the defaults"
         raise ConfigurationError("procedure", given, expected, source)
-    setup = content.get("setup", "")
-    if not isinstance(setup, str):
-        raise ConfigurationError("procedure.setup", setup, "the name of a setup", source)
+    setup, scene = content.get("setup", ""), content.get("scene", "")
+    for key, value in (("setup", setup), ("scene", scene)):
+        if not isinstance(value, str):
+            raise ConfigurationError(f"procedure.{key}", value, f"the name of a {key}", source)
     goals, common = content["goals"], _mapping(content.get("limits", {}), "limits", source)
     if not isinstance(goals, list) or not 0 < len(goals) <= MAX_GOALS:
         given = len(goals) if isinstance(goals, list) else type(goals).__name__
@@ -200,7 +215,7 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
             prefix = "" if error.name.startswith("goals[") else f"{where}."
             raise ConfigurationError(f"{prefix}{error.name}", error.value, error.expectation, source) from None
         found.append(goal)
-    return Procedure(name, setup, tuple(found), tuple(limits))
+    return Procedure(name, setup, scene, tuple(found), tuple(limits))
 
 
 def read_procedure(name: str) -> Procedure:

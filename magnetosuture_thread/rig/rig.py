@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.rig.camera.dish_camera import Image
+from magnetosuture_thread.rig.camera.dish_camera import DishCamera, Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, find_collision
@@ -81,7 +81,7 @@ class Rig:
         settings.check_scene(scene)
         self._settings, self.scene = settings, scene
         self._dynamics = settings.dynamics(scene)
-        self.camera = settings.camera(scene)
+        self._camera: DishCamera | None = None  # drawn when it is needed first, which takes a second
         self.faults = settings.schedule(scene)
         self._random = np.random.default_rng(settings.seed + 1)
         self.time = 0.0
@@ -102,6 +102,13 @@ class Rig:
         spare.step(self.currents, 1e-3)
         self.camera.render(spare.tail, spare.heading, spare.thread)
 
+    @property
+    def camera(self) -> DishCamera:
+        """The camera over the dish as it is now."""
+        if self._camera is None:
+            self._camera = self._settings.camera(self.scene)
+        return self._camera
+
     def set_scene(self, scene: Scene) -> None:
         """Put another dish and other shapes around needle and thread, which stay where they are.
 
@@ -115,9 +122,9 @@ class Rig:
         for name, points in {"needle": self._dynamics.body, "thread": self._dynamics.thread}.items():
             if what := find_collision(new, points, holes=False):
                 raise InvalidInputError("scene", f"{what} where the {name} is", "shapes off needle and thread")
-        camera, surface = self._settings.camera(scene), self._settings.surface(scene)
-        self._dynamics.set_surface(surface)
-        self.scene, self.camera = scene, camera
+        camera = None if self._camera is None else self._settings.camera(scene)
+        self._dynamics.set_surface(self._settings.surface(scene))
+        self.scene, self._camera = scene, camera
         self.faults.set_dish(scene.dish.diameter)
 
     def apply(self, currents: Vector, time: float) -> None:

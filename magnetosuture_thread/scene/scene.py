@@ -170,7 +170,7 @@ class SceneShape:
         if len(self.geometry.holes) > MAX_HOLES:
             raise scene_error(f"{self.name}.polygon.holes", f"{len(self.geometry.holes)} holes", f"at most {MAX_HOLES}")
 
-    @property
+    @cached_property
     def solid(self) -> shapely.Geometry:
         """The shape as a shapely geometry; a disc as a polygon of 256 vertices."""
         if isinstance(self.geometry, Disc):

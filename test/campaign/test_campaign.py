@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import magnetosuture_thread.campaign.run as campaign
+from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.campaign.run import RunResult, run_procedure
 from magnetosuture_thread.campaign.variation import vary
 from magnetosuture_thread.cli.main import main
@@ -40,16 +41,16 @@ def first(hernia: Setup, short: Procedure) -> RunResult:
 
 def test_a_near_place_is_reached_by_the_whole_loop(first: RunResult):
     assert (first.success, first.reason) == (True, "")
-    assert 0.0 < first.ideal_time_s < first.time_s < 1.5 * first.ideal_time_s
-    assert first.min_needle_clearance_m > 1e-3
-    assert (first.max_thread_penetration_m, first.wrap_degrees) == (0.0, 0.0)
-    assert first.max_tension_n > 0.0
-    assert first.last_frames == ()
+    assert 0.0 < first.figures.ideal_time_s < first.figures.time_s < 1.5 * first.figures.ideal_time_s
+    assert first.figures.min_needle_clearance_m > 1e-3
+    assert (first.figures.max_thread_penetration_m, first.figures.wrap_degrees) == (0.0, 0.0)
+    assert first.figures.max_tension_n > 0.0
+    assert (first.last_instants, first.closest_instant) == ((), None)
 
 
 def test_a_seed_gives_the_same_run_and_another_seed_another(hernia: Setup, short: Procedure, first: RunResult):
     assert run_procedure(short, hernia, vary(hernia, 3)) == first
-    assert run_procedure(short, hernia, vary(hernia, 4)).time_s != first.time_s
+    assert run_procedure(short, hernia, vary(hernia, 4)).figures != first.figures
 
 
 def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_vary(hernia: Setup):
@@ -75,13 +76,13 @@ def test_the_path_follower_runs_for_comparison(hernia: Setup, monkeypatch: pytes
     found = run_procedure(read_procedure("hernia"), hernia, vary(hernia, 0), follower=True)
     assert not found.success
     assert "not done after 3 s" in found.reason
-    assert found.last_frames[-1].commanded.any()
+    assert found.last_instants[-1].frame.commanded.any()
 
 
 def test_with_the_camera_the_tracker_measures(hernia: Setup, short: Procedure, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(campaign, "MAX_TIME", 1.5)
     found = run_procedure(short, hernia, vary(hernia, 3), camera=True)
-    moved = [frame.commanded.any() for frame in found.last_frames]
+    moved = [instant.frame.commanded.any() for instant in found.last_instants]
     assert any(moved)
     assert not moved[0]
 
@@ -98,8 +99,40 @@ def test_the_command_writes_what_came_of_each_seed(tmp_path: Path, capsys: pytes
     named = {"seed", "success", "reason", "time_s", "ideal_time_s", "min_needle_clearance_m"}
     named |= {"max_thread_penetration_m", "longest_rest_s", "wrap_degrees"}
     assert named <= set(content["runs"][0])
+    assert sorted(path.name for path in output.iterdir()) == ["campaign.html", "campaign.json"]
     assert "runs succeeded (simulated)" in capsys.readouterr().out
     assert main(["campaign", str(file), "--output", str(output)]) == 1  # exists already
+
+
+def test_files_and_bags_do_not_depend_on_the_number_of_processes(
+    tmp_path: Path, short: Procedure, hernia: Setup, capsys: pytest.CaptureFixture[str]
+):
+    file = tmp_path / "short.yaml"
+    file.write_text(json.dumps(SHORT))
+    common = ["campaign", str(file), "--seeds", "2", "--first-seed", "3", "--bags", "4"]
+    for workers in ("1", "2"):
+        assert main([*common, "--workers", workers, "--output", str(tmp_path / workers)]) == 0
+    for name in ("campaign.json", "campaign.html", "bags/seed_4/seed_4_0.mcap"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+    bag = Bag(tmp_path / "1" / "bags" / "seed_4")
+    assert bag.notes["simulated"].endswith("seed 4")
+    alone = run_procedure(short, hernia, vary(hernia, 4))  # recording changes nothing
+    assert json.loads((tmp_path / "1" / "campaign.json").read_text())["runs"][1] == alone.to_json()
+    counts = {topic.rsplit("/", 1)[-1]: count for topic, count in bag.counts.items()}
+    frames = round(alone.simulated_s * hernia.rig.frame_rate)
+    assert abs(counts["needle"] - frames) <= 1
+    assert 0.8 * frames < counts["measured_cp"] == counts["margins"] == counts["servo_cv"] <= counts["needle"]
+    assert 0.8 * frames < counts["estimated"] <= counts["measured_cp"]
+    capsys.readouterr()
+    replayed = ["replay", "--offline", str(bag.path), "--duration", "2", "--output", str(tmp_path / "replayed")]
+    assert main(replayed) == 0
+    assert "estimate error, mean" in capsys.readouterr().out
+
+
+def test_a_bag_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["campaign", "hernia", "--bags", "7", "--output", str(tmp_path / "out")]) == 2
+    assert "seeds of 0 to 0" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_procedure_that_does_not_fit_its_setup_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

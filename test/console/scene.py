@@ -100,6 +100,7 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "age": 0.02,
         },
         "estimated": None,
+        "forecast": None,
         "margins": {
             "valid": True,
             "of": "prediction",
@@ -172,6 +173,15 @@ def procedure_state(state_name: str = "idle", **values: Any) -> dict[str, Any]:
         **values,
     }
     return {**shown, "plan": [], "procedures": ["hernia", "slalom"]}
+
+
+def forecast_state(*events: str, **values: Any) -> dict[str, Any]:
+    """Return the state of a graph that forecasts its thread: it moves up by 1 mm in each of three seconds."""
+    shown = state(**values)
+    line = thread(len(shown["predicted"]["vertices"]))
+    ghosts = [{"time": float(k), "vertices": (line + np.array([0.0, 1e-3 * k])).tolist()} for k in (1, 2, 3)]
+    shown["forecast"] = {"horizon": 3.0, "ghosts": ghosts, "events": list(events), "problem": "", "age": 0.02}
+    return shown
 
 
 def estimated_state(hidden: bool = False, found: bool = False, **values: Any) -> dict[str, Any]:

@@ -137,6 +137,7 @@ def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path)
     pilot.until(lambda: pilot.tip()[0] - before[0] > 1e-3, "the needle to move to the right")
     right, up = pilot.tip() - before
     assert abs(up) < right  # it turns a little while the thread begins to follow
+    expect(page.locator("#dish")).to_have_attribute("data-ghosts", "3")  # by the graph's own forecasts
     pilot.press()
     bench.rests()
 

@@ -20,6 +20,7 @@ from magnetosuture_msgs.msg import (
     PredictedThread,
     SafetyMargins,
     ThreadDisturbance,
+    ThreadForecast,
     TrackerState,
 )
 
@@ -111,6 +112,24 @@ def test_the_estimated_thread():
     message.deviation = []
     with pytest.raises(InvalidInputError, match="a deviation for each position"):
         messages.estimated(message)
+
+
+def test_the_forecast_has_ghosts_and_what_happens_first():
+    """Eleven instants of two nodes, which move by 1 mm in each."""
+    positions = [Point(x=1e-3 * k, y=0.1 * node) for k in range(11) for node in range(2)]
+    message = ThreadForecast(time=[0.3 * k for k in range(11)], horizon=3.0, positions=positions)
+    message.contact_time, message.contact_shape = 1.44, "left_tissue"
+    message.friction_time, message.rest_time = 0.81, math.nan
+    shown = plain(messages.forecast(message))
+    assert shown["events"] == ["friction in 0.8 s", "touches the left tissue in 1.4 s"]
+    assert [ghost["time"] for ghost in shown["ghosts"]] == pytest.approx([0.9, 2.1, 3.0])
+    assert shown["ghosts"][-1]["vertices"] == [[0.01, 0.0], [0.01, 0.1]]
+    # What holds already is not announced; a needle that rests is.
+    message.contact_time, message.friction_time, message.rest_time = 0.0, 0.0, 0.0
+    assert plain(messages.forecast(message))["events"] == ["needle rests"]
+    message.positions = positions[:-1]
+    with pytest.raises(InvalidInputError, match="as many positions at each instant"):
+        messages.forecast(message)
 
 
 def test_the_page_receives_the_source_and_the_minimum_bound_of_the_margins():

@@ -86,7 +86,7 @@ def test_message_and_markers_say_what_happens_when():
     assert (message.contact_time, message.contact_shape, message.contact_node) == (contact.time, "post", contact.node)
     assert message.clearance[0] == forecast.minima["obstacle"].value
     assert message.clearance_shape[0] == "post"
-    assert forecast_text(forecast).startswith(f"touches post in {contact.time:.1f} s")
+    assert forecast_text(forecast).startswith(f"touches the post in {contact.time:.1f} s")
     ghosts = forecast_markers(MESSAGES, stamp(0), forecast).markers
     assert [len(marker.points) for marker in ghosts] == [41, 41, 41, 0]
     assert ghosts[-1].text == forecast_text(forecast)

@@ -57,7 +57,7 @@ def test_what_is_no_procedure_is_refused(content: Any, message: str):
 
 
 def test_a_file_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path):
-    with pytest.raises(ConfigurationError, match="one of hernia"):
+    with pytest.raises(ConfigurationError, match="one of dead_end, figure_eight, hernia, slalom"):
         read_procedure("hernai")
     with pytest.raises(ConfigurationError, match="YAML"):
         read_procedure(str(tmp_path / "none.yaml"))

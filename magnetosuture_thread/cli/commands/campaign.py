@@ -22,6 +22,8 @@ def add(subparsers: Subparsers) -> None:
     option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
     option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
     option("--follower", action="store_true", help="run the setup's path follower instead, for comparison")
+    bags = "seeds whose runs are recorded as bags (default: none)"
+    option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
     workers = count_argument("processes", 1, 256)
     option("--workers", type=workers, default=1, metavar="W", help="processes (default: 1)")
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
@@ -34,6 +36,8 @@ def run_campaign(options: argparse.Namespace) -> int:
     on simulated time, without ROS; a seed always gives the same run. Each seed varies start, viscosity, bending
     stiffness, coils, friction and noise; the nodes are told nothing of it. DIR, which must not exist, gets
       campaign.json   how many runs succeeded, and the figures of each
+      campaign.html   the same as a page, with pictures of the last seconds of each run that failed
+      bags/seed_N     for each seed of --bags: what all nodes would publish, with the ground truth; `replay` takes it
     A run succeeds if all goals are reached and all limits hold. All of it is simulated.
     """
     from magnetosuture_thread.jobs import campaign as job
@@ -48,23 +52,27 @@ def run_campaign(options: argparse.Namespace) -> int:
             setup=options.setup,
             camera=options.camera,
             follower=options.follower,
+            bags=options.bags,
             workers=options.workers,
             log=make_log(console),
             progress=advance,
         )
     title = f"{result.procedure} on {result.setup}: {result.successes} of {len(seeds)} runs succeeded (simulated)"
     table = Table(title=title, title_justify="left", title_style="bold")
-    for name in ("seed", "success", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]"):
+    for name in ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]"):
         table.add_column(name, justify="right", no_wrap=True)
     for run in result.runs:
+        figures = run.figures
         table.add_row(
             str(run.seed),
             "yes" if run.success else "no",
-            f"{run.time_s:.1f}",
-            f"{run.ideal_time_s:.1f}",
-            f"{1e3 * run.min_needle_clearance_m:.3f}",
-            f"{run.longest_rest_s:.2f}",
-            f"{run.wrap_degrees:.0f}",
+            str(run.goals_met),
+            f"{figures.time_s:.1f}",
+            f"{figures.ideal_time_s:.1f}",
+            f"{1e3 * figures.min_needle_clearance_m:.3f}",
+            f"{figures.longest_rest_s:.2f}",
+            f"{figures.wrap_degrees:.0f}",
         )
     console.print(table)
+    console.print(f"report: {options.output / job.PAGE}", soft_wrap=True)
     return FAILED if result.died else DONE

@@ -6,6 +6,7 @@ export const GREY = "#7d8790";
 export const MEASURED = "rgba(47, 123, 255, 0.40)";
 export const ESTIMATED = "#00a3a8";
 export const MODEL = "#99107f"; // the prediction by the model alone, beside an estimate
+export const AHEAD = "#6d28d9"; // the forecast thread
 export const VELOCITY = "#7a3fc0";
 export const NEAR = "#d1122f";
 export const MIDDLING = "#f08c00";
@@ -13,7 +14,7 @@ export const COILS = ["#0f6fc6", "#c2570c", "#7b3fb5", "#0b8a7c"];
 
 // The same on dark ground.
 const ON_DARK = {
-  [FREE]: "#3fcf7d", [STUCK]: "#82a8ff", [VELOCITY]: "#b992f5", [MIDDLING]: "#ffab3d",
+  [FREE]: "#3fcf7d", [STUCK]: "#82a8ff", [VELOCITY]: "#b992f5", [AHEAD]: "#a78bfa", [MIDDLING]: "#ffab3d",
   "#0f6fc6": "#5db1f7", "#c2570c": "#ff9d5c", "#7b3fb5": "#c79bf2", "#0b8a7c": "#4fc7b8",
 };
 export const onGround = (colour, dark) => (dark ? ON_DARK[colour] ?? colour : colour);
@@ -40,6 +41,9 @@ export function estimateState({ estimated } = {}, since) {
   if (!estimated || estimated.age + since > OLD) return "none";
   return estimated.prediction_only && estimated.unmeasured_for + since > UNMEASURED ? "prediction" : "measured";
 }
+
+// The forecast from the present estimate; null where there is none.
+export const forecastOf = ({ forecast } = {}, since) => (forecast && forecast.age + since <= OLD ? forecast : null);
 
 // State and colour of the thread: free, sliding, stuck, unknown, invalid or old.
 export function threadLook(thread, margins, since) {

@@ -1,9 +1,9 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
 // data-friction (free, sliding, stuck, unknown, invalid, old, none) and data-colour of the thread that the margins are of,
-// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
+// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-ghosts (instants of the forecast thread), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import {
-  ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, nodeLook, onGround, tensionColour, threadLook, threadOf,
+  AHEAD, ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, forecastOf, nodeLook, onGround, tensionColour, threadLook, threadOf,
 } from "./colours.js";
 import { Placement, needleArc } from "./geometry.js";
 import { drawShapes } from "./shapes.js";
@@ -59,9 +59,11 @@ export class Dish {
     const tip = graph?.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop().join(",") : "";
     const tension = showTension && look.colour !== GREY && graph.predicted?.tension?.length ? graph.predicted.tension : null;
     const plan = PLANNED.includes(graph?.procedure?.state) ? graph.plan : [];
+    const ghosts = (graph && forecastOf(graph, since)?.ghosts) ?? [];
     if (graph) {
       this.#line(graph.measured ?? [], 12, MEASURED);
       this.#drawPlan(plan);
+      this.#drawGhosts(ghosts, !bright);
       if (estimate !== "none") this.#drawBand(graph.estimated);
       if (thread !== graph.predicted) this.#drawModel(graph, since);
       this.#drawThread(thread, graph.margins, look, thread === graph.estimated ? estimate : "none", tension);
@@ -74,7 +76,7 @@ export class Dish {
     Object.assign(canvas.dataset, {
       friction: look.state, colour: look.colour, estimate, tension: tension ? "shown" : "not",
       disturbances: String(estimate === "none" ? 0 : graph.estimated.disturbances.length), image: shown ? "yes" : "no", tip,
-      plan: String(plan.length),
+      plan: String(plan.length), ghosts: String(ghosts.length),
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
   }
@@ -160,6 +162,15 @@ export class Dish {
     this.context.setLineDash([2, 6]);
     this.#line(plan, 3, this.velocity);
     this.context.setLineDash([]);
+  }
+
+  // Where the thread will be while the present command is held, fainter the later.
+  #drawGhosts(ghosts, dark) {
+    ghosts.forEach(({ vertices }, at) => {
+      this.context.globalAlpha = 0.55 - 0.13 * at;
+      this.#line(vertices, 4, onGround(AHEAD, dark));
+    });
+    this.context.globalAlpha = 1;
   }
 
   // What the model alone says, beside the estimate.

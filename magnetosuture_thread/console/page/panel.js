@@ -1,7 +1,7 @@
 // Text beside the dish: states, figures, control. Text is written only where it changed.
 
 import { capital, isNumber, leastClearance, micronewtons, millimetres, plural, seconds } from "./format.js";
-import { estimateState, threadOf } from "./colours.js";
+import { estimateState, forecastOf, threadOf } from "./colours.js";
 import { SILENCE_TIMEOUT, motionStatus } from "./status.js";
 
 const NODE_TIMEOUT = 3.0; // [s]
@@ -24,6 +24,7 @@ export function showPanel(view) {
   showCoils(view);
   showControl(view);
   showVision(view);
+  showForecast(view);
   if (graph) {
     showThread(view);
     showNodes(view);
@@ -132,6 +133,16 @@ function showVision({ graph, since, hasImage }) {
     if (estimateState(graph, since) === "prediction") lines.push(`thread not measured for ${seconds(graph.estimated.unmeasured_for)}: prediction only`);
   }
   write("vision", capital(lines.join(", ")));
+}
+
+// What happens ahead if the present command is held.
+function showForecast({ graph, since }) {
+  const forecast = graph ? forecastOf(graph, since) : null;
+  find("forecast-legend").hidden = !forecast;
+  if (forecast) write("forecast-horizon", `forecast for ${seconds(forecast.horizon)}, fainter the later`);
+  const events = forecast?.events ?? [];
+  find("forecast").hidden = !events.length;
+  write("forecast", capital(events.join(", ")));
 }
 
 function showThread({ graph, since }) {

@@ -6,25 +6,23 @@ import base64
 import hashlib
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from functools import cache
-from importlib.resources import files
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined, Template
+from jinja2 import Template
 from plotly.offline import get_plotlyjs
 
-from magnetosuture_thread.evaluation.colours import style_variables
 from magnetosuture_thread.evaluation.frames import MARGIN, Array, ErrorMap, WorstFrame
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report import figures as report
 from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, BagFigures
 from magnetosuture_thread.evaluation.report.pictures import ReportPicture
+from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
 from magnetosuture_thread.model.margins import SOLID
-from magnetosuture_thread.texts import printable
 
 SINCE_EPOCH = 1_000_000_000  # s; a bag's time before it is no date
 MAX_POINTS = 5000  # of a line
@@ -59,7 +57,7 @@ def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pict
         pictures: of the worst frames, the worst first.
     """
     packed, library = _library()
-    script = _source("page.js")
+    script = read_source(__package__, "page.js")
     return _template().render(
         about=about,
         figures=figures,
@@ -71,7 +69,7 @@ def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pict
         times=[("model step", figures.step_time), ("tracker, one frame", figures.processing)],
         stages=STAGES,
         recorded=_date(about.start),
-        style=style_variables() + _source("page.css"),
+        style=page_style(),
         script=script,
         library=packed,
         hashes=" ".join(f"'{_hash(text)}'" for text in (script, library)),
@@ -80,28 +78,14 @@ def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pict
 
 @cache
 def _template() -> Template:
-    environment = Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, finalize=_shown
-    )
-    environment.filters.update(
-        number=report.format_number,
-        milliseconds=report.milliseconds,
-        micrometres=report.micrometres,
-        micronewtons=report.micronewtons,
-    )
-    environment.globals["margin_state"] = report.margin_state
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    return environment.from_string(_source("page.html"))
-
-
-def _shown(value: Any) -> Any:
-    """Return what the page gets for a value: of a text from outside, what can be shown."""
-    return printable(value) if type(value) is str else value  # not Markup, which is ours
-
-
-def _source(name: str) -> str:
-    """Return a file of this folder, which ships with the package."""
-    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+    functions: dict[str, Callable[..., Any]] = {
+        "number": report.format_number,
+        "milliseconds": report.milliseconds,
+        "micrometres": report.micrometres,
+        "micronewtons": report.micronewtons,
+        "margin_state": report.margin_state,
+    }
+    return read_template(__package__, "page.html", functions)
 
 
 @cache

@@ -36,6 +36,7 @@ from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
+from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import shipped_procedures
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
@@ -145,6 +146,7 @@ class ConsoleServices:
 
 NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 MEASURED_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
+FORECAST_PERIOD = 0.1  # s; 400 points take a millisecond to read
 SCENE_PERIOD = 0.5  # s; a large scene takes a tenth of that
 MAX_DIAGNOSTICS = 50  # queued messages of /diagnostics
 MAX_NODES = 32  # shown
@@ -157,6 +159,7 @@ READERS = {
     "measured": (topics.MEASURED_THREAD, messages.measured_thread, MEASURED_PERIOD),
     "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
     "estimated": (topics.ESTIMATED_THREAD, messages.estimated, 0.0),
+    "forecast": (topics.FORECAST, messages.forecast, FORECAST_PERIOD),
     "margins": (topics.MARGINS, messages.margins, 0.0),
     "scene": (topics.SCENE, messages.scene, SCENE_PERIOD),
     "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
@@ -175,7 +178,7 @@ ZERO_FILTER_STATE = {
     "age": 0.0,
 }
 LISTED_PARTS = ("measured", "plan")
-AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "filter", "bridge")
+AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "forecast", "filter", "bridge")
 
 
 class ConsoleGraph:
@@ -202,7 +205,7 @@ class ConsoleGraph:
         self.services = ConsoleServices(node)
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
-        self._procedures = shipped_procedures()
+        self._procedures = {name: read_procedure(name).shape_names for name in shipped_procedures()}
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
         self._open(settings, _file_scene(settings))
@@ -256,14 +259,16 @@ class ConsoleGraph:
         }
         if self.blocked:
             parts["filter"] = {**ZERO_FILTER_STATE, "reason": self.blocked}
+        shown_scene = parts["scene"] or self._scene
+        shapes = {shape["name"] for shape in shown_scene["shapes"]} if shown_scene else set()
         return {
             "time": self.now().nanoseconds * 1e-9,
             "needle_length": settings.needle_length,
             "needle_curvature": settings.needle_curvature,
             **parts,
             "camera": None if self._camera.value is None else {"age": self._camera.age},
-            "scene": parts["scene"] or self._scene,
-            "procedures": self._procedures,
+            "scene": shown_scene,
+            "procedures": [name for name, needed in self._procedures.items() if needed <= shapes],
             "nodes": self.nodes(),
         }
 

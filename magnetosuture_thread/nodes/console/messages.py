@@ -16,6 +16,7 @@ from magnetosuture_msgs.msg import (
     ProcedureState,
     SafetyMargins,
     ThreadDisturbance,
+    ThreadForecast,
     TrackerState,
 )
 from magnetosuture_msgs.msg import Scene as SceneMessage
@@ -23,6 +24,7 @@ from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.geometry.orientation import heading_angle
+from magnetosuture_thread.messages.forecasts import forecast_events
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.estimator.disturbance import disturbance_text
@@ -32,6 +34,7 @@ from magnetosuture_thread.texts import shortened
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
 MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page
 MAX_REASON_CHARS = 400
+MAX_GHOSTS = 3  # instants of a forecast that are sent to the page
 MAX_PLAN_POINTS = 400  # that are sent to the page
 DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
 
@@ -141,6 +144,34 @@ def _disturbance(message: ThreadDisturbance) -> dict[str, Any]:
     place, way = message.position, message.direction
     text = disturbance_text(message.arc_length, message.force, (way.x, way.y))
     return {"position": [place.x, place.y], "direction": [way.x, way.y], "force": message.force, "text": text}
+
+
+def forecast(message: ThreadForecast) -> dict[str, Any]:
+    """Return where the thread will be at some instants, the last that of the horizon, and what happens when.
+
+    Raises:
+        InvalidInputError: the positions are not those of equally many nodes at each instant.
+    """
+    instants, count = len(message.time), len(message.positions)
+    if not instants or count % instants or count // instants > MAX_THREAD_NODES:
+        found = f"{count} positions and {instants} instants"
+        raise InvalidInputError("thread/forecast", found, "as many positions at each instant")
+    nodes = count // instants
+    shown = sorted({round(index) for index in np.linspace(0, instants - 1, MAX_GHOSTS + 1)[1:]})
+    return {
+        "horizon": message.horizon,
+        "ghosts": [
+            {
+                "time": message.time[at],
+                "vertices": [[place.x, place.y] for place in message.positions[at * nodes : (at + 1) * nodes]],
+            }
+            for at in shown
+        ],
+        "events": forecast_events(
+            message.contact_time, shortened(message.contact_shape), message.friction_time, message.rest_time
+        ),
+        "problem": shortened(message.problem),
+    }
 
 
 def margins(message: SafetyMargins) -> dict[str, Any]:

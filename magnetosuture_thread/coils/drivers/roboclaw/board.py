@@ -110,22 +110,21 @@ class Board:
         for query in (*protocol.SETTING_QUERIES, Query.STATUS, *first_currents, Query.VOLTAGES):
             self._poll(query)
 
-    def write(self, latest: Callable[[], Vector | None], expires: Callable[[], float] = lambda: math.inf) -> None:
+    def write(self, latest: Callable[[], tuple[Vector | None, float]]) -> None:
         """Command the latest currents of its two coils.
 
         They are read again before each attempt, as they may have been stopped in between.
 
         Args:
-            latest: returns the currents to apply now, shape (2,) [A]; None is zero in both coils.
-            expires: returns until when they may be written, a time of `time.monotonic` [s].
+            latest: returns the currents to apply now, shape (2,) [A], None for zero in both coils, and until when they
+                may be written, a time of `time.monotonic` [s].
 
         Raises:
             DeviceError: the board does not acknowledge.
         """
 
         def target_duties() -> tuple[int, ...]:
-            until, currents = expires(), latest()  # in this order: of newer currents, the earlier end
-            self._expires = math.inf if currents is None else until
+            currents, self._expires = latest()
             duties, self._supply_too_low = (
                 ((0, 0), False) if currents is None else protocol.duties_for(currents, self._resistances, self.voltage)
             )
@@ -143,7 +142,7 @@ class Board:
         Raises:
             DeviceError: the board does not acknowledge.
         """
-        self.write(lambda: None)
+        self.write(lambda: (None, math.inf))
 
     def poll(self) -> None:
         """Send the next query of the polling sequence.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -71,17 +72,13 @@ class Mailbox:
             self._currents, self._computed, self._timed_out = currents.copy(), computed, False
         self._wake()
 
-    def expires(self) -> float:
-        """Return until when the currents may be applied [s]."""
-        return self._computed + self._timeout
-
-    def latest(self, now: float) -> Vector | None:
-        """Return the currents to apply now, shape (m,) [A]; None is zero in all coils."""
+    def latest(self, now: float) -> tuple[Vector | None, float]:
+        """Return the currents to apply now, shape (m,) [A], None for zero in all coils, and until when [s]."""
         with self._lock:
             if self._currents is not None and now - self._computed > self._timeout:
                 self._timed_out = bool(np.any(self._currents))
                 self._currents = None
-            return self._currents
+            return self._currents, math.inf if self._currents is None else self._computed + self._timeout
 
     def set_ready(self, line: int, report: LineReport) -> None:
         """Mark a line as ready, with its first report."""
@@ -212,17 +209,17 @@ class LineThread:
             self._wake.wait(KEEP_ALIVE_PERIOD)
             self._wake.clear()
             for number, board in self._boards.items():
-                board.write(partial(self._latest, number), self._mailbox.expires)
+                board.write(partial(self._latest, number))
             # New currents go first, but the boards must be polled all the same.
             if not self._wake.is_set() or time.monotonic() - polled_at > POLL_PERIOD:
                 list(self._boards.values())[turn % len(self._boards)].poll()
                 turn, polled_at = turn + 1, time.monotonic()
                 self._mailbox.update_report(self._number, self._report())
 
-    def _latest(self, number: int) -> Vector | None:
-        """Return the currents that a board is to apply now, shape (2,) [A]; None is zero in both its coils."""
-        currents = self._mailbox.latest(time.monotonic())
-        return None if currents is None else currents[2 * number : 2 * number + 2]
+    def _latest(self, number: int) -> tuple[Vector | None, float]:
+        """Return the currents of a board to apply now, shape (2,) [A], None for zero in both coils, and until when."""
+        currents, until = self._mailbox.latest(time.monotonic())
+        return (None if currents is None else currents[2 * number : 2 * number + 2]), until
 
     def _leave(self, port: ExchangePort) -> None:
         """Set every board to zero; one that does not acknowledge stops by its own timeout."""

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import math
-import os
 import select
 import time
 from typing import Any
 
 import serial
+
+# `os.write` lets another thread have the interpreter first, and may wait for it there for longer than a board waits for
+# the next byte of a packet.
+_write = ctypes.PyDLL(None).write
+_write.argtypes, _write.restype = (ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t), ctypes.c_ssize_t
 
 
 class DeviceError(Exception):
@@ -19,8 +24,8 @@ class DeviceError(Exception):
 class ExchangePort(serial.Serial):
     """Exclusive serial port for one request and one answer at a time.
 
-    Written bytes are buffered until the answer is read, so that a packet is sent in one piece: a board drops one
-    with a gap of 10 ms, and the manufacturer's library writes a packet in up to five pieces.
+    Written bytes are buffered until the answer is read, so that a packet is sent without gaps: a board drops one with a
+    gap of 10 ms, and the manufacturer's library writes a packet in up to five pieces.
 
     Args:
         path: of the port.
@@ -82,16 +87,22 @@ class ExchangePort(serial.Serial):
         return data
 
     def _send(self, packet: bytes) -> None:
-        """Write a packet to the kernel in one piece, once there is room.
+        """Write a packet to the kernel, once its buffer takes it; not its last byte, if it is outdated by then.
 
+        A process that is stopped before the clock is read sees there that the packet is outdated; one that is stopped
+        after that sends the last byte later than the board waits for it. The board drops the packet in both cases.
         The library's own write reports a sent packet as not sent if this thread was delayed after the system call.
         """
-        _, room, _ = select.select([], [self], [], max(0.0, self._until - time.monotonic()))
-        # At the last moment: this process may have been stopped for long, and gone on just now.
-        if time.monotonic() >= min(self._until, self._expires):
+        port, until = self.fileno(), min(self._until, self._expires)
+        _, writable, _ = select.select([], [port], [], max(0.0, self._until - time.monotonic()))
+        if not writable:
+            raise serial.SerialTimeoutException("the output buffer is full")
+        most, last = packet[:-1], packet[-1:]
+        is_written = _write(port, most, len(most)) == len(most)
+        if time.monotonic() >= until:
             raise serial.SerialTimeoutException("an outdated packet")
-        if not room or os.write(self.fileno(), packet) < len(packet):
-            raise serial.SerialTimeoutException("no room for a packet")
+        if not is_written or _write(port, last, 1) != 1:
+            raise serial.SerialTimeoutException("a packet was written in part")
 
 
 def _open_problem(path: str, error: Exception) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import itertools
+import math
 import os
+import select
 import struct
 import threading
 import time
@@ -12,6 +14,7 @@ import tty
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,7 +133,7 @@ def board(port: ExchangePort, tenths: int = 2, hurries: bool = False) -> Board:
 
 def give(made: Board, *currents: float) -> None:
     """Ask for currents."""
-    made.write(lambda: np.array(currents))
+    made.write(lambda: (np.array(currents), math.inf))
 
 
 def whole_round(made: Board) -> None:
@@ -190,18 +193,52 @@ def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     assert len(port.answer) < 48  # which the library would wait for
 
 
-def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port, clock, monkeypatch):
-    write = os.write
+@pytest.mark.parametrize("stopped_before", [8, 7, 1], ids=["the clock", "the first bytes", "the last byte"])
+def test_a_process_that_is_stopped_while_it_writes_currents_drives_no_board_later(
+    peer, port, monkeypatch, stopped_before: int
+):
+    """As a stop between two instructions cannot be had at will, the thread sleeps there."""
+    wait_for(port, 5.0)
+    there = RoboClawBoard()
+    peer.answer(simulated(there))
+    made = board(port)
+    made.voltage = 24.0
+    expires = time.monotonic() + 0.2
+    commanded = iter([(np.array([3.0, -6.0]), expires), (None, math.inf)])
 
-    def held_up(file: int, data: bytes) -> int:
-        written = write(file, data)
-        if file == port.fileno():
-            assert os.read(peer.host, 100) == data
-            write(peer.host, b"\xff")
+    def stopped(size: int) -> None:
+        if size == stopped_before and time.monotonic() < expires:
+            time.sleep(expires - time.monotonic() + 0.02)
+
+    def late_select(*arguments: Any) -> Any:
+        stopped(8)
+        return select.select(*arguments)
+
+    def late_write(file: int, data: bytes, size: int) -> int:
+        stopped(size)
+        return os.write(file, data)
+
+    monkeypatch.setattr(port_module, "select", SimpleNamespace(select=late_select))
+    monkeypatch.setattr(port_module, "_write", late_write)
+    made.write(lambda: next(commanded))
+    assert next(commanded, None) is None
+    assert not there.timeline
+    assert there.heard > expires
+
+
+def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port, clock, monkeypatch):
+    def held_up(file: int, data: bytes, size: int) -> int:
+        written = os.write(file, data)
+        assert size == len(data)
+        if size == 1:
+            received = b""
+            while len(received) < 8:
+                received += os.read(peer.host, 8)
+            os.write(peer.host, b"\xff")
             clock.hold_up()
         return written
 
-    monkeypatch.setattr(os, "write", held_up)
+    monkeypatch.setattr(port_module, "_write", held_up)
     board(port, hurries=True).write_zero()
 
 
@@ -296,7 +333,7 @@ def test_a_second_attempt_takes_what_is_newest(peer, port):
     peer.answer(lambda _: next(replies))
     made = board(port)
     made.voltage = 24.0
-    newest = iter([np.array([3.0, -6.0]), None])  # stopped after the first
+    newest = iter([(np.array([3.0, -6.0]), math.inf), (None, math.inf)])  # stopped after the first
     made.write(lambda: next(newest))
     assert [packet[2:6] for packet in peer.heard] == [struct.pack(">hh", 4095, -8191), bytes(4)]
     assert made.warnings == ()

@@ -173,10 +173,10 @@ class Hearing:
         self.asked: list[list[float] | None] = []
         self._between = between
 
-    def write(self, newest: Callable[[], Vector | None], expires: Callable[[], float]) -> None:
+    def write(self, newest: Callable[[], tuple[Vector | None, float]]) -> None:
         """Take currents twice."""
         for _ in range(2):
-            currents = newest()
+            currents, _ = newest()
             self.asked.append(None if currents is None else currents.tolist())
             self._between()
 

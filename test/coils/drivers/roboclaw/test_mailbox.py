@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from magnetosuture_thread.coils.drivers.roboclaw.line import LineReport, Mailbox
 
@@ -26,21 +27,22 @@ def test_currents_are_in_force_for_the_patience():
     made = mailbox()
     made.put(CURRENTS, 1.0)
     for now in (1.0, 1.09):
-        taken = made.latest(now)
+        taken, until = made.latest(now)
         assert taken is not None
         assert taken.tolist() == CURRENTS.tolist()
-    assert made.latest(1.11) is None
-    assert made.latest(1.05) is None  # they do not come back
+        assert until == pytest.approx(1.1)
+    assert made.latest(1.11)[0] is None
+    assert made.latest(1.05)[0] is None  # they do not come back
     assert made.state().warnings == ("no currents were commanded within 0.1 s: coils at zero",)
     made.put(CURRENTS, 2.0)
     assert made.state().warnings == ()
-    assert made.latest(2.0) is not None
+    assert made.latest(2.0)[0] is not None
 
 
 def test_zeros_that_are_not_asked_for_any_more_are_no_warning():
     made = mailbox()
     made.put(np.zeros(4), 1.0)
-    assert made.latest(2.0) is None
+    assert made.latest(2.0)[0] is None
     assert made.state().warnings == ()
 
 
@@ -49,7 +51,7 @@ def test_what_was_put_does_not_change_with_the_callers_array():
     mine = CURRENTS.copy()
     made.put(mine, 1.0)
     mine[:] = 9.0
-    taken = made.latest(1.0)
+    taken = made.latest(1.0)[0]
     assert taken is not None
     assert taken.tolist() == CURRENTS.tolist()
 
@@ -60,14 +62,14 @@ def test_nothing_is_kept_until_every_line_is_ready():
     made.set_ready(0, report(0))
     made.put(CURRENTS, 1.0)
     made.set_ready(1, report(1))
-    assert made.latest(1.0) is None
+    assert made.latest(1.0)[0] is None
 
 
 def test_a_loss_drops_the_currents_for_good_and_is_counted_once():
     made = mailbox()
     made.put(CURRENTS, 1.0)
     made.set_failed(0, "gone")
-    assert made.latest(1.0) is None
+    assert made.latest(1.0)[0] is None
     assert made.state().losses == 1
     made.set_failed(0, "still gone")
     made.set_failed(1, "gone too")
@@ -77,7 +79,7 @@ def test_a_loss_drops_the_currents_for_good_and_is_counted_once():
     assert not made.state().ready
     made.set_ready(1, report(1))
     assert made.state().ready
-    assert made.latest(1.0) is None
+    assert made.latest(1.0)[0] is None
     made.set_failed(1, "again")
     assert made.state().losses == 2
 

@@ -1,0 +1,204 @@
+"""The report of a campaign as a page of HTML that loads nothing and runs no script."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from magnetosuture_thread.campaign.limits import MAX_REST, MAX_TIME_RATIO, PENETRATION_TOLERANCE, RunLimits
+from magnetosuture_thread.campaign.report.charts import RunChart, draw_chart
+from magnetosuture_thread.campaign.report.pictures import InstantPicture, outline_shapes, picture_instant
+from magnetosuture_thread.campaign.run import RunResult
+from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
+from magnetosuture_thread.planning.procedure import Procedure
+from magnetosuture_thread.setups import Setup
+
+MAX_STRIPS = 200  # failed runs with pictures
+GOOD, BAD = "good", "bad"
+NOT_REACHED = "not all goals reached"
+NAMES = {
+    "min_needle_clearance_m": "the needle came too close to wall or shape",
+    "max_thread_penetration_m": "a node of the thread was in wall or shape",
+    "longest_rest_s": "the needle rested too long",
+    "max_tension_n": "the thread's tension was too high",
+    "max_friction_nodes": "too many nodes were under friction",
+    "time_s": "it took too long",
+}
+
+
+@dataclass(frozen=True)
+class CampaignDetails:
+    """What was run.
+
+    Attributes:
+        procedure: that was run.
+        setup: what the nodes believe.
+        camera: whether frames were rendered and tracked.
+        follower: whether the setup's path follower ran in place of the procedure.
+        died: seeds whose process ended early, and why.
+        bags: seeds of which there is a bag, with its folder beside the page.
+    """
+
+    procedure: Procedure
+    setup: Setup
+    camera: bool
+    follower: bool
+    died: dict[int, str]
+    bags: dict[int, str]
+
+    @property
+    def limits(self) -> RunLimits:
+        """Limits of a run."""
+        return RunLimits.of(self.procedure, self.setup.coils.keep_out)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A headline figure."""
+
+    name: str
+    value: str
+    grade: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """A run as the table shows it.
+
+    Attributes:
+        result: of the run.
+        broken: names of the figures beyond their limits.
+        pictures: of its last seconds, if it failed; the first shows the whole dish.
+        closest: when the needle was closest to wall or shape, if it came too close before the last seconds.
+    """
+
+    result: RunResult
+    broken: frozenset[str]
+    pictures: tuple[InstantPicture, ...]
+    closest: InstantPicture | None
+
+
+def write_campaign_page(details: CampaignDetails, runs: Sequence[RunResult]) -> str:
+    """Return the page.
+
+    Args:
+        details: what was run.
+        runs: what came of each seed, in order.
+    """
+    rows, shown = [], 0
+    for run in runs:
+        drawn = not run.success and shown < MAX_STRIPS
+        shown += drawn
+        rows.append(_row(details, run, drawn=drawn))
+    scene = details.setup.scene
+    spaced = {"spaced": lambda text: text.replace("_", " ")}
+    return read_template(__package__, "page.html", spaced).render(
+        details=details,
+        runs=rows,
+        failed=[row for row in rows if row.pictures],
+        left_out=sum(not run.success for run in runs) - shown,
+        tiles=_tiles(details, rows),
+        reasons=_reasons(rows),
+        charts=_charts(details, runs),
+        shapes=outline_shapes(scene),
+        dish_radius=1e3 * scene.dish.radius,
+        needle_width=1e3 * details.setup.rig.needle_width,
+        halo_width=2e3 * details.limits.clearance,
+        max_rest=MAX_REST,
+        max_time_ratio=MAX_TIME_RATIO,
+        max_penetration=PENETRATION_TOLERANCE,
+        style=page_style() + read_source(__package__, "page.css"),
+    )
+
+
+def _row(details: CampaignDetails, run: RunResult, *, drawn: bool) -> RunRow:
+    broken = frozenset(details.limits.broken(run.figures))
+    if not drawn or not run.last_instants:
+        return RunRow(run, broken, (), None)
+    scene, speed = details.setup.scene, details.procedure.limits[0].speed
+    pictures = [picture_instant(run.last_instants[-1], scene, speed, overview=True)]
+    pictures += [picture_instant(instant, scene, speed) for instant in run.last_instants]
+    closest = run.closest_instant
+    begin = run.last_instants[0].frame.time
+    if closest is None or closest.frame.time >= begin or "min_needle_clearance_m" not in broken:
+        return RunRow(run, broken, tuple(pictures), None)
+    return RunRow(run, broken, tuple(pictures), picture_instant(closest, scene, speed))
+
+
+def _reasons(rows: Sequence[RunRow]) -> list[tuple[str, list[int]]]:
+    """Return why runs failed, and the seeds of each reason, the most frequent first; a run may have several."""
+    found: dict[str, list[int]] = {}
+    for row in rows:
+        names = [NAMES[name] for name in sorted(row.broken)]
+        if not row.result.success and not row.result.reached:
+            names.insert(0, NOT_REACHED)
+        for name in names:
+            found.setdefault(name, []).append(row.result.seed)
+    return sorted(found.items(), key=lambda each: -len(each[1]))
+
+
+def _tiles(details: CampaignDetails, rows: Sequence[RunRow]) -> list[Tile]:
+    if not rows:
+        return []
+    count, limits = len(rows) + len(details.died), details.limits
+    successes, reached = sum(row.result.success for row in rows), sum(row.result.reached for row in rows)
+    figures = [row.result.figures for row in rows]
+    clearance = min(found.min_needle_clearance_m for found in figures)
+    penetration = max(found.max_thread_penetration_m for found in figures)
+    rest = max(found.longest_rest_s for found in figures)
+    ratios = [ratio for row in rows if row.result.reached and math.isfinite(ratio := time_ratio(row.result))]
+    tiles = [
+        Tile("runs that succeeded", f"{successes} of {count}", _grade(successes == count), "all goals, all limits"),
+        Tile("runs that reached all goals", f"{reached} of {count}", _grade(reached == count), "limits apart"),
+        Tile(
+            "closest needle",
+            f"{1e3 * clearance:.3f} mm",
+            _grade(clearance >= limits.clearance),
+            f"of all runs; at least {1e3 * limits.clearance:.3f} mm",
+        ),
+        Tile(
+            "deepest node of the thread",
+            f"{1e6 * penetration:.1f} µm",
+            _grade(penetration <= PENETRATION_TOLERANCE),
+            f"of all runs; at most {1e6 * PENETRATION_TOLERANCE:g} µm",
+        ),
+        Tile("longest rest", f"{rest:.1f} s", _grade(rest <= MAX_REST), f"of all runs; at most {MAX_REST:g} s"),
+    ]
+    if ratios:
+        middle, most = median(ratios), max(ratios)
+        detail = f"median of runs that reached all goals; maximum {most:.2f}, at most {MAX_TIME_RATIO:g}"
+        tiles.append(Tile("time over ideal time", f"{middle:.2f}", _grade(most <= MAX_TIME_RATIO), detail))
+    return tiles
+
+
+def _charts(details: CampaignDetails, runs: Sequence[RunResult]) -> list[RunChart]:
+    limits = details.limits
+    marks = [(run.seed, run.success) for run in runs]
+    columns = [
+        ("time over ideal time", "", [time_ratio(run) for run in runs], MAX_TIME_RATIO, False),
+        (
+            "minimum clearance of the needle's axis", "mm",
+            [1e3 * run.figures.min_needle_clearance_m for run in runs], 1e3 * limits.clearance, True,
+        ),
+        ("longest rest", "s", [run.figures.longest_rest_s for run in runs], MAX_REST, False),
+        (
+            "peak tension", "mN", [1e3 * run.figures.max_tension_n for run in runs],
+            1e3 * limits.tension if limits.tension < 1.0 else math.nan, False,
+        ),
+    ]  # fmt: skip
+    if any(run.figures.wrap_degrees for run in runs):
+        columns.append(("angle swept by the thread", "°", [run.figures.wrap_degrees for run in runs], math.nan, False))
+    return [draw_chart(name, unit, marks, values, limit, lower) for name, unit, values, limit, lower in columns]
+
+
+def time_ratio(run: RunResult) -> float:
+    """Return time over ideal time; NaN without an ideal time."""
+    figures = run.figures
+    return figures.time_s / figures.ideal_time_s if figures.ideal_time_s > 0.0 else math.nan
+
+
+def _grade(is_good: bool) -> str:
+    return GOOD if is_good else BAD

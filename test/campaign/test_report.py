@@ -1,0 +1,129 @@
+"""The page of a campaign: pictures of failed runs, reasons, charts, and nothing loaded or run."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.campaign.extremes import RunInstant
+from magnetosuture_thread.campaign.limits import RunFigures
+from magnetosuture_thread.campaign.loop import LoopFrame
+from magnetosuture_thread.campaign.report.charts import draw_chart
+from magnetosuture_thread.campaign.report.page import CampaignDetails, write_campaign_page
+from magnetosuture_thread.campaign.run import RunResult
+from magnetosuture_thread.planning.executor import ThreadCondition
+from magnetosuture_thread.planning.procedure import read_procedure
+from magnetosuture_thread.setups import read_setup
+
+VOID = {"meta", "br", "link", "img"}
+GOOD = RunFigures(80.0, 75.0, 0.0003, 0.0, 0.4, 365.0, 1.5e-5, 12)
+
+
+class _Tags(HTMLParser):
+    """Collects the tags of a page, and checks that each is closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def instant(time: float, clearance: float = 0.004, reason: str = "") -> RunInstant:
+    """Return a instant with a needle at (1, 2) mm and a thread to the left of it."""
+    thread = np.column_stack([np.linspace(0.001, -0.01, 5), np.full(5, 0.002)])
+    frame = LoopFrame(time, thread[0], 0.0, thread, 1e-5, ThreadCondition(), np.array([0.002, 0.0]), reason)
+    axis = np.array([[0.001, 0.002], [0.0035, 0.002]])
+    return RunInstant(frame, axis, clearance, 2, np.array([[0.0, 0.0], [0.01, 0.01]]))
+
+
+def failed(seed: int, figures: RunFigures, reason: str, closest: RunInstant) -> RunResult:
+    """Return a run that failed."""
+    instants = tuple(instant(76.0 + 0.8 * k) for k in range(6))
+    return RunResult(seed, False, reason, False, 2, figures, 82.0, instants, closest)
+
+
+@pytest.fixture
+def details() -> CampaignDetails:
+    """Return what is run: the hernia repair."""
+    return CampaignDetails(read_procedure("hernia"), read_setup("hernia_ring"), False, False, {}, {3: "bags/seed_3"})
+
+
+def tags_of(page: str) -> list[tuple[str, dict[str, str | None]]]:
+    """Return the tags of a page, all of them closed."""
+    parser = _Tags()
+    parser.feed(page)
+    assert parser.open == []
+    return parser.found
+
+
+def test_each_failed_run_has_a_strip_of_its_last_seconds_and_of_its_closest_instant(details: CampaignDetails):
+    close = failed(3, replace(GOOD, min_needle_clearance_m=0.0002), "too <close>", instant(20.0, 0.0002, "wall"))
+    slow = failed(4, replace(GOOD, time_s=200.0), "too slow", instant(20.0, 0.0003))
+    page = write_campaign_page(details, [RunResult(2, True, "", True, 5, GOOD, 81.0), close, slow])
+    tags = tags_of(page)
+    assert [attrs["id"] for tag, attrs in tags if tag == "article"] == ["seed-3", "seed-4"]
+    strips = page.split('<article class="run"')[1:]
+    # The dish, six instants of the last seconds, in one of which the closest instant stands where it came earlier.
+    assert [strip.count("<figure") for strip in strips] == [7, 7]
+    times = [re.findall(r"<figcaption><b>([0-9.]+) s</b>", strip) for strip in strips]
+    assert times[0] == ["80.00", "20.00", "76.80", "77.60", "78.40", "79.20", "80.00"]
+    assert times[1] == ["80.00", "76.00", "76.80", "77.60", "78.40", "79.20", "80.00"]
+    assert "at rest: wall" in strips[0]
+    assert "too &lt;close&gt;" in page
+    assert 'points="1.000,2.000 3.500,2.000"' in page  # the needle, in mm
+
+
+def test_reasons_tiles_and_limits_follow_from_the_figures(details: CampaignDetails):
+    close = failed(3, replace(GOOD, min_needle_clearance_m=0.0002), "", instant(79.0, 0.0002))
+    page = write_campaign_page(details, [RunResult(2, True, "", True, 5, GOOD, 81.0), close])
+    assert re.search(r"came too close to wall or shape</th><td>1 of 2</td>", page)
+    assert re.search(r"not all goals reached</th><td>1 of 2</td>", page)
+    assert page.count(">1 of 2</span>") == 2  # tiles: succeeded, reached all goals
+    assert re.findall(r'class="beyond">([^<]+)<', page) == ["0.200 mm"]
+    assert '<td class="words">bags/seed_3</td>' in page
+
+
+def test_the_page_loads_and_runs_nothing(details: CampaignDetails):
+    page = write_campaign_page(details, [RunResult(2, True, "", True, 5, GOOD, 81.0)])
+    tags = tags_of(page)
+    assert {tag for tag, _ in tags} & {"script", "img", "link", "iframe", "object"} == set()
+    links = [attrs[name] for _, attrs in tags for name in ("href", "src") if name in attrs]
+    assert all(link is not None and link.startswith("#") for link in links)
+    assert "default-src 'none'" in page
+    assert "Simulated:" in page
+
+
+def test_seeds_without_a_result_are_named(details: CampaignDetails):
+    page = write_campaign_page(replace(details, died={5: "its process ended"}), [])
+    tags_of(page)
+    assert re.search(r"Seed 5 has no result:</b> its process ended", page)
+
+
+def test_a_chart_places_values_between_zero_and_its_limit():
+    runs = [(1, True), (2, False), (3, True)]
+    chart = draw_chart("rest", "s", runs, [0.0, 3.0, float("nan")], 3.0, is_minimum=False)
+    zero, above = (mark.y for mark in chart.marks)
+    assert [mark.success for mark in chart.marks] == [True, False]
+    assert chart.limit is not None
+    assert chart.limit[0] == above < zero
+    assert chart.limit[1] + chart.limit[2] == pytest.approx(above)  # what is above the limit is shaded
+    assert chart.ticks[0] == (zero, "0")
+    assert [text for _, text in chart.seeds] == ["1", "3"]
+    least = draw_chart("clearance", "mm", runs, [1.0, 2.0, 3.0], 1.0, is_minimum=True)
+    assert least.limit is not None
+    assert least.limit[1] == least.limit[0]  # what is below is shaded

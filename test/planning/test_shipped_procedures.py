@@ -1,0 +1,73 @@
+"""Every procedure that ships fits its setup and scene; a needle that moves as the filter lets it gets to its end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
+from magnetosuture_thread.planning.procedure import Tighten, parse_procedure, read_procedure
+from magnetosuture_thread.resources import share_directory
+from magnetosuture_thread.setups import read_procedure_setup
+
+FOLDER = share_directory("magnetosuture_thread") / "config" / "procedures"
+SHIPPED = sorted(path.stem for path in FOLDER.glob("*.yaml"))
+PERIOD = 0.05
+
+
+def test_there_is_one_for_each_kind_of_way():
+    assert {"hernia", "slalom", "dead_end", "figure_eight", "wrap_and_tighten"} <= set(SHIPPED)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
+    procedure = read_procedure(name)
+    setup = read_procedure_setup(procedure)
+    setup.rig.check_scene(setup.scene)
+    setup.model.predictor(setup.scene)  # refuses a shape that the thread would pass through
+    planner, keep_out = setup.planner.planner(setup.scene), setup.coils.keep_out
+    executor = ProcedureExecutor(procedure, planner)
+    safety = setup.coils.safety_filter(setup.scene)
+    x, y, angle = setup.rig.needle_start
+    tail, heading, time = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)]), 0.0
+    executor.start()
+    clearance, tight_at = math.inf, math.inf
+    while executor.state is ProcedureState.RUNNING and time < 300.0:
+        # The thread is tight half a second after it is pulled, by its tension or close to the shape.
+        goal, condition = procedure.goals[executor.goal], ThreadCondition()
+        if isinstance(goal, Tighten):
+            tight_at = min(tight_at, time + 0.5)
+            if time >= tight_at:
+                shapes = [shape for shape in setup.scene.shapes if shape.name == goal.around]
+                thread = np.array([shape.solid.centroid.coords[0] for shape in 2 * shapes])
+                condition = replace(condition, tension=goal.tension, vertices=thread)
+        velocity = executor.update(time, tail, heading, condition).velocity
+        if velocity.any():
+            velocity = safety.filter(velocity, tail, heading).filtered
+        moved = safety.kinematics.body_velocity(heading, velocity)
+        tail, heading = safety.kinematics.moved(tail, heading, *moved, PERIOD)
+        clearance, time = min(clearance, safety.clearance(tail, heading)), time + PERIOD
+    assert (executor.state, executor.reason) == (ProcedureState.DONE, "")
+    assert clearance >= keep_out - 1e-9
+
+
+def test_a_procedure_brings_its_own_scene_to_any_setup():
+    procedure = read_procedure("slalom")
+    assert read_procedure_setup(procedure, "hernia_ring").scene.names == tuple(f"post_{k}" for k in range(1, 6))
+    plain = parse_procedure({"goals": [{"withdraw": {}}]}, "plain")
+    assert "ring" in read_procedure_setup(plain, "hernia_ring").scene.names
+
+
+def test_a_procedure_without_a_setup_or_with_a_scene_that_is_none_is_refused(tmp_path: Path):
+    with pytest.raises(ConfigurationError, match="as the procedure plain names none"):
+        read_procedure_setup(parse_procedure({"goals": [{"withdraw": {}}]}, "plain"))
+    missing = parse_procedure({"scene": str(tmp_path / "none.yaml"), "goals": [{"withdraw": {}}]}, "plain")
+    with pytest.raises(ConfigurationError, match=r"none\.yaml"):
+        read_procedure_setup(missing, "hernia_ring")
+    with pytest.raises(ConfigurationError, match="the name of a scene"):
+        parse_procedure({"scene": 3, "goals": [{"withdraw": {}}]}, "plain")
