@@ -192,13 +192,20 @@ def _definition(path: Path) -> str:
     return "\n".join(lines)
 
 
+def _linked(kind: str) -> str:
+    """Return a field's type, linked where its definition is on the page."""
+    plain = re.sub(r"\[.*\]", "", kind)
+    own = (DEFINITIONS / "msg" / f"{plain}.msg").is_file()
+    return f"[{plain}](messages.md#{plain.lower()}){kind[len(plain) :]}" if own else kind
+
+
 def _fields(content: str) -> Iterator[tuple[str, ...]]:
     """Yield name, type and comment of each field and constant; a comment goes on in lines that hold nothing else."""
     rows: list[list[str]] = []
     for line in content.splitlines():
         field = re.match(r"([\w/\[\]<=]+) +(\w+(?:=\S+)?) *(?:# *(.*))?$", line)
         if field is not None:
-            rows.append([code(field[2]), field[1], field[3] or ""])
+            rows.append([code(field[2]), _linked(field[1]), field[3] or ""])
         elif line.strip():
             assert rows, line
             assert line.strip().startswith("#"), line
