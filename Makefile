@@ -2,6 +2,7 @@
 # make test   run all tests
 # make lint   check style and types
 # make colcon build both packages by colcon, into install/
+# make docs  build the documentation into output/docs
 # make peers  add the solvers and simulators of `python -m benchmarks solver --peers`
 # make clean  remove all that make made
 #
@@ -10,7 +11,7 @@
 
 PYTHON ?= python3
 VENV := .venv
-EXTRAS := ros dev colcon
+EXTRAS := ros dev docs colcon
 READY := $(VENV)/.ready
 RUN := $(VENV)/bin
 DEMO := output/demo
@@ -22,7 +23,7 @@ INSTALL = PIP_CONSTRAINT=constraints.txt PIP_NO_COMPILE=no $(RUN)/python -m pip 
 # Every node is a process that imports most of the packages: without their bytecode that takes it thrice as long.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint colcon peers clean help
+.PHONY: demo test lint docs colcon peers clean help
 .PHONY: .packages .messages
 
 demo: $(READY)
@@ -37,6 +38,10 @@ lint: $(READY)
 	$(RUN)/ruff check .
 	$(RUN)/ruff format --check .
 	$(RUN)/mypy
+
+# Warnings are errors; nothing is fetched.
+docs: $(READY)
+	$(RUN)/python -m sphinx --fail-on-warning --keep-going --quiet docs output/docs
 
 # Both packages by colcon, over the wheels in .venv, into install/.
 colcon: $(READY)

@@ -1,4 +1,4 @@
-"""Makes `docs/console.png`: the operator's page while the needle draws its thread around the hernia.
+"""Makes `docs/pictures/console.png`: the operator's page while the needle draws its thread around the hernia.
 
 The whole graph runs around the simulated rig, and a program presses arrow keys in a browser without a window (Chromium,
 which has to be installed). Run it from the top: python examples/console_picture.py
@@ -25,7 +25,7 @@ from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 from benchmarks.page.measurements import BROWSERS
 
-PICTURE = Path(__file__).parents[1] / "docs" / "console.png"
+PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "console.png"
 SCREEN: ViewportSize = {"width": 1366, "height": 768}
 WAIT = 240.0  # s; the needle is slow where it is narrow, and may need several goes
 SPEED = 4e-3  # m/s

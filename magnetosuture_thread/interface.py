@@ -24,16 +24,27 @@ STORAGE_SUFFIXES = (".mcap", ".db3")  # of files of messages, which make a folde
 
 
 @dataclass(frozen=True)
+class ServiceInterface:
+    """A service: its type, for example `std_srvs/srv/Trigger`, the node that offers it, and what it does."""
+
+    type_name: str
+    node: str
+    about: str
+
+
+@dataclass(frozen=True)
 class Channel:
     """A topic: its name and type.
 
     Attributes:
         name: without a leading slash, so that a namespace can come before it.
         type_name: for example `nav_msgs/msg/Path`.
+        about: what its messages are, for the reference.
     """
 
     name: str
     type_name: str
+    about: str
 
     @property
     def recorded(self) -> str:
@@ -41,55 +52,167 @@ class Channel:
         return f"/{self.name}"
 
 
-IMAGE = Channel("camera/image_raw", "sensor_msgs/msg/Image")
-COMPRESSED_IMAGE = Channel("camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
-CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo")
-NEEDLE_POSE = Channel("needle/measured_cp", "geometry_msgs/msg/PoseWithCovarianceStamped")
-TRACKER_STATE = Channel("needle/tracker_state", "magnetosuture_msgs/msg/TrackerState")
-TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped")
-OPERATOR_COMMAND = Channel("operator/servo_cv", "geometry_msgs/msg/TwistStamped")  # above NEEDLE_COMMAND
-FILTER_STATE = Channel("needle/filter_state", "magnetosuture_msgs/msg/FilterState")
-NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
-NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
-MEASURED_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
-THREAD_OBSERVATION = Channel("thread/observation", "magnetosuture_msgs/msg/ThreadObservation")
-PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
-ESTIMATED_THREAD = Channel("thread/estimated", "magnetosuture_msgs/msg/EstimatedThread")
-FORECAST = Channel("thread/forecast", "magnetosuture_msgs/msg/ThreadForecast")
-MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
-THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
-SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene")  # dish and shapes from now on
-SCENE_MARKERS = Channel("scene/markers", "visualization_msgs/msg/MarkerArray")
-MATERIAL = Channel("thread/material", "magnetosuture_msgs/msg/ThreadMaterial")
-CURRENTS = Channel("coils/currents", "magnetosuture_msgs/msg/CoilCurrents")
-BRIDGE_STATE = Channel("coils/state", "magnetosuture_msgs/msg/CoilBridgeState")
-PROCEDURE_STATE = Channel("procedure/state", "magnetosuture_msgs/msg/ProcedureState")
-PROCEDURE_PLAN = Channel("procedure/plan", "nav_msgs/msg/Path")
-PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header")  # while a person holds the page
-DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+IMAGE = Channel("camera/image_raw", "sensor_msgs/msg/Image", "camera frames, in place of the compressed ones")
+COMPRESSED_IMAGE = Channel("camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "camera frames")
+CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo", "the lens, whose distortion is undone")
+NEEDLE_POSE = Channel(
+    "needle/measured_cp",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "the needle's tail, x axis along the needle there; where nothing tells tail and tip apart, the heading has "
+    "a standard deviation of more than 1 rad, which all subscribers refuse",
+)
+TRACKER_STATE = Channel(
+    "needle/tracker_state",
+    "magnetosuture_msgs/msg/TrackerState",
+    "searching, tracked or lost, why, confidence, curvature; where the dish is in the image",
+)
+TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped", "where the path wants the tip")
+OPERATOR_COMMAND = Channel(
+    "operator/servo_cv",
+    "geometry_msgs/msg/TwistStamped",
+    "velocity of the tip that an operator commands; has priority, and pauses a procedure; by the operator "
+    "page, or your joystick",
+)
+FILTER_STATE = Channel(
+    "needle/filter_state",
+    "magnetosuture_msgs/msg/FilterState",
+    "commanded, filtered and applied velocity, active constraints, why the needle rests",
+)
+NEEDLE_COMMAND = Channel(
+    "needle/servo_cv",
+    "geometry_msgs/msg/TwistStamped",
+    "velocity of the tip, followed while no operator commands; of one node at a time",
+)
+NEEDLE_SETPOINT = Channel(
+    "needle/setpoint_cv",
+    "geometry_msgs/msg/TwistStamped",
+    "applied velocity, that the currents give",
+)
+MEASURED_THREAD = Channel(
+    "thread/measured",
+    "nav_msgs/msg/Path",
+    "the measured centreline from the tail on, for viewers: half of a thread looks like a short one; "
+    "thread_model takes it where nobody publishes thread/observation",
+)
+THREAD_OBSERVATION = Channel(
+    "thread/observation",
+    "magnetosuture_msgs/msg/ThreadObservation",
+    "the pieces of the thread that a frame shows, whether they are all of it, and what may hide the rest",
+)
+PREDICTED_THREAD = Channel(
+    "thread/predicted",
+    "magnetosuture_msgs/msg/PredictedThread",
+    "the thread by the model alone",
+)
+ESTIMATED_THREAD = Channel(
+    "thread/estimated",
+    "magnetosuture_msgs/msg/EstimatedThread",
+    "the thread by model and camera, with a covariance for each node, and the forces that the model does not "
+    "know of; from the first measurement on, and again with the same stamp where an observation comes late",
+)
+FORECAST = Channel(
+    "thread/forecast",
+    "magnetosuture_msgs/msg/ThreadForecast",
+    "where needle and thread will be if the present command is held, and what happens when; with every "
+    "estimate, where the parameter forecast_horizon is above 0",
+)
+MARGINS = Channel(
+    "thread/margins",
+    "magnetosuture_msgs/msg/SafetyMargins",
+    "every barrier, the wall included; the minimum of each kind, contact, friction; of the estimated thread "
+    "where there is one, with the 99 % bound of each",
+)
+THREAD_MARKERS = Channel(
+    "thread/markers",
+    "visualization_msgs/msg/MarkerArray",
+    "for RViz and Foxglove: the thread in the colour of its friction, and the minimum of each barrier "
+    "(namespace margins); of an estimated one also the band of its deviation (deviation), the prediction "
+    "(predicted) and forces that were found (disturbances); of a forecast the thread at three instants and "
+    "what happens when (forecast)",
+)
+SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene", "the dish and the named shapes in it, from now on")
+SCENE_MARKERS = Channel(
+    "scene/markers",
+    "visualization_msgs/msg/MarkerArray",
+    "the dish and its shapes, for RViz and Foxglove",
+)
+MATERIAL = Channel(
+    "thread/material",
+    "magnetosuture_msgs/msg/ThreadMaterial",
+    "material, liquid and attachment of the thread from now on; by you, or a calibration",
+)
+CURRENTS = Channel(
+    "coils/currents",
+    "magnetosuture_msgs/msg/CoilCurrents",
+    "currents that are commanded to the driver, and why they are zero",
+)
+BRIDGE_STATE = Channel(
+    "coils/state",
+    "magnetosuture_msgs/msg/CoilBridgeState",
+    "state, armed, reasons, velocities, driver",
+)
+PROCEDURE_STATE = Channel(
+    "procedure/state",
+    "magnetosuture_msgs/msg/ProcedureState",
+    "state, goals met, progress, why it is paused or has failed",
+)
+PROCEDURE_PLAN = Channel(
+    "procedure/plan",
+    "nav_msgs/msg/Path",
+    "where the middle of the needle is to go, from where it was when it was planned",
+)
+PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header", "a person holds the page's button now")
+DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "what every node reports of itself")
 
-# Services of the coil bridge, of std_srvs: SetBool, Trigger and Trigger.
+# Services of the coil bridge, of the thread model where it forecasts, of the scene server, of the needle planner, of a
+# replayed bag and of the simulated rig.
 ARM, EMERGENCY_STOP, RESET = "coils/arm", "coils/emergency_stop", "coils/reset"
-
-FORECAST_PATH = "thread/forecast_path"  # of the thread model, where it forecasts: ForecastPath of magnetosuture_msgs
-
-# Services of the scene server, of magnetosuture_msgs: LoadScene, EditShape, EditShape and RemoveShape.
+FORECAST_PATH = "thread/forecast_path"
 LOAD_SCENE, ADD_SHAPE, REPLACE_SHAPE, REMOVE_SHAPE = "scene/load", "scene/add", "scene/replace", "scene/remove"
-
-# Of the needle planner: its action, ExecuteProcedure of magnetosuture_msgs, and services, PlanProcedure and Triggers.
-EXECUTE_PROCEDURE = "execute_procedure"
 PLAN_PROCEDURE = "procedure/make_plan"
 PAUSE_PROCEDURE, RESUME_PROCEDURE, ABORT_PROCEDURE = "procedure/pause", "procedure/resume", "procedure/abort"
-
-# Services of std_srvs/SetBool that let time stand still: of a replayed bag, of the simulated rig.
 PAUSE_REPLAY, PAUSE_RIG = "replay/pause", "rig/pause"
 
+EXECUTE_PROCEDURE = "execute_procedure"  # the needle planner's action, ExecuteProcedure of magnetosuture_msgs
+
+_SET, _TRIGGER, _EDIT = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger", "magnetosuture_msgs/srv/EditShape"
+SERVICES = {
+    ARM: ServiceInterface(_SET, "coil_bridge", "arm, or disarm"),
+    EMERGENCY_STOP: ServiceInterface(_TRIGGER, "coil_bridge", "zero currents at once, in any state, latched"),
+    RESET: ServiceInterface(_TRIGGER, "coil_bridge", "clear an emergency stop or a fault; the bridge stays disarmed"),
+    LOAD_SCENE: ServiceInterface("magnetosuture_msgs/srv/LoadScene", SCENE_SERVER, "take another scene"),
+    ADD_SHAPE: ServiceInterface(_EDIT, SCENE_SERVER, "add a shape to the scene"),
+    REPLACE_SHAPE: ServiceInterface(_EDIT, SCENE_SERVER, "replace the shape of the same name"),
+    REMOVE_SHAPE: ServiceInterface("magnetosuture_msgs/srv/RemoveShape", SCENE_SERVER, "remove a shape"),
+    FORECAST_PATH: ServiceInterface(
+        "magnetosuture_msgs/srv/ForecastPath",
+        "thread_model",
+        "forecast of a path of the tip, where forecast_horizon is above 0; nothing moves",
+    ),
+    PLAN_PROCEDURE: ServiceInterface("magnetosuture_msgs/srv/PlanProcedure", PLANNER, "check a procedure and plan it"),
+    PAUSE_PROCEDURE: ServiceInterface(_TRIGGER, PLANNER, "pause the procedure"),
+    RESUME_PROCEDURE: ServiceInterface(_TRIGGER, PLANNER, "begin what is planned, or go on"),
+    ABORT_PROCEDURE: ServiceInterface(_TRIGGER, PLANNER, "give the procedure up"),
+    PAUSE_REPLAY: ServiceInterface(_SET, "replay", "let the time of a replayed bag stand still"),
+    PAUSE_RIG: ServiceInterface(_SET, "rig_simulator", "let the rig's time stand still"),
+}
+
 # What only a simulation knows; never an input of the graph.
-GROUND_TRUTH_NEEDLE = Channel("ground_truth/needle", "geometry_msgs/msg/PoseStamped")
-GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path")
+GROUND_TRUTH_NEEDLE = Channel(
+    "ground_truth/needle",
+    "geometry_msgs/msg/PoseStamped",
+    "simulated ground truth of the needle",
+)
+GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path", "simulated ground truth of the thread")
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 
-RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents")  # the wires to the simulated coils
-FAULT_REQUEST = Channel("rig/fault", "std_msgs/msg/String")  # KIND DURATION, in force from now on
-CLOCK = Channel("clock", "rosgraph_msgs/msg/Clock")
+RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents", "the wires to the simulated coils")
+FAULT_REQUEST = Channel(
+    "rig/fault",
+    "std_msgs/msg/String",
+    "kind and duration of a fault, in force from now on; by you",
+)
+CLOCK = Channel(
+    "clock", "rosgraph_msgs/msg/Clock", "simulated time, for every node with use_sim_time; also by a replay"
+)

@@ -267,7 +267,7 @@ def _draw_consistency(axes: Axes, series: TimeSeries) -> None:
 
 def _draw_clearance(axes: Axes, series: TimeSeries) -> None:
     clearance = 1e3 * np.fmin.reduce([series.column(f"margin_{kind}") for kind in SOLID])
-    axes.set_title("minimum distance of a node from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
+    axes.set_title("minimum clearance from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
     if not np.isfinite(clearance).any():
         axes.text(0.5, 0.5, "no obstacle near the thread", transform=axes.transAxes, ha="center", color=FAINT)
         return

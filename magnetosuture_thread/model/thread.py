@@ -94,7 +94,7 @@ class Material:
         elastic_modulus: effective modulus in bending [Pa].
         source: where the numbers come from.
         stiffness_weight: W_stiff of the formulation `paper`, which has no stiffness in N m^2; tuned on the
-            reference set, see docs/thread_model.md.
+            reference set, see docs/explanation/thread_model.md.
     """
 
     name: str

@@ -1,0 +1,130 @@
+"""Every code block of README and tutorials runs, in a folder of its own, in the order in which a reader meets it.
+
+A comment before a block says what is special about it:
+
+    <!-- file: NAME -->                     it is saved under that name
+    <!-- runs: with the whole graph -->     it runs where nothing else does
+    <!-- runs: until TEXT -->               the same, and is interrupted once it has printed that
+    <!-- runs: not, REASON -->              it is left out
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs/tutorials").glob("*.md"))]
+BLOCK = re.compile(r"^(?:<!-- (file|runs): ([^\n]*) -->\n)?```(bash|python|yaml)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+LEFT_OUT = {  # blocks of each page that cannot run here
+    "README.md": 3,  # pip from the registry; colcon and ros2 of an installed ROS; make, which these tests are run by
+    "calibrate_a_thread.md": 1,  # a node that runs until it is interrupted
+}
+TIMEOUT = 300.0  # s
+GRAPH = "with the whole graph"
+
+
+class Block(NamedTuple):
+    """A block of code: a file to save under a name, or what is run and how."""
+
+    file: str
+    runs: str
+    language: str
+    text: str
+
+    @property
+    def on_the_graph(self) -> bool:
+        """Return whether it starts the nodes in processes of their own."""
+        return self.runs == GRAPH or self.runs.startswith("until ")
+
+
+def blocks_of(page: Path) -> list[Block]:
+    """Return the blocks of a page."""
+    found = BLOCK.finditer(page.read_text(encoding="utf-8"))
+    return [Block(m[2] if m[1] == "file" else "", m[2] if m[1] == "runs" else "", m[3], m[4]) for m in found]
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """Return a folder that has the examples and setups as the clone has."""
+    for name in ("config", "examples"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    return tmp_path
+
+
+def run(block: Block, folder: Path) -> None:
+    """Save a block, or run it."""
+    if block.file:
+        (folder / block.file).write_text(block.text, encoding="utf-8")
+        return
+    shell = ["bash", "-euo", "pipefail", "-c"]
+    command = [*(shell if block.language == "bash" else [sys.executable, "-c"]), block.text]
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path}
+    if block.runs.startswith("until "):
+        run_until(block.runs.removeprefix("until "), command, folder, environment)
+        return
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIMEOUT, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def run_until(text: str, command: list[str], folder: Path, environment: dict[str, str]) -> None:
+    """Run a command until it has printed a text, then press Ctrl-C; it has to end in order."""
+    log = folder / "printed.txt"
+    with log.open("w") as output:
+        process = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            deadline = time.monotonic() + TIMEOUT
+            while text not in log.read_text() and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.1)
+            assert text in log.read_text(), log.read_text()
+            os.killpg(process.pid, signal.SIGINT)
+            assert process.wait(TIMEOUT) == 0, log.read_text()
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_blocks_of_a_page_run_in_their_order(page: Path, clone: Path):
+    for block in blocks_of(page):
+        if not (block.on_the_graph or block.runs.startswith("not, ")):
+            run(block, clone)
+
+
+ON_THE_GRAPH = [page for page in PAGES if any(block.on_the_graph for block in blocks_of(page))]
+
+
+@pytest.mark.whole_graph
+@pytest.mark.parametrize("page", ON_THE_GRAPH, ids=lambda page: page.name)
+def test_blocks_on_the_graph_run(page: Path, clone: Path):
+    for block in blocks_of(page):
+        if block.file or block.on_the_graph:
+            run(block, clone)
+
+
+def test_no_block_is_left_out_unnoticed():
+    for page in PAGES:
+        fences = re.findall(r"^```(\w*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+        opened = Counter(fences[::2])
+        assert set(opened) <= {"bash", "python", "yaml", "math", "text"}, page
+        assert sum(opened[language] for language in ("bash", "python", "yaml")) == len(blocks_of(page)), page
+        assert not re.search(r"^    \S", BLOCK.sub("", page.read_text(encoding="utf-8")), re.MULTILINE), page
+    left_out = Counter(page.name for page in PAGES for block in blocks_of(page) if block.runs.startswith("not, "))
+    assert left_out == LEFT_OUT
+    kinds = {block.runs.partition(" ")[0] for page in PAGES for block in blocks_of(page)}
+    assert kinds <= {"", "with", "until", "not,"}
