@@ -100,7 +100,7 @@ def test_names_that_mean_something_to_programs_are_drawn_and_shown_as_they_are(t
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["check", "nowhere"], "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dish_150mm"),
+        (["check", "nowhere"], "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dead_end"),
         (["check", "BAD"], "bad.yaml: post.disc.radius: got 1.5, expected a number from 1e-06 to 1 m"),
         (["draw", "BAD", "--output", "OUT/a.png"], "bad.yaml: post.disc.radius: got 1.5, expected a number"),
         (["draw", "hernia_ring", "--output", "OUT/a.gif"], "a.gif', expected a file that ends in .png or .svg"),

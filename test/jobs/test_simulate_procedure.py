@@ -9,8 +9,10 @@ import pytest
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.interface import NEEDLE_COMMAND, PROCEDURE_PLAN, PROCEDURE_STATE, TIP_SETPOINT
+from magnetosuture_thread.interface import NEEDLE_COMMAND, PROCEDURE_PLAN, PROCEDURE_STATE, SCENE, TIP_SETPOINT
 from magnetosuture_thread.jobs.simulate import SUMMARY_FILE, simulate
+from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.scene import read_scene
 
 SETUP = """
 /**: {ros__parameters: {scene: dish_35mm}}
@@ -18,8 +20,9 @@ SETUP = """
   ros__parameters: {needle_start: [0.003, -0.002, 0.0], thread_segments: 30, frame_rate: 20.0}
 """
 NEAR = """
+scene: dish_35mm_post
 limits: {speed: 0.003}
-goals: [{go_to: {position: [0.009, 0.002], tolerance: 0.003}}]
+goals: [{go_to: {position: [0.009, -0.003], tolerance: 0.003}}]
 """
 
 
@@ -40,7 +43,10 @@ def test_the_needle_reaches_the_goals_and_the_summary_has_the_result(setup: str,
     assert (summary.procedure["state"], summary.procedure["goals_met"]) == ("done", 1)
     assert summary.procedure["min_clearance_m"] > 5e-4
     assert json.loads((output / SUMMARY_FILE).read_text())["procedure"] == summary.procedure
-    counts = Bag(output).counts
+    bag = Bag(output)
+    scenes = {parse_scene_message(record.decode()).version for record in bag.records({SCENE.recorded})}
+    assert scenes == {read_scene("dish_35mm_post").version}  # the procedure's, in place of the setup's
+    counts = bag.counts
     assert counts[PROCEDURE_STATE.recorded] > 5
     assert counts[PROCEDURE_PLAN.recorded] >= 1
     assert counts[NEEDLE_COMMAND.recorded] > 10

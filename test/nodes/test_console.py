@@ -393,7 +393,7 @@ def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, wh
 @pytest.mark.parametrize(
     ("parameter", "words"),
     [
-        ("scene:=nowhere", "scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dish_150mm"),
+        ("scene:=nowhere", "scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dead_end"),
         ("needle_length:=35.0", "console.needle_length: got 35.0"),
         ("dish:=0.035", "console.dish: got 0.035"),
         ("address:=0.0.0.0", "a token, as 0.0.0.0 can be reached"),

@@ -126,7 +126,7 @@ def test_without_a_scene_only_loading_one_is_possible(graph):
 
 
 HOSTILE: list[tuple[str, dict[str, str], str]] = [
-    ("load", {"file": ""}, "scene: got '', expected a YAML or GeoJSON file, or one of dish_150mm"),
+    ("load", {"file": ""}, "scene: got '', expected a YAML or GeoJSON file, or one of dead_end"),
     ("load", {"file": "/dev/zero"}, "scene: got '/dev/zero', expected a YAML or GeoJSON file"),
     ("load", {"file": "FIFO"}, "scene: got '"),
     ("load", {"file": "x" * 100_000}, "file: got '100000 characters', expected at most 4096"),
@@ -188,5 +188,5 @@ def test_a_scene_that_cannot_be_read_does_not_start_the_node(graph):
     environment = graph_environment(graph.domain)
     ended = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
     assert ended.returncode == 1
-    assert "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dish_150mm" in ended.stderr
+    assert "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dead_end" in ended.stderr
     assert ended.stderr.count("\n") == 1

@@ -158,7 +158,7 @@ def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
     for path in (fifo, tmp_path / "folder.yaml", tmp_path / "device.yaml", tmp_path / "none.yaml", Path("/dev/zero")):
         with pytest.raises(
             ConfigurationError,
-            match=r"^scene: got '.*(yaml|\.{3}.*|zero)', expected a YAML or GeoJSON file, or one of dish_150mm",
+            match=r"^scene: got '.*(yaml|\.{3}.*|zero)', expected a YAML or GeoJSON file, or one of dead_end",
         ):
             read_scene(str(path))
     large = tmp_path / "large.yaml"
