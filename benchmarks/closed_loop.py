@@ -24,7 +24,7 @@ from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import Setup, read_setup
 
-SETUPS = ("petri_35mm_polyamide", "petri_35mm_polyamide_post", "hernia_ring")
+CASES = (("petri_35mm_polyamide", 25), ("petri_35mm_polyamide_post", 25), ("hernia_ring", 40), ("hernia_ring", 80))
 TRUE_SEGMENTS = 240
 SETTLING = 0.5  # s, after the start, in which the model finds velocities of its own
 AVERAGING = 0.1  # s, of the running means
@@ -59,31 +59,33 @@ class _RecordingSession(ThreadSession):
         return self.results[stamp]
 
 
-def measure_closed_loop(setups: tuple[str, ...] = SETUPS, duration: float = 90.0) -> list[dict[str, Any]]:
-    """Return the figures of each setup, whose loop ends with its path, or after a duration [s]."""
-    return [figures for name in setups for figures in _measure(read_setup(name), duration)]
+def measure_closed_loop(cases: tuple[tuple[str, int], ...] = CASES, duration: float = 90.0) -> list[dict[str, Any]]:
+    """Return the figures of setups with so many segments; a loop ends with its path, or after a duration [s]."""
+    return [figures for name, segments in cases for figures in _measure(read_setup(name), segments, duration)]
 
 
 def closed_loop_table(figures: list[dict[str, Any]]) -> Table:
     """Return the figures as a table."""
     table = Table(title=f"pull on the needle in closed loop, rig of {TRUE_SEGMENTS} segments, simulated; % of its peak")
-    for name in ("setup", "poses", "RMS", "median", "maximum", f"RMS of means over {AVERAGING:g} s", "peak [µN]"):
+    for name in ("setup", "n", "poses", "RMS", "median", "maximum", f"RMS of means over {AVERAGING:g} s", "peak [µN]"):
         table.add_column(name, justify="left" if name in ("setup", "poses") else "right")
     for row in figures:
         shares = (row[f"{name}_percent"] for name in ("rms", "median", "max", "averaged_rms"))
-        table.add_row(row["setup"], row["poses"], *(f"{share:.1f}" for share in shares), f"{1e6 * row['peak_n']:.0f}")
+        percents, peak = (f"{share:.1f}" for share in shares), f"{1e6 * row['peak_n']:.0f}"
+        table.add_row(row["setup"], str(row["segments"]), row["poses"], *percents, peak)
     return table
 
 
 def nodes_table(figures: list[dict[str, Any]]) -> Table:
     """Return the errors of the nodes as a table."""
     table = Table(title="nodes in closed loop, tracked poses and threads, simulated; % of the length, mean (maximum)")
-    for name in ("setup", "prediction", "estimate"):
+    for name in ("setup", "n", "prediction", "estimate"):
         table.add_column(name, justify="left" if name == "setup" else "right")
     for row in figures:
         if "estimate" in row:
             errors = (row[name] for name in ("prediction", "estimate"))
-            table.add_row(row["setup"], *(f"{e['mean_percent']:.3f} ({e['max_percent']:.2f})" for e in errors))
+            where = row["setup"], str(row["segments"])
+            table.add_row(*where, *(f"{e['mean_percent']:.3f} ({e['max_percent']:.2f})" for e in errors))
     return table
 
 
@@ -109,8 +111,9 @@ def record_loop(setup: Setup, duration: float) -> tuple[list[LoopInstant], dict[
     return instants, session.results
 
 
-def _measure(setup: Setup, duration: float) -> list[dict[str, Any]]:
-    setup = replace(setup, rig=replace(setup.rig, thread_segments=TRUE_SEGMENTS)).with_scene(setup.scene)
+def _measure(setup: Setup, segments: int, duration: float) -> list[dict[str, Any]]:
+    rig, model = replace(setup.rig, thread_segments=TRUE_SEGMENTS), replace(setup.model, segments=segments)
+    setup = replace(setup, rig=rig, model=model).with_scene(setup.scene)
     instants, results = record_loop(setup, duration)
     begins = next(k for k, instant in enumerate(instants) if (instant.pose.tail != instants[0].pose.tail).any())
     moving = instants[max(begins - 1, 0) :]
@@ -134,7 +137,8 @@ def _measure(setup: Setup, duration: float) -> list[dict[str, Any]]:
         f"exact, {setup.rig.frame_rate:g} Hz": _follow(setup, [instant for instant in moving if instant.framed]),
         f"exact, {setup.coils.rate:g} Hz": _follow(setup, moving),
     }
-    figures = [{"setup": setup.name, "poses": poses, **compare_pulls(*found)} for poses, found in rows.items()]
+    case = {"setup": setup.name, "segments": segments}
+    figures = [{**case, "poses": poses, **compare_pulls(*found)} for poses, found in rows.items()]
     for name, each in errors.items():
         figures[0][name] = {"mean_percent": float(np.mean(each)), "max_percent": float(np.max(each))}
     return figures
