@@ -1,6 +1,6 @@
-"""Starts every node from colcon's install folder, as `ros2 run` would, and ends it.
+"""Starts every node as it is installed, from colcon's folder as `ros2 run` would, and ends it.
 
-Each gets a scene by its name, which the install folder holds. A node passes when it says on /diagnostics that it is
+Each gets a scene by its name, which is installed too. A node passes when it says on /diagnostics that it is
 there, and ends with exit code 0 when interrupted.
 """
 
@@ -41,33 +41,46 @@ sys.exit(0 if heard() else 1)
 """
 
 
-def main(install: Path) -> int:
-    """Start every node from an install folder; return 0 if all of them work."""
-    setup = install.resolve() / "setup.sh"
+def check_nodes(programs: dict[str, str], python: Path, state: Path) -> int:
+    """Start every node, listen to it, and end it.
+
+    Args:
+        programs: how a shell starts each, by name.
+        python: of an environment with rclpy.
+        state: folder for what the nodes remember.
+
+    Returns:
+        0 if all of them work.
+    """
     environment = {
         **os.environ,
-        "XDG_STATE_HOME": str(install.resolve() / "state"),
+        "XDG_STATE_HOME": str(state),
         "ROS_DOMAIN_ID": "101",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        "PATH": f"{python.parent}:{os.environ['PATH']}",
     }
-    for name, node in NODES.items():
-        path = f"{install.resolve()}/magnetosuture_thread/lib/magnetosuture_thread/{name}"
-        program = f'. "{setup}" && exec "{path}" --ros-args -p scene:=dish_35mm'
-        process = subprocess.Popen(["sh", "-c", program], env=environment, cwd="/")
+    for name, program in programs.items():
+        shell = ["sh", "-c", f"{program} --ros-args -p scene:=dish_35mm"]
+        process = subprocess.Popen(shell, env=environment, cwd="/")
         try:
-            heard = subprocess.run([sys.executable, "-c", LISTEN, node, str(TIMEOUT)], env=environment, check=False)
+            heard = subprocess.run([python, "-c", LISTEN, NODES[name], str(TIMEOUT)], env=environment, check=False)
             process.send_signal(signal.SIGINT)
             code = process.wait(TIMEOUT)
         finally:
             process.kill()
         if heard.returncode or code:
-            print(f"{name} from {install}: heard {heard.returncode == 0}, exit code {code}", file=sys.stderr)
+            print(f"{program}: heard {heard.returncode == 0}, exit code {code}", file=sys.stderr)
             return 1
-        print(f"{name} from {install}: runs and ends")
+        print(f"{name}: runs and ends")
         time.sleep(0.2)
     return 0
 
 
+def main(install: Path) -> int:
+    """Start every node from colcon's install folder; return 0 if all of them work."""
+    programs = f'. "{install}/setup.sh" && exec "{install}/magnetosuture_thread/lib/magnetosuture_thread/'
+    return check_nodes({name: f'{programs}{name}"' for name in NODES}, Path(sys.executable), install / "state")
+
+
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    sys.exit(main(Path(sys.argv[1]).resolve()))

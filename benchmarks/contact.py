@@ -2,8 +2,9 @@
 
 The thread model first steers its needle, a point, as `magnetosuture reproduce hernia` does. Then the rig's rod, of
 springs and with many more segments, is driven along the same way, and the model, with several n, is compared with it.
-The same with friction, of the rig's own code and the model's; then friction alone: capstans, a thread that is held, and
-the time of a step. Last, random motions in which the thread may not pass through itself.
+The same with friction, of the rig's own code and the model's; then the pull on the needle where closed loops move it;
+friction alone: capstans, a thread that is held, and the time of a step. Last, random motions in which the thread may
+not pass through itself.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.closed_loop import closed_loop_table, measure_closed_loop, nodes_table
 from benchmarks.friction import friction_table, measure_friction
 from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
@@ -80,6 +82,10 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         figures = f"{1e6 * row['deepest_m']:.1f}", f"{row['pull_error_percent']:.1f}", str(row["not_converged"])
         table.add_row(str(row["segments"]), f"{row['friction']:g}", error, *figures, f"{row['median_step_us']:.0f}")
     console.print(table)
+    log("the loop closed: the needle moves by the coils, and the poses are noisy")
+    loops = measure_closed_loop()
+    console.print(closed_loop_table(loops))
+    console.print(nodes_table(loops))
     log("friction by itself")
     friction = measure_friction()
     console.print(friction_table(friction))
@@ -88,7 +94,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     console.print(self_contact_table(selves))
     passed = all(row["deepest_m"] <= MAX_DEPTH and row["not_converged"] == 0 for row in rows)
     passed = passed and selves["model"]["crossed"] == selves["rig"]["crossed"] == 0
-    return {"cases": rows, "friction": friction, "self_contact": selves}, passed
+    return {"cases": rows, "closed_loop": loops, "friction": friction, "self_contact": selves}, passed
 
 
 def _with_friction(setup: Setup, friction: float) -> Setup:

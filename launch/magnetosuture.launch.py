@@ -4,12 +4,17 @@ The setup is one that ships with the package, by `setup:=NAME`, or a file of you
 `namespace:=NAME` all nodes are in a namespace. The coil bridge goes as far as the setup says; on hardware a person
 arms it. With `simulated:=true` a rig in software and a path follower come with them, and the bridge drives that rig and
 arms itself. With `planner:=true` procedures can be executed, and no path follower starts. With `console:=true` the
-operator's page is served on this machine.
+operator's page is served on this machine. Where tf2_ros is installed, the dish's frame is published as that of
+`parent_frame:=NAME`, on `tf_static` of the namespace; with an empty name it is left to others.
+
+What only looks comes back when its process dies: the camera's nodes and the operator's page. What moves the needle does
+not: a person arms the bridge, planner and path follower would begin anew amid a motion, and the scene server would
+forget the shapes that were added since.
 """
 
 from pathlib import Path
 
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition, UnlessCondition
@@ -19,6 +24,8 @@ from launch_ros.actions import Node
 PACKAGE = "magnetosuture_thread"
 DEFAULT_SETUP = "petri_35mm_polyamide"
 RIG_NODES = ("rig_simulator", "path_follower")
+RESPAWNED = ("perception", "console")
+RESPAWN_DELAY = 2.0  # s
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -42,13 +49,15 @@ def generate_launch_description() -> LaunchDescription:
         if not file.is_file():
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
         planner = LaunchConfiguration("planner").perform(context) == "true"
-        return started(str(file.resolve()), planner)
+        frame = LaunchConfiguration("parent_frame").perform(context)
+        return [*started(str(file.resolve()), planner), *transforms(frame)]
 
     return LaunchDescription(
         [
             argument("setup", DEFAULT_SETUP, "name of a setup that ships with the package", choices=names),
             argument("setup_file", "", "path of a setup of your own, in place of setup"),
             argument("namespace", "", "namespace of all nodes"),
+            argument("parent_frame", "map", "frame that the dish's is in; empty if others publish it"),
             switch("use_sim_time", "take the time from /clock"),
             switch("simulated", "with a rig in software"),
             switch("planner", "with the needle planner, in place of the path follower"),
@@ -71,6 +80,8 @@ def started(file: str, planner: bool) -> list[Node]:
             namespace=LaunchConfiguration("namespace"),
             parameters=[file, {"use_sim_time": LaunchConfiguration("use_sim_time")}, *more],
             output="screen",
+            respawn=name in RESPAWNED,
+            respawn_delay=RESPAWN_DELAY,
             **options,
         )
 
@@ -84,4 +95,20 @@ def started(file: str, planner: bool) -> list[Node]:
         *(node(name, condition=with_rig) for name in RIG_NODES if not (planner and name == "path_follower")),
         *([node("needle_planner")] if planner else []),
         node("console", condition=with_console),
+    ]
+
+
+def transforms(parent_frame: str) -> list[Node]:
+    """Return the publisher of the dish's frame in another one; none without tf2_ros, or without a name."""
+    if not parent_frame or "tf2_ros" not in get_packages_with_prefixes():
+        return []
+    return [
+        Node(
+            package="tf2_ros",
+            executable="static_transform_publisher",
+            name="dish_transform",
+            namespace=LaunchConfiguration("namespace"),
+            arguments=["--frame-id", parent_frame, "--child-frame-id", "dish"],
+            remappings=[("/tf_static", "tf_static")],  # two rigs in two namespaces have a dish each
+        )
     ]

@@ -7,6 +7,11 @@ from magnetosuture_thread.texts import shortened
 MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
 
 
+def missing_module(error: ModuleNotFoundError) -> str:
+    """Return what to do about a module that is not there; those of ROS do not come with the package alone."""
+    return f"{error}; nodes and the live graph need ROS 2 Jazzy: docs/how_to/installation.md, or pip install '.[ros]'"
+
+
 class MagnetosutureError(Exception):
     """Base of every error that this package raises on purpose; its text is one line for a person."""
 

@@ -6,6 +6,7 @@ other unknown parameter is refused.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from magnetosuture_thread.configuration import quantity
@@ -30,6 +31,13 @@ _QUANTITIES: dict[str, tuple[Any, str, str, float | None, float | None]] = {
     ),
     "thread_length": (0.019, "rest length of the thread", "m", 0.001, 2.0),
     "viscosity": (1.0, "dynamic viscosity of the liquid; glycerin at room temperature is about 1", "Pa s", 1e-4, 100.0),
+    "coil_angles": (
+        (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi),
+        "direction of each coil from the dish's centre, against the x axis",
+        "rad",
+        -2.0 * math.pi,
+        2.0 * math.pi,
+    ),
     "driver_timeout": (
         0.2,
         "without new currents for this long the coil drivers switch off by themselves; whole tenths for RoboClaw "

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread import cli
+from magnetosuture_thread import __version__, cli
 from magnetosuture_thread.cli import commands
 from magnetosuture_thread.cli.main import COMMANDS, MOVED, make_parser
 from magnetosuture_thread.model.formulations import FORMULATIONS
@@ -43,6 +43,11 @@ def test_help_names_every_command_and_the_exit_codes():
         "0 done, 1 the job failed, 2 wrong use",
     ):
         assert words in shown.stdout
+
+
+def test_the_version_is_that_of_the_package():
+    shown = run("--version")
+    assert (shown.returncode, shown.stdout) == (0, f"magnetosuture {__version__}\n")
 
 
 def test_every_command_of_every_file_is_in_the_parser():
@@ -171,7 +176,7 @@ def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert cli.main(["replay", str(short_bag), "--output", str(tmp_path / "out")]) == 1
-    assert "the live graph needs ROS 2 Jazzy" in capsys.readouterr().err
+    assert "nodes and the live graph need ROS 2 Jazzy" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +12,10 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.interface import NEEDLE_COMMAND, OPERATOR_COMMAND, PROCESSES, RIG_NODES
+from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_COMMAND, OPERATOR_COMMAND, PROCESSES, RIG_NODES
 
 ROOT = Path(__file__).parent.parent
+INSTALLED: dict[str, str] = {}  # packages of the ROS installation
 SHIPPED = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
 
 
@@ -38,7 +40,10 @@ def description(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Return what the launch file describes."""
     modules: dict[str, dict[str, Any]] = {
         "ament_index_python": {},
-        "ament_index_python.packages": {"get_package_share_directory": lambda package: str(ROOT)},
+        "ament_index_python.packages": {
+            "get_package_share_directory": lambda package: str(ROOT),
+            "get_packages_with_prefixes": lambda: INSTALLED,
+        },
         "launch": {"LaunchContext": dict, "LaunchDescription": lambda entries: entries},
         "launch.actions": {"DeclareLaunchArgument": kept("argument"), "OpaqueFunction": kept("function")},
         "launch.conditions": {"IfCondition": kept("if"), "UnlessCondition": kept("unless")},
@@ -103,6 +108,25 @@ def test_every_node_gets_the_same_file_and_namespace(description):
 def test_a_planner_comes_in_place_of_the_path_follower(description):
     started = {node.executable for node in nodes(description, planner="true")}
     assert started == {"scene_server", *PROCESSES, "rig_simulator", "needle_planner", "console"}
+
+
+def test_the_frame_of_the_dish_is_published_where_tf2_is_installed(description, monkeypatch: pytest.MonkeyPatch):
+    assert "tf2_ros" not in {node.package for node in nodes(description)}
+    monkeypatch.setitem(INSTALLED, "tf2_ros", "/opt/ros/jazzy")
+    (transform,) = (node for node in nodes(description, parent_frame="bench") if node.package == "tf2_ros")
+    assert transform.arguments == ["--frame-id", "bench", "--child-frame-id", DISH_FRAME]
+    assert (transform.namespace.name, transform.remappings) == ("namespace", [("/tf_static", "tf_static")])
+    assert "tf2_ros" not in {node.package for node in nodes(description, parent_frame="")}
+
+
+def test_what_moves_the_needle_never_comes_back_by_itself(description):
+    started = {node.executable: node for planner in ("true", "false") for node in nodes(description, planner=planner)}
+    respawned = {name for name, node in started.items() if node.respawn}
+    assert respawned == {"perception", "console"}
+    assert all(started[name].respawn_delay > 0.0 for name in respawned)
+    (page,) = (ROOT / "docs").rglob("nodes.md")
+    documented = dict(re.findall(r"^\| `(\w+)` \| (yes|no):", page.read_text(), re.MULTILINE))
+    assert documented == {name: "yes" if name in respawned else "no" for name in started}
 
 
 def test_a_file_of_ones_own_comes_in_place_of_a_name_and_must_be_there(description, tmp_path: Path):

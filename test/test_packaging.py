@@ -15,6 +15,7 @@ from magnetosuture_thread.resources import share_directory
 
 ROOT = Path(__file__).parent.parent
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
+REUSE = (ROOT / "REUSE.toml").read_text()
 
 
 def package_xml(path: Path) -> ElementTree.Element:
@@ -32,6 +33,56 @@ def test_the_version_is_the_same_everywhere():
     assert re.search(
         rf"^## \[{re.escape(version[1])}\] - \d{{4}}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE
     )
+
+
+def test_maintainer_and_addresses_are_those_of_pyproject_everywhere():
+    maintainer = re.search(r'^maintainers = \[\{ name = "(.+?)", email = "(.+?)" \}\]$', PYPROJECT, re.MULTILINE)
+    assert maintainer is not None
+    name, address = maintainer.groups()
+    urls = re.search(r"^\[project\.urls\].*\n((?:\w+ = .+\n)+)", PYPROJECT, re.MULTILINE)
+    assert urls is not None
+    known = dict(re.findall(r'^(\w+) = "(.+)"$', urls[1], re.MULTILINE))
+    for path in (ROOT / "package.xml", ROOT / "msg_defs" / "package.xml"):
+        package = package_xml(path)
+        assert [(entry.text, entry.get("email")) for entry in package.findall("maintainer")] == [(name, address)], path
+        repeated = {entry.get("type"): entry.text for entry in package.findall("url")}
+        assert repeated == {"repository": known["repository"], "bugtracker": known["issues"]}, path
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["authors"] == [{"name": name}]
+    assert citation["repository-code"] == known["repository"]
+    assert re.search(rf'^SPDX-FileCopyrightText = "\d{{4}}(-\d{{4}})? {re.escape(name)}"$', REUSE, re.MULTILINE)
+
+
+def test_the_licence_is_the_same_everywhere_and_its_text_is_there():
+    licence = re.search(r'^license = \{ text = "(.+)" \}$', PYPROJECT, re.MULTILINE)
+    assert licence is not None
+    for path in (ROOT / "package.xml", ROOT / "msg_defs" / "package.xml"):
+        assert package_xml(path).findtext("license") == licence[1]
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["license"] == licence[1]
+    annotated = re.findall(r'^SPDX-License-Identifier = "(.+)"$', REUSE, re.MULTILINE)
+    assert licence[1] in annotated
+    assert {path.name for path in (ROOT / "LICENSES").iterdir()} == {f"{name}.txt" for name in annotated}
+    assert (ROOT / "LICENSES" / f"{licence[1]}.txt").read_text() == (ROOT / "LICENSE").read_text()
+
+
+def test_licences_are_annotated_in_one_place():
+    """Every file has its licence by the annotations of REUSE.toml; none names one in a header of its own."""
+    assert re.findall(r"^path = (.+)$", REUSE, re.MULTILINE)[0] == '"**"'
+    tag = b"SPDX-" + b"License-Identifier:"
+    folders = ("magnetosuture_thread", "msg_defs", "launch", "config", "test", "benchmarks", "examples", "docs")
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
+    assert not [path for path in files if tag in path.read_bytes()]
+
+
+def test_workflows_run_what_is_there_for_every_python_that_is_supported():
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    supported = re.findall(r'^  "Programming Language :: Python :: ([\d.]+)",$', PYPROJECT, re.MULTILINE)
+    assert workflow["jobs"]["python"]["strategy"]["matrix"]["python"] == supported
+    steps = "\n".join(step.get("run", "") for job in workflow["jobs"].values() for step in job["steps"])
+    for path in re.findall(r"\.ci/[\w.]+", steps):
+        assert (ROOT / path).is_file()
+    (installed,) = re.findall(r"^pip install ('.*)$", steps, re.MULTILINE)
+    assert any(installed in page.read_text() for page in (ROOT / "docs").rglob("installation.md"))
 
 
 def test_every_message_is_built():

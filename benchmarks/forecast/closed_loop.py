@@ -8,6 +8,7 @@ seconds as they were sent. What is compared with it is where the rig's needle an
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from magnetosuture_thread import ForecastStart, NeedlePose, ThreadForecaster
 from magnetosuture_thread.coils.bridge import NEEDLE, CoilBridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.rig import Rig
@@ -90,7 +92,8 @@ def run_loop(setup: Setup, duration: float) -> list[Moment]:
             if command.progress >= 1.0:
                 break
             velocity = command.velocity
-            bridge.on_pose(pose.tail, heading, now, count, now, now)
+            with suppress(InvalidInputError):  # of a tail that jumps as the thread comes free, as the node does
+                bridge.on_pose(pose.tail, heading, now, count, now, now)
             bridge.on_margins(now, True, friction.slowdown, scene.version, now)
             bridge.command(NEEDLE, velocity, now, count, now, now)
         output = bridge.step(now, now, READY)

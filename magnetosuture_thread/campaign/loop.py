@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -142,7 +142,7 @@ class ClosedLoop:
         self._count = 0
         self._condition = ThreadCondition(problem="no thread yet")
         self._commanded = np.zeros(2)
-        self._reason = ""
+        self._reason, self._drift = "", 0.0
 
     def step(self) -> LoopFrame | None:
         """Go on by a period of the bridge; return the frame if one was taken.
@@ -159,7 +159,7 @@ class ClosedLoop:
         while self._waiting and self._waiting[0].due <= self.now + 1e-9:
             self._measured(heapq.heappop(self._waiting))
         output = self.bridge.step(self.now, self.now, self._driver)
-        self._reason = output.reason
+        self._reason, self._drift = output.reason, output.drift
         if self._recorder is not None:
             self._recorder.on_bridge(self.now, output)
         self.rig.apply(self._gains * output.allocation.currents, self.now - START)
@@ -240,7 +240,7 @@ class ClosedLoop:
         if self.bridge.feedforward is not None:
             force = np.full(2, np.nan) if forces is None else forces.needle_force
             self.bridge.feedforward.update(force, stamp, now)
-        self._condition = condition_of(result)
+        self._condition = replace(condition_of(result), drift=self._drift)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
         self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
         if self._recorder is not None:

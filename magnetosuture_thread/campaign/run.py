@@ -77,7 +77,7 @@ def run_procedure(
         ConfigurationError: the procedure does not fit the scene.
     """
     kinematics, keep_out = setup.coils.needle().kinematics, setup.coils.keep_out
-    planner = NeedlePlanner(setup.scene, kinematics, keep_out, setup.model.thread_length)
+    planner = NeedlePlanner(setup.scene, kinematics, keep_out, setup.model.thread_length, setup.coils.coil_angles)
     planner.check(procedure)
     executor = ProcedureExecutor(procedure, planner)
     rig = Rig(variation.setup.rig, setup.scene)

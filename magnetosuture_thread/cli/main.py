@@ -8,10 +8,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from magnetosuture_thread import ConfigurationError, MagnetosutureError
+from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
 from magnetosuture_thread.cli.arguments import EXIT_CODES, FAILED, WRONG_USE, check_outputs
 from magnetosuture_thread.cli.commands import bag, calibrate, campaign, evaluate, run_graph, scene
 from magnetosuture_thread.cli.terminal import make_console
+from magnetosuture_thread.errors import missing_module
 
 MOVED = {  # commands of before, and what is written instead
     "record": "`magnetosuture render`",
@@ -36,6 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
         epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for module in COMMANDS:
         module.add(subparsers)
@@ -64,7 +66,7 @@ def exit_code(run: Callable[[], int]) -> int:
     except ConfigurationError as error:
         return _fail(str(error), WRONG_USE)
     except ModuleNotFoundError as error:
-        return _fail(f"{error}; the live graph needs ROS 2 Jazzy: see the README, or pip install '.[ros]'", FAILED)
+        return _fail(missing_module(error), FAILED)
     except (MagnetosutureError, OSError) as error:
         return _fail(str(error), FAILED)
     except KeyboardInterrupt:

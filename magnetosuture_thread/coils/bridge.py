@@ -51,6 +51,7 @@ class BridgeOutput:
         slowdown: factor on the speed by the thread's friction.
         active: names of the constraints that changed the command.
         scene_version: of the scene that the needle is kept within; empty for none.
+        drift: velocity of the needle across its chord, to the left, that is measured and compensated [m/s].
     """
 
     coils: tuple[str, ...]
@@ -64,6 +65,7 @@ class BridgeOutput:
     slowdown: float = 1.0
     active: tuple[str, ...] = ()
     scene_version: str = ""
+    drift: float = 0.0
 
     @property
     def applied(self) -> Vector:
@@ -280,6 +282,7 @@ class CoilBridge:
             return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
         max_change, pull = self._settings.max_current_slew * elapsed, np.zeros(2)
         disturbance = None if self._observer is None else self._observer.disturbance(pose.heading)
+        drift = 0.0 if disturbance is None else disturbance.drift
         if self.feedforward is not None and not no_prediction:
             pull = self.feedforward.velocity(filtered.filtered, pose.heading, now, arrival)
         allocation, limiting = self._coils.allocate(
@@ -301,7 +304,7 @@ class CoilBridge:
         if self._observer is not None:
             self._observer.apply(pose.heading, float(e @ allocation.velocity), allocation.drift, elapsed)
             self._gains.apply(now, allocation.currents)
-        return self._output(selected, (), True, active, filtered.slowdown)
+        return self._output(selected, (), True, active, filtered.slowdown, drift)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
         """Return the input to follow at a time of the stamps' clock and a monotonic time [s]."""
@@ -363,6 +366,7 @@ class CoilBridge:
         publish: bool,
         active: tuple[str, ...],
         slowdown: float,
+        drift: float = 0.0,
     ) -> BridgeOutput:
         """Return the result of a step with the currents and the filtered velocity that it has ended with."""
         return BridgeOutput(
@@ -377,6 +381,7 @@ class CoilBridge:
             slowdown,
             active,
             self.scene_version,
+            drift,
         )
 
     def _clear(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os.path
 from dataclasses import dataclass
 from functools import cached_property
@@ -154,13 +153,7 @@ class CoilBridgeSettings(Configuration):
     needle_turning_drag: float = quantity(
         1.6e-7, "drag torque of the needle at 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2
     )
-    coil_angles: tuple[float, ...] = quantity(
-        (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi),
-        "direction of each coil from the dish's centre, against the x axis",
-        unit="rad",
-        minimum=-2.0 * math.pi,
-        maximum=2.0 * math.pi,
-    )
+    coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
 
     coil_resistance: float = quantity(
         1.0,

@@ -19,7 +19,8 @@ class ForecastMargin:
     """The least margin of one kind over a forecast.
 
     Attributes:
-        value: a distance [m], inf where nothing comes near: the clearance of the thread's surface from shapes or wall;
+        value: a distance [m], inf where nothing comes near: the clearance of the thread's surface from shapes or wall,
+            that of nodes and half segments as in `Margins`;
             a segment's length that is left until it is taut, or until it is pressed together; the distance of the
             needle's axis from shapes and wall, less `keep_out`.
         time: since the start of the forecast [s].

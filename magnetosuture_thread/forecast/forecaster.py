@@ -29,7 +29,7 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, MotionBuffers
-from magnetosuture_thread.model.formulations.step import StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.margins import FrictionLaw
 from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose, check_pose
 from magnetosuture_thread.model.predictor import MAX_STEP_LENGTH, ThreadPredictor

@@ -20,7 +20,8 @@ from magnetosuture_thread.forecast.rollout_data import (
     RolloutState,
 )
 from magnetosuture_thread.geometry.obstacles import WALL, find_contacts
-from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
+from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
+from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.formulations.rod_forces import write_forces
@@ -31,7 +32,7 @@ from magnetosuture_thread.model.formulations.rod_step import (
     accept_step,
     solve_step,
 )
-from magnetosuture_thread.model.formulations.step import program_of
+from magnetosuture_thread.model.formulations.step_buffers import program_of
 from magnetosuture_thread.model.solvers import banded
 from magnetosuture_thread.safety.certificate import PosedNeedle
 from magnetosuture_thread.safety.motion import (
@@ -132,6 +133,8 @@ def record_margins(
 ) -> bool:
     """Record the least margins of the thread at an instant, what it touches, and its nodes under friction.
 
+    Clearances are of nodes and half segments, as those of `Margins`, and say what touches; friction is of nodes.
+
     Returns:
         Whether the buffers had room for all contacts.
     """
@@ -142,20 +145,24 @@ def record_margins(
         count = find_contacts(positions, model.around, to.node, to.obstacle, to.distance, to.normal, to.nearest)
     if count < 0:
         return False
-    near, close = np.zeros(nodes, np.bool_), np.zeros(nodes, np.int64)
-    some, nearest = False, np.inf
+    close = np.zeros(nodes, np.int64)
     for c in range(count):
         clearance, i, o = to.distance[c] - rod.radius, to.node[c], to.obstacle[c]
         kind = WALL_MARGIN if o == WALL else OBSTACLE_MARGIN
         if clearance < margin[kind]:
             margin[kind], node[kind], shape[kind] = clearance, i, o
-        if clearance <= model.contact_tolerance and clearance < nearest:
-            nearest, record.contact[k, 0], record.contact[k, 1] = clearance, o, i
-        if o != WALL:
-            if clearance < model.friction[0] and i > 0 and to.nearest[c]:
-                close[i] += 1
-            if to.distance[c] <= model.near.reach:
-                near[i] = some = True
+        if o != WALL and clearance < model.friction[0] and i > 0 and to.nearest[c]:
+            close[i] += 1
+    for c in range(count):
+        kind, i, o = WALL_MARGIN if to.obstacle[c] == WALL else OBSTACLE_MARGIN, to.node[c], to.obstacle[c]
+        # No point of a half segment is nearer than its node by more than its length.
+        if to.distance[c] - rod.radius - MAX_ELONGATION * 0.5 * rod.unit < margin[kind]:
+            clearance = half_segment_distance(positions, i, o, to.distance[c], model.around) - rod.radius
+            if clearance < margin[kind]:
+                margin[kind], node[kind], shape[kind] = clearance, i, o
+    nearest = OBSTACLE_MARGIN if margin[OBSTACLE_MARGIN] <= margin[WALL_MARGIN] else WALL_MARGIN
+    if margin[nearest] <= model.contact_tolerance:
+        record.contact[k, 0], record.contact[k, 1] = shape[nearest], node[nearest]
     for i in range(nodes):
         record.rubbed[k, i] = close[i] >= 2
     chords = buffers.step.chords  # of where the thread is: of the last linearisation, that showed that it is there
@@ -167,14 +174,7 @@ def record_margins(
             left = rod.unit - length if kind == CONNECTIVITY_MARGIN else length - chords[i] * rod.unit
             if left < margin[kind]:
                 margin[kind], node[kind] = left, i + 1
-    if some:
-        contacts = ChordContacts(to.node, to.obstacle, to.distance, to.normal, to.place)
-        count = find_chord_contacts(positions, model.near, rod.unit, rod.radius, near, 0, contacts)
-        for c in range(count):
-            clearance = to.distance[c] - rod.radius
-            if clearance <= model.contact_tolerance and clearance < nearest:
-                nearest, record.contact[k, 0], record.contact[k, 1] = clearance, to.obstacle[c], to.node[c]
-    return count >= 0
+    return True
 
 
 @compiled
@@ -238,9 +238,9 @@ def record_instant(
     if k > 0 and interval > 0.0:
         tension = np.empty(len(state.positions) - 1)
         scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
-        multipliers, heading = buffers.step.multipliers[: len(tension)], state.pose[2:]
-        points = state.positions / rod.unit
-        write_forces(rod, points, state.velocities, heading, multipliers, scale, tension, record.pull[k])
+        step, points = buffers.step, state.positions / rod.unit
+        heading, internal, load = state.pose[2:], step.internal, step.tail_load
+        write_forces(rod, points, state.velocities, heading, internal, load, scale, tension, record.pull[k])
         record.tension[k] = tension.max()
     return record_margins(model, buffers, state, k, record)
 

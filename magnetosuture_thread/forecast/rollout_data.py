@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, RodProperties
-from magnetosuture_thread.model.formulations.step import StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.solvers.banded import SolverBuffers
 from magnetosuture_thread.safety.motion import FilterData
 
@@ -35,7 +35,7 @@ class RolloutModel(NamedTuple):
         max_step: intervals are divided into steps of at most this [s].
         max_way: of a prescribed node in such a step [m].
         max_substeps: into which an interval is divided at the most.
-        contact_tolerance: a node this close to a shape or the wall touches it [m].
+        contact_tolerance: the thread touches a shape or the wall to which it is this close [m].
         friction: threshold [m], slowdown of a node, and speed of a node that is stuck [m/s], as of `FrictionLaw`; and
             the time over which the speeds are averaged [s]; shape (4,).
         drag: of the needle, see `NeedleDrag`: along with the thread's and without it, across, turning, and that of the
@@ -86,14 +86,12 @@ class MarginBuffers(NamedTuple):
     distance: NDArray[np.float64]
     normal: Points
     nearest: NDArray[np.bool_]
-    place: NDArray[np.float64]
 
     @classmethod
     def of(cls, capacity: int) -> MarginBuffers:
         """Return buffers with room for so many contacts."""
         node, obstacle = np.zeros((2, capacity), np.int64)
-        distance, place = np.zeros((2, capacity))
-        return cls(node, obstacle, distance, np.zeros((capacity, 2)), np.zeros(capacity, np.bool_), place)
+        return cls(node, obstacle, np.zeros(capacity), np.zeros((capacity, 2)), np.zeros(capacity, np.bool_))
 
 
 class RolloutBuffers(NamedTuple):

@@ -286,6 +286,7 @@ class MessageBuilder:
         if output is not None:
             current, saturated, reasons = output.allocation.currents, output.allocation.saturated, output.reasons
             fields = {**self._velocities(output), "current": self.numbers("d", current), "saturated": saturated}
+            fields["drift"] = output.drift
         else:
             reasons, fields = system.closed_reasons, {}
         if driver.currents is not None:

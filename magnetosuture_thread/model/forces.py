@@ -18,20 +18,22 @@ class ThreadForces:
     """The forces in a thread and on it, at the end of a step.
 
     A row's multiplier is the force that keeps its barrier. With the program in units of the segment's length D, and of
-    the metric's scale Z = zeta_perp + mu / dt,
+    the metric's scale Z = zeta_perp + mu / dt, and f_j what the thread's own segments push node j with, by tension and
+    bending (`keep_internal_forces`),
 
-        T_i = Z D^2 lambda_i |x_i - x_{i-1}| / D,    N_i = Z D^2 sum_c lambda_c n_c
+        T_i = Z D^2 t_i' sum_{j<i} f_j,    N_i = Z D^2 sum_c lambda_c n_c
 
-    over the contacts c of node i, those of friction included. The thread pulls the needle with what is left of the
-    balance of the node at its tail,
+    over the contacts c of node i, those of friction included. The thread pulls the needle with what its first segment
+    does, and with the loads on half of that,
 
-        F = T_1 t_1 - (EI / D^2) dE / dx_0 + (D / 2) (mu g - zeta_perp v + (zeta_perp - zeta_par) t_1 t_1' v)
+        F = Z D^2 f_0 + N_0 + (D / 2) (mu (g - dv / dt) - zeta_perp v + (zeta_perp - zeta_par) t_1 t_1' v)
 
-    with the tail's velocity v against the medium, and turns it, if clamped, by M = -dE_bend / d(heading angle).
+    with the tail's velocity v, in the drag against the medium, and turns it, if clamped, by
+    M = -dE_bend / d(heading angle).
 
     Attributes:
-        tension: T_i of each segment, positive where it is pulled, shape (n,) [N]. It is what keeps the segment's
-            length; the resultant of the stresses along the tangent is greater by EI times the squared curvature.
+        tension: T_i of each segment, positive where it is pulled, shape (n,) [N]: what the one half of the thread pulls
+            at the other with, along the segment.
         contact: N_i, the force of shapes and wall upon each node, shape (n + 1, d) [N].
         needle_force: F, of the thread upon the needle, at its tail, shape (d,) [N].
         needle_moment: M about the tail, counter-clockwise, 0 of a pinned thread; in the plane only, else NaN [N m].
@@ -39,8 +41,8 @@ class ThreadForces:
         friction_use: the same over its limit mu N of the shape where it is nearest to it: 1 where the node slides, 0
             where it has no friction, shape (n + 1,).
 
-    Source: Lagrange's multipliers; the paper works no force out. Deviation: inertia of the half segment at the needle
-    and the damping of bending are not in F.
+    Source: Lagrange's multipliers; the paper works no force out. Deviation: none but that friction on the first segment
+    is not in F.
     """
 
     tension: Vector

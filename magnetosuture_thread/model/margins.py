@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
@@ -174,15 +174,14 @@ class Margins(Mapping[str, BarrierMargins]):
         barriers: Sequence[BarrierRows],
         contact_tolerance: float,
         scene_version: str = "",
-        in_contact: Iterable[int] = (),
     ) -> Margins:
         """Return the margins of barriers at the same positions.
 
         Args:
             barriers: the rows of each, in SI units.
-            contact_tolerance: a node this close to a shape or the wall touches it [m].
+            contact_tolerance: a node touches a shape or the wall to which it, or half a segment beside it, is this
+                close [m].
             scene_version: of the scene.
-            in_contact: nodes that touch besides, as their segment does; see `Formulation.chords_in_contact`.
         """
         margins = tuple(
             BarrierMargins(
@@ -195,7 +194,7 @@ class Margins(Mapping[str, BarrierMargins]):
             for rows in barriers
         )
         near = [m.node[m.clearance <= contact_tolerance] for m in margins if m.barrier in SOLID]
-        touching = sorted({node for nodes in near for node in nodes.tolist()} | set(in_contact))
+        touching = sorted({node for nodes in near for node in nodes.tolist()})
         return cls(margins, tuple(touching), scene_version=scene_version)
 
 

@@ -337,8 +337,7 @@ class ThreadPredictor:
 
         def compute_margins() -> Margins:
             rows = formulation.margins(positions, pose.heading)
-            touching = formulation.chords_in_contact(positions, self.contact_tolerance)
-            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version, touching)
+            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
             return None if last is None else formulation.forces(last, pose.heading)

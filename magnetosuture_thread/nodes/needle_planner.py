@@ -116,8 +116,8 @@ class NeedlePlannerNode(PackageNode):
         self._publish()
 
     def on_bridge(self, message: CoilBridgeState) -> None:
-        """Pause where the coil bridge is disarmed or stopped."""
-        self._session.on_armed(message.armed)
+        """Pause where the coil bridge is disarmed or stopped; register the drift that it compensates."""
+        self._session.on_bridge(message.armed, message.drift)
         self._publish()
 
     def on_operator(self, message: TwistStamped) -> None:

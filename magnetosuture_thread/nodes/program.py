@@ -9,6 +9,8 @@ from importlib import import_module
 from pathlib import Path
 from types import FrameType
 
+from magnetosuture_thread.errors import missing_module
+
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -20,13 +22,17 @@ def main() -> int:
     Ctrl-C reaches each node twice, from the terminal and from launch.
 
     Returns:
-        The node's exit code.
+        The node's exit code; 1 with one line on standard error where ROS, or another package, is not installed.
     """
     for which in STOPS:
         if signal.getsignal(which) is not signal.SIG_IGN:
             signal.signal(which, _leave)
     try:
-        node = import_module(f"magnetosuture_thread.nodes.{Path(sys.argv[0]).name}")
+        try:
+            node = import_module(f"magnetosuture_thread.nodes.{Path(sys.argv[0]).name}")
+        except ModuleNotFoundError as error:
+            print(f"error: {missing_module(error)}", file=sys.stderr)
+            return 1
         return int(node.main())
     finally:
         for which in STOPS:

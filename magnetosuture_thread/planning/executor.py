@@ -49,6 +49,8 @@ class ThreadCondition:
         friction_nodes: how many nodes are under friction.
         slowdown: factor on the needle's speed by the thread's friction, which the bridge applies.
         problem: why it is not known well enough to go on; empty if it is.
+        drift: velocity of the needle across its chord, to the left, by what pulls it, which the bridge measures and
+            compensates [m/s]; 0 if unknown.
     """
 
     vertices: Points | None = None
@@ -56,6 +58,7 @@ class ThreadCondition:
     friction_nodes: int = 0
     slowdown: float = 1.0
     problem: str = ""
+    drift: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -210,7 +213,8 @@ class ProcedureExecutor:
             return self._next_goal()
         if self._tracker.travel > PROGRESS:
             self._replans = 0
-        command = self._tracker.compute_command(stamp, middle, angle, self._allowed_speed(thread), thread.slowdown)
+        speed = self._allowed_speed(thread)
+        command = self._tracker.compute_command(stamp, middle, angle, speed, thread.slowdown, thread.drift)
         if command.done:
             return self._at_end(stamp, goal, middle, angle)
         assert self.path is not None
@@ -238,7 +242,7 @@ class ProcedureExecutor:
         assert self._begin is not None
         left = goals[0].swept - self._swept if isinstance(goals[0], Wrap) else None
         self.path = self.planner.plan(goals, self.procedure.limits[self.goal], middle, angle, self._begin, left)
-        self._tracker, self._reached = PathTracker(self.path), 0
+        self._tracker, self._reached = PathTracker(self.path, self.planner.coil_angles), 0
 
     def _replan(self, stamp: float, stopped: Vector) -> ProcedureOutput:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""

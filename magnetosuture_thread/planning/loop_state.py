@@ -43,7 +43,7 @@ class LoopState:
         self._pose, self._outside = -math.inf, ""
         self._tracker = ""
         self._margins: _Margins | None = None
-        self._tension = 0.0
+        self._tension = self._drift = 0.0
         self._vertices: Callable[[], Points] | None = None
         self._estimates, self._estimate_problem = False, ""
         self._disturbances: dict[float, str] = {}
@@ -87,6 +87,10 @@ class LoopState:
         """Go on in spite of the forces that are known now, as a person who begins or resumes wants; new ones count."""
         self._accepted = set(self._disturbances)
 
+    def on_bridge(self, drift: float) -> None:
+        """Register the velocity across the needle's chord that the bridge compensates [m/s]; 0 if it is no number."""
+        self._drift = drift if math.isfinite(drift) else 0.0
+
     def on_margins(self, now: float, reason: str, friction_nodes: int, slowdown: float, scene_version: str) -> None:
         """Register the thread's margins, or the reason why they are not valid."""
         self._margins = _Margins(now, reason, friction_nodes, slowdown, scene_version)
@@ -125,6 +129,7 @@ class LoopState:
             0 if margins is None else margins.friction_nodes,
             1.0 if margins is None else margins.slowdown,
             problem,
+            self._drift,
         )
 
     def _problem(self, now: float) -> str:

@@ -65,10 +65,18 @@ class NeedlePlanner:
         needle: its kinematics.
         keep_out: least distance of the needle's axis from wall and shapes [m].
         thread_length: of the thread behind it [m].
+        coil_angles: direction of each coil from the dish's centre [rad], for `PathTracker`.
     """
 
-    def __init__(self, scene: Scene, needle: NeedleKinematics, keep_out: float, thread_length: float) -> None:
-        self.scene, self.needle = scene, needle
+    def __init__(
+        self,
+        scene: Scene,
+        needle: NeedleKinematics,
+        keep_out: float,
+        thread_length: float,
+        coil_angles: Sequence[float] = (),
+    ) -> None:
+        self.scene, self.needle, self.coil_angles = scene, needle, tuple(coil_angles)
         self._keep_out, self._thread_length = keep_out, thread_length
         self.near = map_clearance(scene)
         self.lever = 0.5 * needle.chord

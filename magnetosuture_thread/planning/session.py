@@ -186,8 +186,14 @@ class ProcedureSession:
         self._update_status()
         return True
 
-    def on_armed(self, armed: bool) -> None:
-        """Register whether the coil bridge is armed; a procedure pauses where it is not, until `resume`."""
+    def on_bridge(self, armed: bool, drift: float) -> None:
+        """Register whether the coil bridge is armed; a procedure pauses where it is not, until `resume`.
+
+        Args:
+            armed: whether it is.
+            drift: velocity across the needle's chord that it compensates [m/s].
+        """
+        self.known.on_bridge(drift)
         self._armed = armed
         if not armed and not self._by_person:
             self.pause("the coil bridge is not armed")

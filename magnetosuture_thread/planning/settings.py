@@ -23,6 +23,7 @@ class NeedlePlannerSettings(Configuration):
     needle_length: float = shared_parameter("needle_length")
     needle_curvature: float = shared_parameter("needle_curvature")
     thread_length: float = shared_parameter("thread_length")
+    coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
     keep_out: float = quantity(
         0.0005,
         "minimum clearance of the needle's axis to wall and obstacles on a path; that of coil_bridge, or more",
@@ -69,4 +70,5 @@ class NeedlePlannerSettings(Configuration):
     def planner(self, scene: Scene, keep_out: float | None = None) -> NeedlePlanner:
         """Return a planner for a scene, with another clearance than `keep_out` if one is given [m]."""
         kinematics = NeedleKinematics(self.needle_length, self.needle_curvature)
-        return NeedlePlanner(scene, kinematics, self.keep_out if keep_out is None else keep_out, self.thread_length)
+        clearance = self.keep_out if keep_out is None else keep_out
+        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, self.coil_angles)

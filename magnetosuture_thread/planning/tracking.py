@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,10 @@ ACCELERATION = 0.008  # m/s^2
 MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle that is farther from it
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
 MAX_RATIO = 2.0  # of the allowed speed, that corrections of either kind may take
+MIN_SLOWDOWN = 0.3  # for which the gains on errors are raised, so that the bridge's factor does not lower them
+DRIFT_PER_ANGLE = 0.012  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
+MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
+AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
 
 
@@ -55,21 +60,29 @@ class PathTracker:
     profile between the places where the needle changes between ahead and back. It waits while the needle is farther
     from it than `MAX_LAG` along the path or `MAX_ANGLE`.
 
+    Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
+    the velocity d, theta stays off the axes by min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p,
+    and jumps to the other side when theta_p crosses. All of theta - theta_p stays within what half of the path's
+    leeway allows. Corrections are raised by as much as the bridge slows them down, within the same limits.
+
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
 
     Args:
         path: to track.
+        coil_angles: direction of each coil from the dish's centre [rad]; none where it does not matter.
     """
 
-    def __init__(self, path: BodyPath) -> None:
+    def __init__(self, path: BodyPath, coil_angles: Sequence[float] = ()) -> None:
         self.path = path
+        self._axes = tuple({round(math.remainder(angle, math.pi), 6) for angle in coil_angles})
         self.travel = 0.0
         turning = turning_points(path.middles, path.angles, path.lever)
         self._stops = [(float(path.travel[index]), sense) for index, sense in turning]
         self._stamp: float | None = None
         self._speed = 0.0
         self._integral = 0.0
+        self._side = 0.0  # of the nearest axis, on which the needle lies; 0 before the first pose
 
     @property
     def leeway(self) -> float:
@@ -77,7 +90,7 @@ class PathTracker:
         return self.path.leeway_at(self.travel)
 
     def compute_command(
-        self, stamp: float, middle: Vector, angle: float, speed: float, slowdown: float = 1.0
+        self, stamp: float, middle: Vector, angle: float, speed: float, slowdown: float = 1.0, drift: float = 0.0
     ) -> TrackingCommand:
         """Compute the command for a pose.
 
@@ -87,6 +100,7 @@ class PathTracker:
             angle: of the chord [rad].
             speed: of the tip that is allowed now [m/s].
             slowdown: factor on every velocity that the bridge applies.
+            drift: velocity across the chord, to the left, that the bridge measures and compensates [m/s].
         """
         interval = 0.0 if self._stamp is None else stamp - self._stamp
         interval = interval if 0.0 < interval <= MAX_INTERVAL else 0.0
@@ -115,11 +129,22 @@ class PathTracker:
         if not waits:
             self._integral += INTEGRAL_GAIN * interval * driven * across
             self._integral = min(MAX_INTEGRAL, max(-MAX_INTEGRAL, self._integral))
-        turn += course
-        limit = MAX_RATIO * speed
+        turn += min(allowed, max(-allowed, self._off_axes(direction, course, drift)))
+        limit, raised = MAX_RATIO * speed, 1.0 / max(slowdown, MIN_SLOWDOWN)
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
-        v = self.path.lever * (self._speed * rate) + min(limit, max(-limit, self.path.lever * TURN_GAIN * turn))
+        v = self.path.lever * self._speed * rate
+        v += min(limit, max(-limit, raised * TURN_GAIN * self.path.lever * turn))
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
+
+    def _off_axes(self, direction: float, course: float, drift: float) -> float:
+        """Return the course with which the needle stays off the coils' axes, on the side of the planned direction."""
+        if not self._axes:
+            return course
+        planned = min((math.remainder(direction - axis, math.pi) for axis in self._axes), key=abs)
+        if not self._side or planned * self._side <= -AXIS_CROSSED:
+            self._side = math.copysign(1.0, planned)
+        kept = min(MAX_AXIS_ANGLE, abs(drift) / DRIFT_PER_ANGLE)
+        return max(course, kept - planned) if self._side > 0.0 else min(course, -kept - planned)
 
     def _rates(self, stop: float) -> tuple[float, float]:
         """Return how far the needle is driven along its chord, and turned [rad], for each metre of the tip's way."""

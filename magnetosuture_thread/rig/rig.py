@@ -217,6 +217,11 @@ class Rig:
         """Tension of each segment of the thread, shape (n,) [N]."""
         return self._dynamics.tension
 
+    @property
+    def thread_pull(self) -> Vector:
+        """Force of the thread on the needle, at the tail, shape (2,) [N]."""
+        return self._dynamics.thread_pull
+
     def look(self, time: float, *, rendered: bool = True) -> RigFrame:
         """Take a frame at a time since the start [s].
 

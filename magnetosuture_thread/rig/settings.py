@@ -53,13 +53,7 @@ class RigSettings(Configuration):
         (), f"of what each shape of the scene seems to be made, in order: {', '.join(LOOKS)}; none given: by its kind"
     )
 
-    coil_angles: tuple[float, ...] = quantity(
-        (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi),
-        "direction of each coil from the dish's centre, against the x axis",
-        unit="rad",
-        minimum=-2.0 * math.pi,
-        maximum=2.0 * math.pi,
-    )
+    coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
     coil_distance: float = quantity(
         0.05, "from the dish's centre to the middle of a coil", unit="m", minimum=0.01, maximum=1.0
     )

@@ -90,6 +90,16 @@ def test_saturation_is_reported_with_the_velocity_really_reached():
     assert 0.0 < found.velocity[0] < 0.01
 
 
+def test_a_current_at_its_limit_is_no_saturation_while_the_velocity_is_reached():
+    """The other coils take over what one lacks, at the cost of the field along the needle."""
+    free = np.abs(allocation(limit=1000.0).allocate(0.005 * EAST, MIDDLE, EAST).currents).max()
+    for share, error, saturated in ((0.7, 0.001, False), (0.5, 0.1, True)):
+        found = allocation(limit=share * free).allocate(0.005 * EAST, MIDDLE, EAST)
+        assert np.abs(found.currents).max() == pytest.approx(share * free)
+        assert np.linalg.norm(found.velocity - 0.005 * EAST) < error * 0.005
+        assert found.saturated == saturated
+
+
 @given(vx=st.floats(-1.0, 1.0), vy=st.floats(-1.0, 1.0), x=st.floats(-0.017, 0.017), angle=st.floats(-np.pi, np.pi))
 def test_currents_never_leave_their_limits(vx: float, vy: float, x: float, angle: float):
     found = allocation(limit=3.0).allocate(np.array([vx, vy]), np.array([x, 0.5 * x]), turned(EAST, angle))

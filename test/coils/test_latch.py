@@ -100,4 +100,5 @@ def test_whatever_is_pressed_in_whatever_order_nothing_passes_without_an_arm_aft
             active = press == "activate" or (active and press != "deactivate")
             allowed = press == "arm" or (allowed and press not in ends)
             assert not (latched and latch.stop_reason == "")
+            assert latch.ready_to_arm == (active and not latched and not allowed)
         assert (latch.stop_reason == "") == (allowed and active and not latched), sequence

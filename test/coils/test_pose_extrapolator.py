@@ -179,6 +179,15 @@ def test_a_tracker_that_says_how_uncertain_it_is_may_be_off_by_three_sigma():
             extrapolator.update(np.array([0.0025, 0.0]), EAST, 1.02, 2, 1.02, 50.02, covariance)
 
 
+def test_an_uncertain_heading_moves_the_tip_by_the_chord_times_its_angle():
+    """An end may jump by 0.9 mm and by 3 sigma of its pose: of 1.5 mm here the heading has 0.6 mm to explain."""
+    sigma = 0.0006 / (3.0 * NEEDLE.chord)
+    for factor, believed in ((1.02, True), (0.98, False)):
+        extrapolator, covariance = doubter(), np.diag([0.0, 0.0, (factor * sigma) ** 2])
+        with nullcontext() if believed else pytest.raises(InvalidInputError, match="jumped"):
+            extrapolator.update(np.array([0.0015, 0.0]), EAST, 1.02, 2, 1.02, 50.02, covariance)
+
+
 def test_poses_are_believed_again_when_five_in_a_row_agree():
     extrapolator = doubter()
     assert show(extrapolator, [[0.004, 0.0]] * 6) == [False] * 4 + [True] * 2

@@ -125,9 +125,7 @@ def test_forecast_equals_stepping_by_hand(attachment: Attachment, friction: floa
         assert forecast.tension[k + 1] == pytest.approx(tension, rel=1e-4, abs=1e-9)
         np.testing.assert_allclose(forecast.needle_force[k + 1], pull, rtol=1e-4, atol=1e-9)
         for name in ("obstacle", "wall", "connectivity", "compression"):
-            # A forecast has the nodes' own distances, as the program's h has; the clearance is of half segments too.
-            of_node = margins[name].minimum if name in ("obstacle", "wall") else margins[name].minimum_clearance
-            near = min(of_node, 1e-3)
+            near = min(margins[name].minimum_clearance, 1e-3)
             assert min(forecast.margins[name][k + 1], 1e-3) == pytest.approx(near, abs=2e-9)
     touched = [bool(margins.in_contact) for _, _, margins, *_ in expected]
     contact = forecast.first_contact
@@ -244,7 +242,15 @@ def test_first_contact_names_shape_and_time():
     assert contact.shape == "post"
     before = forecast.margins["obstacle"][: round(contact.time / STEP)]
     assert before.min() > 2e-6
-    assert forecast.minima["obstacle"].value > -2e-7
+    surface = 0.001 + 0.5 * thread(80).diameter
+    from_centre = forecast.vertices - (-0.004, 0.002)
+    assert np.linalg.norm(from_centre, axis=2).min() - surface > -2e-7
+    share = np.linspace(0.0, 1.0, 401)[
+        :, None, None, None
+    ]  # the clearance is of chords, which dip in between two nodes
+    chords = (1.0 - share) * from_centre[:, :-1] + share * from_centre[:, 1:]
+    deepest = np.linalg.norm(chords, axis=3).min() - surface
+    assert forecast.minima["obstacle"].value == pytest.approx(deepest, abs=1e-9)
     assert forecaster.forecast(start, np.array([0.0, -0.003]), 2.0).first_contact is None
 
 

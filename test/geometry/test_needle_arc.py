@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.needle_arc import needle_axis, needle_chord
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis, needle_chord, needle_points
 
 LENGTH = 0.007
 
@@ -27,3 +30,30 @@ def test_the_chord_leads_from_tail_to_tip(curvature: float):
     points, _ = needle_axis(np.zeros(2), 0.4, LENGTH, curvature, np.array([1.0]))
     chord, turn = needle_chord(LENGTH, curvature)
     np.testing.assert_allclose(chord * turn @ [np.cos(0.4), np.sin(0.4)], points[0], atol=1e-15)
+
+
+@pytest.mark.parametrize("curvature", [0.0, 150.0, -300.0])
+def test_points_of_the_body_reach_from_tail_to_tip_and_move_as_a_rigid_body(curvature: float):
+    spacing, heading = 0.0006, np.array([math.cos(0.4), math.sin(0.4)])
+    points, turning, chord = needle_points(LENGTH, curvature, spacing).turned(heading)
+    expected, _ = needle_axis(np.zeros(2), 0.4, LENGTH, curvature, np.linspace(0.0, 1.0, len(points)))
+    np.testing.assert_allclose(points, expected, atol=1e-15)
+    assert len(points) % 2 == 1
+    assert LENGTH / (len(points) - 1) <= spacing < LENGTH / (len(points) - 3)
+    length, left = np.linalg.norm(points[-1]), np.array([-chord[1], chord[0]])
+    np.testing.assert_allclose(chord, points[-1] / length, atol=1e-12)
+    np.testing.assert_allclose(turning[-1], left, atol=1e-12)  # the tip, at the velocity of the tip
+    np.testing.assert_allclose(turning[0], -left, atol=1e-12)  # the tail goes the other way
+    # Turned by a small angle about the middle of the chord, each point moves by the angle times half of the chord.
+    angle = 1e-7
+    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    middle = 0.5 * points[-1]
+    moved = (points - middle) @ rotation.T + middle - points
+    np.testing.assert_allclose(moved / (0.5 * length * angle), turning, atol=1e-6)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_needle_may_turn_by_a_half_circle_and_no_more(side: float):
+    check_needle("rig", LENGTH, side * math.pi / LENGTH)
+    with pytest.raises(ConfigurationError, match=r"rig\.needle_curvature"):
+        check_needle("rig", LENGTH, side * 1.03 * math.pi / LENGTH)

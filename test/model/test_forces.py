@@ -108,9 +108,9 @@ def test_contact_drag_and_needle_are_in_balance():
 
 
 @pytest.mark.parametrize("attachment", ["pinned", "clamped"])
-@pytest.mark.parametrize("segments", [25, 80])
-def test_the_needle_is_pulled_as_the_simulated_rigs_is(attachment: str, segments: int):
-    """The rig is other code: springs in place of multipliers, twice as many segments."""
+@pytest.mark.parametrize(("segments", "jitter", "bound"), [(25, 0.0, 0.015), (80, 0.0, 0.015), (100, 0.02, 0.03)])
+def test_the_needle_is_pulled_as_the_simulated_rigs_is(attachment: str, segments: int, jitter: float, bound: float):
+    """The rig is other code: springs in place of multipliers, more segments. Jitter is of the heading [rad]."""
     thread = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=segments, attachment=attachment).thread
     properties = ThreadProperties(
         length=thread.length,
@@ -127,9 +127,9 @@ def test_the_needle_is_pulled_as_the_simulated_rigs_is(attachment: str, segments
     rig = RigDynamics(body, properties, Surface(), None, (0.0, 0.0), 0.0, path, largest_step=5e-3)
     predictor = ThreadPredictor(thread)
     predictor.start(pose(0.0, (0.0, 0.0), (1.0, 0.0)), path)
-    here, pulls, expected = np.zeros(2), [], []
+    here, pulls, expected, random = np.zeros(2), [], [], np.random.default_rng(3)
     for k in range(1, 200):
-        heading = 1.2 * math.sin(1.1 * k / RATE)
+        heading = 1.2 * math.sin(1.1 * k / RATE) + jitter * random.standard_normal()
         ahead = np.array([math.cos(heading), math.sin(heading)])
         here = here + 2e-3 / RATE * ahead
         rig.drive(here, heading, 1.0 / RATE)
@@ -138,4 +138,4 @@ def test_the_needle_is_pulled_as_the_simulated_rigs_is(attachment: str, segments
         pulls.append(forces.needle_force)
         expected.append(rig.thread_pull)
     off = np.linalg.norm(np.array(pulls) - expected, axis=1)[10:]
-    assert math.sqrt(float(np.mean(off**2))) < 0.015 * float(np.linalg.norm(expected, axis=1).max())
+    assert math.sqrt(float(np.mean(off**2))) < bound * float(np.linalg.norm(expected, axis=1).max())

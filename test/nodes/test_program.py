@@ -62,3 +62,15 @@ def test_two_interruptions_at_any_time_end_a_node_in_order(name: str, environmen
             process.kill()
         assert process.returncode == 0, output
         assert "Traceback" not in output
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_without_ros_a_node_ends_with_one_line_that_names_it(name: str):
+    without = "import sys; sys.modules['rclpy'] = None; sys.argv[0] = sys.argv[1]; " + (
+        "from magnetosuture_thread.nodes.program import main; sys.exit(main())"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", without, name], capture_output=True, text=True, timeout=TIMEOUT, check=False
+    )
+    assert ended.returncode == 1
+    assert re.fullmatch(r"error: .*rclpy.*; nodes and the live graph need ROS 2 Jazzy: .*\n", ended.stderr)

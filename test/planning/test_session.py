@@ -149,7 +149,7 @@ def test_who_paused_decides_whether_it_goes_on_by_itself():
         run.known.on_margins(now, "", 0, 1.0, SCENE.version)
         assert run.on_pose(now, TAIL, EAST, now) is None
     assert (run.status.state, run.status.resumes) == (ProcedureState.PAUSED, False)
-    run.on_armed(False)
+    run.on_bridge(False, 0.0)
     with pytest.raises(InvalidInputError, match="not armed"):
         run.resume()
     assert run.status.reason == "an operator commands the needle"

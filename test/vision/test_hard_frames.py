@@ -146,7 +146,13 @@ def test_a_thread_that_passes_a_tail_does_not_leave_it():
 
 @pytest.mark.parametrize(
     ("name", "index", "seed"),
-    [("decoy_at_thread", 21, 280001), ("length_off_10", 0, 270001), ("thread_black_6px", 2, 290001)],
+    [
+        ("decoy_at_thread", 21, 280001),
+        ("length_off_10", 0, 270001),
+        ("thread_black_6px", 2, 290001),
+        ("thread_black_6px", 11, 310001),  # a thread wider than the needle leaves its tail sideways
+        ("thread_black_6px", 42, 310001),
+    ],
 )
 def test_needles_that_were_wrong_once_are_not(name: str, index: int, seed: int):
     result = measure(*frame_of(name, index, seed))
@@ -242,6 +248,12 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("decoy_needle", 32, 91001),  # a faint reflection of the lamp leaves the tail
         ("decoy_at_thread", 59, 91001),  # the thread passes beyond the tail, and touches nothing
         ("decoy_at_thread", 9, 91001),  # a walk has one edge only, the thread's
+        ("rod_in_path", 57, 310001),  # a line over a rod leaves one end through its middle
+        ("rod_in_path", 25, 310004),  # a line hides one end of a rod, whose length is set wrong
+        ("rod_in_path", 89, 310004),
+        ("rod_in_path", 8, 310005),  # beyond a line over a rod lies the rest of it
+        ("rod_in_path", 87, 310005),  # a rod is longer than set, by more than what a thread is wide
+        ("rod_in_path", 88, 310005),  # a line passes one end of a rod
     ],
 )
 def test_poses_that_were_reversed_once_are_not(name: str, index: int, seed: int):

@@ -247,17 +247,3 @@ def find_chord_contacts(
         if count < 0:
             return -1
     return count
-
-
-def chord_contacts(points: Points, data: WorkspaceData, segment: float, radius: float) -> ChordContacts:
-    """Return what `find_chord_contacts` writes, as arrays of their own; see there for the arguments."""
-    room, near = 4 * len(points), np.ones(len(points), dtype=np.bool_)
-    while True:
-        integers, numbers = np.zeros((2, room), np.int64), np.zeros((2, room))
-        normal = np.zeros((room, points.shape[1]))
-        to = ChordContacts(integers[0], integers[1], numbers[0], normal, numbers[1])
-        found = find_chord_contacts(points, data, segment, radius, near, 0, to)
-        if found >= 0:
-            kept = slice(found)
-            return ChordContacts(to.node[kept], to.obstacle[kept], to.distance[kept], to.normal[kept], to.place[kept])
-        room *= 2

@@ -126,14 +126,13 @@ def _deepest(
     first: int,
     last: int,
     data: WorkspaceData,
-    rows: ContactRows,
 ) -> float:
     """Return the least signed distance on a way that is inside in part, a lower bound within the tolerance.
 
     The depth of a point is at most its distance from any feature, which is convex, so between two points at most the
     greater of theirs; and it changes by no more than the way. Intervals are halved where this is not enough.
     """
-    table = data.tables[obstacle + 1]
+    table, rows = data.tables[obstacle + 1], ContactRows(np.empty(0), np.empty((0, 3)))
     kind, base = int(table[0]), int(table[6])
     width = FACE_WIDTH if kind == FACES else EDGE_WIDTH
     lows, highs = np.empty(64), np.empty(64)
@@ -168,9 +167,7 @@ def _deepest(
 
 
 @compiled
-def _from_shape(
-    start: Vector, end: Vector, signed: float, obstacle: int, data: WorkspaceData, rows: ContactRows
-) -> float:
+def _from_shape(start: Vector, end: Vector, signed: float, obstacle: int, data: WorkspaceData) -> float:
     """Return the least signed distance on a way from a polygon or mesh; `signed` is that of its start."""
     table = data.tables[obstacle + 1]
     kind, base = int(table[0]), int(table[6])
@@ -187,7 +184,7 @@ def _from_shape(
             best = min(best, _lowest(start, end, k, kind, data.numbers))
     if signed > 0.0 and best > TOLERANCE:
         return best
-    return _deepest(start, end, length, obstacle, first, last, data, rows)
+    return _deepest(start, end, length, obstacle, first, last, data)
 
 
 @compiled
@@ -200,6 +197,33 @@ def _from_ball(start: Vector, end: Vector, centre: NDArray[np.float64], radius: 
 
 
 @compiled
+def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, data: WorkspaceData) -> float:
+    """Return the least signed distance of a node and the half segments beside it from one shape or the wall [m].
+
+    Args:
+        points: nodes, shape (n + 1, d) [m].
+        i: the node.
+        obstacle: index of the shape, `WALL` for the wall.
+        signed: distance of the node from it [m].
+        data: `Workspace.data`.
+    """
+    space, least = points.shape[1] == 3, signed
+    start = (points[i, 0], points[i, 1], points[i, 2] if space else 0.0)
+    for j in (i - 1, i + 1):
+        if not 0 <= j < len(points):
+            continue
+        end = _along(start, (points[j, 0], points[j, 1], points[j, 2] if space else 0.0), 0.5)
+        if obstacle == WALL:
+            found, _, _ = wall_contact(end[0], end[1], data.wall_radius)
+        elif data.tables[obstacle + 1, 0] == BALL:
+            found = _from_ball(start, end, data.frames[obstacle + 1], data.frames[obstacle + 1, 5])
+        else:
+            found = _from_shape(start, end, signed, obstacle, data)
+        least = min(least, found)
+    return least
+
+
+@compiled
 def _write(
     points: Points,
     data: WorkspaceData,
@@ -208,22 +232,8 @@ def _write(
     distance: NDArray[np.float64],
 ) -> None:
     """Lower the distances of nodes to those of the half segments beside them."""
-    space, last = points.shape[1] == 3, len(points) - 1
-    rows = ContactRows(np.empty(0), np.empty((0, points.shape[1])))
     for row in range(len(node)):
-        i, o, signed = node[row], obstacle[row], distance[row]
-        start = (points[i, 0], points[i, 1], points[i, 2] if space else 0.0)
-        for j in (i - 1, i + 1):
-            if not 0 <= j <= last:
-                continue
-            end = _along(start, (points[j, 0], points[j, 1], points[j, 2] if space else 0.0), 0.5)
-            if o == WALL:
-                found, _, _ = wall_contact(end[0], end[1], data.wall_radius)
-            elif data.tables[o + 1, 0] == BALL:
-                found = _from_ball(start, end, data.frames[o + 1], data.frames[o + 1, 5])
-            else:
-                found = _from_shape(start, end, signed, o, data, rows)
-            distance[row] = min(distance[row], found)
+        distance[row] = half_segment_distance(points, node[row], obstacle[row], distance[row], data)
 
 
 def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contacts) -> NDArray[np.float64]:

@@ -32,7 +32,7 @@ from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.estimator.covariance import selected_inverse
 from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.model.formulations.rod_step import STRAIN_TOLERANCE, RodProperties, segment_rows
-from magnetosuture_thread.model.formulations.step import StepBuffers, program_of
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
 from magnetosuture_thread.model.solvers import banded
 
 Vector = NDArray[np.float64]

@@ -17,7 +17,7 @@ from magnetosuture_thread.model.estimator.correction import (
 )
 from magnetosuture_thread.model.estimator.sensitivity import correct_sensitivities
 from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.model.formulations.step import StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.model.solvers.banded import SolverBuffers

@@ -50,7 +50,6 @@ class ThreadEstimate:
         slow_parameters: what is learned of thread and liquid; empty if nothing is asked for.
         compute_rows: of the barriers, at its positions.
         contact_tolerance: a node this close to a shape or the wall touches it [m].
-        compute_chords_in_contact: nodes of the segments that touch a shape between them.
     """
 
     prediction: Prediction
@@ -71,7 +70,6 @@ class ThreadEstimate:
     slow_parameters: tuple[SlowParameter, ...]
     compute_rows: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
     contact_tolerance: float = field(repr=False)
-    compute_chords_in_contact: Callable[[], tuple[int, ...]] = field(repr=False)
 
     @property
     def stamp(self) -> float:
@@ -85,8 +83,7 @@ class ThreadEstimate:
     @cached_property
     def margins(self) -> Margins:
         """The margins of every barrier by its name with their bounds, of its positions; computed at first access."""
-        touching, version = self.compute_chords_in_contact(), self.prediction.scene_version
-        margins = Margins.of(self._rows, self.contact_tolerance, version, touching)
+        margins = Margins.of(self._rows, self.contact_tolerance, self.prediction.scene_version)
         return margins.with_bounds(self.clearance_bounds)
 
     @cached_property

@@ -350,7 +350,6 @@ class ThreadEstimator:
             slow_parameters=self._slow.report(),
             compute_rows=compute_rows,
             contact_tolerance=tolerance,
-            compute_chords_in_contact=lambda: formulation.chords_in_contact(positions, tolerance),
         )
 
     def snapshot(self) -> FilterState | None:

@@ -202,7 +202,6 @@ def _carried_over(state: FilterState, predictor: ThreadPredictor) -> Prediction:
             formulation.margins(positions, heading),
             predictor.contact_tolerance,
             version,
-            formulation.chords_in_contact(positions, predictor.contact_tolerance),
         ),
         compute_forces=lambda: None,
     )

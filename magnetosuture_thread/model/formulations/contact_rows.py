@@ -9,7 +9,7 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.formulations.step import StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.program import SPAN, Vector
 
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import FRICTION, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.formulations.step import GRIPS, NO_SHAPE, StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import GRIPS, NO_SHAPE, StepBuffers
 from magnetosuture_thread.model.program import SPAN, Vector
 
 FRICTION_COMPLIANCE = 1e-7  # as of a segment: far below what can be measured, and exact at once for the solver

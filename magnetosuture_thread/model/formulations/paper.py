@@ -46,11 +46,11 @@ from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE
 from magnetosuture_thread.model.formulations.step import (
     Formulation,
     PrescribedMotion,
-    StepBuffers,
     StepResult,
     ThreadState,
     move_prescribed,
 )
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.mechanics import rest_distances
 from magnetosuture_thread.model.program import Solver, Vector
 from magnetosuture_thread.model.thread import Thread

@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 from magnetosuture_thread.barrier import Barrier, CompiledBarrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.geometry.obstacles.chords import chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity
@@ -56,10 +55,10 @@ from magnetosuture_thread.model.formulations.rod_step import (
 from magnetosuture_thread.model.formulations.step import (
     Formulation,
     PrescribedMotion,
-    StepBuffers,
     StepResult,
     ThreadState,
 )
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
 from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, banded
@@ -215,7 +214,9 @@ class RodFormulation(Formulation):
             accept_step(self._buffers, self._near.data, motion, solution.velocities, own, interval)
             if added is not None:
                 pushes = solution.multipliers[self._rows + contacts :] if self._waits else np.zeros(len(added.lower))
-                self._buffers.contact_force[:] += added.force(pushes, motion.about.shape)
+                forces = added.force(pushes, motion.about.shape)
+                self._buffers.contact_force[:] += forces
+                self._buffers.tail_load[:] += forces[0]
                 added = self.added.linearised(motion.about, motion.start, motion.known, interval)
             worst, solves = worst.or_worse(solution.residuals), solves + 1
             if status == SOLVED:
@@ -223,30 +224,25 @@ class RodFormulation(Formulation):
         end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
-        multipliers = self._buffers.multipliers[: self._rows].copy(), self._buffers.contact_force.copy()
-        grip = self._buffers.grip.copy() if self._rubs else None
+        buffers = self._buffers
+        loads = buffers.internal.copy(), buffers.contact_force.copy(), buffers.tail_load.copy()
+        grip = buffers.grip.copy() if self._rubs else None
         passed = off > 1.0 and self._self_contact is not None and self._self_contact.passed(positions, end.positions)
-        return StepResult(end, solver, status, worst, solves, off <= 1.0, multipliers, grip, passed)
+        return StepResult(end, solver, status, worst, solves, off <= 1.0, loads, grip, passed)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
-        assert result.multipliers is not None
-        rod, state, (lengths, contact) = self._rod, result.state, result.multipliers
+        assert result.loads is not None
+        rod, state, (internal, contact, load) = self._rod, result.state, result.loads
         scale = (rod.drag_across + rod.mass_per_length / state.interval) * rod.unit**2
-        tension, force = np.empty(len(lengths)), np.empty(self.dimension)
+        tension, force = np.empty(len(internal) - 1), np.empty(self.dimension)
         positions, velocities = state.positions / rod.unit, state.velocities
-        moment = write_forces(rod, positions, velocities, heading, lengths, scale, tension, force)
+        moment = write_forces(rod, positions, velocities, heading, internal, load, scale, tension, force)
         friction, use = np.zeros(len(positions)), np.zeros(len(positions))
         if result.grip is not None:
             friction, use = friction_of(result.grip)
             friction *= scale
         return ThreadForces(tension, scale * contact, force, moment, friction, use)
-
-    def chords_in_contact(self, positions: Points, tolerance: float) -> tuple[int, ...]:
-        """Return both nodes of each segment that touches an obstacle between them; see `Formulation`."""
-        chords = chord_contacts(positions, self._near.data, self._thread.segment_length, self._radius)
-        first = chords.node[chords.distance - self._radius <= tolerance]
-        return tuple(np.concatenate([first, first + 1]).tolist())
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
@@ -255,8 +251,9 @@ class RodFormulation(Formulation):
         accept_step(self._buffers, self._near.data, self._motion, velocities, multipliers, 1.0)
         buffers, heading = self._motion, np.eye(self.dimension)[0]
         chain = np.outer(np.arange(self._thread.segments + 1.0), heading)
-        lengths = np.zeros(self._thread.segments)
-        write_forces(self._rod, chain, buffers.velocities, heading, lengths, 1.0, lengths.copy(), heading.copy())
+        internal, tension = np.zeros_like(chain), np.zeros(self._thread.segments)
+        written = np.zeros(self.dimension)
+        write_forces(self._rod, chain, buffers.velocities, heading, internal, written, 1.0, tension, written)
 
     def _use(self, buffers: StepBuffers) -> None:
         """Use buffers for the step, and as much for the structured solver."""

@@ -17,7 +17,8 @@ def write_forces(
     positions: Points,
     velocities: Points,
     heading: Points,
-    multipliers: Vector,
+    internal: Points,
+    tail_load: Vector,
     scale: float,
     tension: Vector,
     force: Vector,
@@ -29,8 +30,9 @@ def write_forces(
         positions: of all nodes at the end of the step, in segment lengths, shape (n + 1, d).
         velocities: of all nodes [m/s].
         heading: unit vector along the needle, shape (d,).
-        multipliers: of the segments' lengths, shape (n,).
-        scale: force of a unit of a multiplier [N].
+        internal: what the segments push each node with, see `keep_internal_forces`, shape (n + 1, d).
+        tail_load: what medium and contacts push node 0 with, shape (d,).
+        scale: force of a unit of these [N].
         tension: written, shape (n,).
         force: written, shape (d,).
 
@@ -38,42 +40,31 @@ def write_forces(
         The moment, counter-clockwise; 0 of a pinned thread, NaN in space, where it is no single number.
     """
     nodes, dimension = positions.shape
-    work, gradient = np.zeros((2, nodes, dimension)), np.zeros((nodes, dimension))
-    mechanics.bending_gradient(positions, heading, rod.clamped, rod.rest_angles, work, gradient)
-    bending = rod.bending_stiffness / rod.unit**2
     tangent, passed = np.zeros(dimension), np.zeros(dimension)
-    load = rod.drag_across - rod.drag_along
+    for a in range(dimension):
+        force[a] = scale * (internal[0, a] + tail_load[a])
     for i in range(nodes - 1):
         chord = 0.0
         for a in range(dimension):
             tangent[a] = positions[i + 1, a] - positions[i, a]
             chord += tangent[a] ** 2
         chord = np.sqrt(chord)
-        tension[i] = scale * multipliers[i] * chord
-        last = i == nodes - 2
-        node = i + 1 if last else i
-        slip = 0.0
+        tension[i] = 0.0
         for a in range(dimension):
             tangent[a] /= chord
-            slip += tangent[a] * (velocities[node, a] - rod.flow[a])
-        if last:  # the end correction takes some of the load on the last segment from the node behind its middle
-            along = -rod.drag_along * slip
-            for a in range(dimension):
-                along += rod.mass_per_length * rod.gravity[a] * tangent[a]
-            tension[i] += mechanics.END_CORRECTION * rod.unit * along
-        if i == 0:
-            slip = 0.0
-            for a in range(dimension):
-                slip += tangent[a] * (velocities[0, a] - rod.flow[a])
-            for a in range(dimension):
-                drag = -rod.drag_across * (velocities[0, a] - rod.flow[a]) + load * slip * tangent[a]
-                weight = rod.mass_per_length * rod.gravity[a]
-                force[a] = tension[0] * tangent[a] - bending * gradient[0, a] + 0.5 * rod.unit * (weight + drag)
-        for a in range(dimension):  # what bending passes on, besides the force that keeps the segment's length
-            passed[a] -= bending * gradient[i, a]
-            tension[i] += passed[a] * tangent[a]
+            passed[a] += internal[i, a]  # what the thread behind pulls at that before
+            tension[i] += scale * passed[a] * tangent[a]
+    # The end correction takes some of the load on the last segment from the node behind its middle.
+    along = 0.0
+    for a in range(dimension):
+        slip = velocities[nodes - 1, a] - rod.flow[a]
+        along += tangent[a] * (rod.mass_per_length * rod.gravity[a] - rod.drag_along * slip)
+    tension[nodes - 2] += mechanics.END_CORRECTION * rod.unit * along
     if not rod.clamped:
         return 0.0
     if dimension != 2:
         return np.nan
-    return float(-2.0 * bending * rod.unit * (work[1, 0, 1] * heading[0] - work[1, 0, 0] * heading[1]))
+    work, gradient = np.zeros((2, nodes, dimension)), np.zeros((nodes, dimension))
+    mechanics.bending_gradient(positions, heading, rod.clamped, rod.rest_angles, work, gradient)
+    bending = rod.bending_stiffness / rod.unit
+    return float(-2.0 * bending * (work[1, 0, 1] * heading[0] - work[1, 0, 0] * heading[1]))

@@ -14,7 +14,9 @@ from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
 from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows, keep_multipliers
 from magnetosuture_thread.model.formulations.friction_rows import friction_rows, keep_grips, knows_friction
-from magnetosuture_thread.model.formulations.step import StepBuffers, move_prescribed, program_of
+from magnetosuture_thread.model.formulations.internal_forces import keep_internal_forces
+from magnetosuture_thread.model.formulations.step import move_prescribed
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
 from magnetosuture_thread.model.program import Vector
 from magnetosuture_thread.model.solvers import banded
 
@@ -150,16 +152,18 @@ def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, 
     stiffness = rate * (interval + rod.bending_damping)
     for i in range(nodes):
         for a in range(dimension):
-            value = rate * linear[i, a]
+            bending = value = rate * linear[i, a]
             for b in range(dimension):
                 value -= trailing * blocks[i, a, b] * last[i, b]
             value -= inertia * rod.weights[i] * (last[i, a] + interval / rod.unit * rod.gravity[a])
             for b in range(dimension):
                 value -= blocks[i, a, b] * rod.flow[b] / rod.unit
             linear[i, a] = value + inertia * rod.weights[i] * rod.flow[a] / rod.unit
+            buffers.drag_linear[i, a] = linear[i, a] - bending
         for a in range(dimension):
             for b in range(dimension):
                 blocks[i, a, b] *= leading
+                buffers.drag[i, a, b] = blocks[i, a, b]
             blocks[i, a, a] += stiffness * rod.bands[0, i]
         for apart in range(1, 4):
             couplings[apart - 1, i] = stiffness * rod.bands[apart, i]
@@ -348,5 +352,7 @@ def accept_step(
     keep_multipliers(buffers, multipliers, len(velocities) - 1)
     if knows_friction(workspace):
         keep_grips(buffers, multipliers, len(velocities) - 1, workspace)
+    moved = motion.start[0] - motion.before[0]
+    keep_internal_forces(buffers, motion.known, moved, velocities, multipliers, interval)
     motion.velocities[:] = velocities
     motion.about[:] = motion.start + interval * velocities  # known nodes have moved, and have no velocity

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,8 @@ from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.model.barriers import ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.formulations.added_rows import AddedBarriers, LinearRows
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
 from magnetosuture_thread.model.program import (
-    SPAN,
-    ChainProgram,
     Residuals,
     Solution,
     Solver,
@@ -30,8 +28,6 @@ from magnetosuture_thread.model.program import (
 )
 from magnetosuture_thread.model.thread import Thread
 
-GRIPS = 3  # shapes at most that a node or a chord has friction with at once
-NO_SHAPE = -2  # in place of a shape
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this have no row in the program
 
 
@@ -106,8 +102,8 @@ class StepResult:
         solves: number of programs solved.
         converged: whether the end satisfies the barriers themselves, not only their last linearisation; of
             `paper` the hard ones, those of the obstacles.
-        multipliers: of the segments, shape (n,), and of contacts as forces on the nodes, shape (n + 1, d), in the
-            program's units; None where these are of no mechanics.
+        loads: what the segments push the nodes with, and what contacts do, shape (n + 1, d), and what medium and
+            contacts do at the needle's tail, shape (d,), in the program's units; None where these are of no mechanics.
         grip: of friction, as in `StepBuffers`; None where no shape has any.
         passed: whether the thread has passed through itself where it may not; then the step must not be taken.
     """
@@ -118,132 +114,12 @@ class StepResult:
     residuals: Residuals
     solves: int
     converged: bool
-    multipliers: tuple[Vector, Points] | None = field(default=None, compare=False)
+    loads: tuple[Points, Points, Vector] | None = field(default=None, compare=False)
     grip: NDArray[np.float64] | None = field(default=None, compare=False)
     passed: bool = False
 
 
 WarmStart = tuple[Vector, Vector, NDArray[np.int64], NDArray[np.float64]]
-
-
-class StepBuffers(NamedTuple):
-    """StepBuffers for a step's program and its contacts, kept from step to step so that no step pays for it.
-
-    Attributes:
-        blocks: see `ChainProgram`, as are the following; n + 1 nodes.
-        couplings: shape (3, n + 1).
-        linear: shape (n + 1, d).
-        first: rows: those of the formulation, then those of the contacts, shape (r,).
-        gradient: shape (r, 3, d).
-        lower: shape (r,).
-        upper: shape (r,).
-        compliance: shape (r,).
-        limit: shape (r,).
-        value: h of each row, shape (r,).
-        multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
-        chords: length of each segment, shape (n,).
-        work: shape (2, n + 1, d).
-        node: contacts: as `find_contacts` writes them, shape (c,).
-        obstacle: shape (c,).
-        distance: shape (c,).
-        normal: shape (c, d).
-        nearest: shape (c,).
-        place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
-        push: what contacts last pushed each node and each segment with, shape (2, n + 1).
-        contact_force: the same as vectors, with friction, of all contacts of a node, shape (n + 1, d).
-        grip_shape: the shapes with friction that last pushed each node, and each chord between its nodes, `NO_SHAPE`
-            for none, shape (2, n + 1, GRIPS).
-        grip: of these, the force (2), the multiplier of friction, its limit, and the place on the chord, shape
-            (2, n + 1, GRIPS, 5).
-    """
-
-    blocks: NDArray[np.float64]
-    couplings: NDArray[np.float64]
-    linear: NDArray[np.float64]
-    first: NDArray[np.int64]
-    gradient: NDArray[np.float64]
-    lower: Vector
-    upper: Vector
-    compliance: Vector
-    limit: Vector
-    value: Vector
-    multipliers: Vector
-    chords: Vector
-    work: NDArray[np.float64]
-    node: NDArray[np.int64]
-    obstacle: NDArray[np.int64]
-    distance: Vector
-    normal: Points
-    nearest: NDArray[np.bool_]
-    place: Vector
-    push: NDArray[np.float64]
-    contact_force: Points
-    grip_shape: NDArray[np.int64]
-    grip: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> StepBuffers:
-        """Return buffers for a number of rows, and of contacts besides."""
-        total = rows + contacts
-        return cls(
-            np.zeros((nodes, dimension, dimension)),
-            np.zeros((SPAN, nodes)),
-            np.zeros((nodes, dimension)),
-            np.zeros(total, dtype=np.int64),
-            np.zeros((total, SPAN, dimension)),
-            np.zeros(total),
-            np.zeros(total),
-            np.zeros(total),
-            np.full(total, np.inf),
-            np.zeros(total),
-            np.zeros(total),
-            np.zeros(nodes - 1),
-            np.zeros((2, nodes, dimension)),
-            np.zeros(contacts, dtype=np.int64),
-            np.zeros(contacts, dtype=np.int64),
-            np.zeros(contacts),
-            np.zeros((contacts, dimension)),
-            np.zeros(contacts, dtype=np.bool_),
-            np.zeros(contacts),
-            np.zeros((2, nodes)),
-            np.zeros((nodes, dimension)),
-            np.full((2, nodes, GRIPS), NO_SHAPE),
-            np.zeros((2, nodes, GRIPS, 5)),
-        )
-
-    def enlarged(self) -> StepBuffers:
-        """Return buffers for twice as many contacts, with the same chords and multipliers."""
-        nodes, dimension = self.linear.shape
-        rows = len(self.first) - len(self.node)
-        larger = StepBuffers.of(nodes, dimension, rows, 2 * len(self.node))
-        larger.multipliers[:rows] = self.multipliers[:rows]
-        larger.chords[:] = self.chords
-        larger.push[:] = self.push
-        larger.grip_shape[:], larger.grip[:] = self.grip_shape, self.grip
-        return larger
-
-    def forget(self) -> None:
-        """Forget the last solve: the next step starts without tension and contacts."""
-        self.multipliers[:] = 0.0
-        self.push[:] = 0.0
-        self.grip_shape[:], self.grip[:] = NO_SHAPE, 0.0
-
-
-@compiled
-def program_of(buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> ChainProgram:
-    """Return the program of the first rows."""
-    return ChainProgram(
-        buffers.blocks,
-        buffers.couplings,
-        buffers.linear,
-        known,
-        buffers.first[:rows],
-        buffers.gradient[:rows],
-        buffers.lower[:rows],
-        buffers.upper[:rows],
-        buffers.compliance[:rows],
-        buffers.limit[:rows],
-    )
 
 
 @compiled
@@ -365,15 +241,6 @@ class Formulation(ABC):
     @abstractmethod
     def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
         """Return the built-in barriers of the thread itself, obstacles and wall aside, at these positions."""
-
-    def chords_in_contact(self, positions: Points, tolerance: float) -> tuple[int, ...]:
-        """Return both nodes of each segment that touches an obstacle between them, where contact is enforced there.
-
-        Args:
-            positions: of all nodes, shape (n + 1, d) [m].
-            tolerance: what is closer than this touches [m].
-        """
-        return ()
 
     def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
         """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""

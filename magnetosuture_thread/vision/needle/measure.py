@@ -10,12 +10,13 @@ import numpy as np
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.axis_guesses import axis_guesses
 from magnetosuture_thread.vision.needle.comparison import bluntness, excess, fading, steel_rows
+from magnetosuture_thread.vision.needle.ends import ends_beyond, leaves_sideways, leaves_tail, thread_offsets
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.needle.tail_edge import tail_shift
 from magnetosuture_thread.vision.needle.template import BLOOM_PX, FIRST_ROUNDS, THIN, TemplateFit, fit_template
-from magnetosuture_thread.vision.sampling import middle, straighten
+from magnetosuture_thread.vision.sampling import straighten
 
 FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this
 LEVELS = (0.5, 0.7)  # share of steel that is dark: more of a thread over the needle is, less of one beside it
@@ -33,7 +34,6 @@ MAX_MISSING_TIP, TIP = 0.2, 0.2  # of the steel of this last part of the length
 SURE, SURE_ROWS = 0.75, 0.97  # share of steel that some place of a row has, and of the rows that have one
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
 MAX_BOTH = 0.2  # of it beyond both ends, which a thread leaves or passes at one only
-LONGER = 0.2  # of the length beyond a tail, before whose end what is as wide as the body is more of the needle
 SHARP = 0.2  # bluntness of both sides of a tip if the thread is so thick
 AXIS_POINTS, MAX_HIDDEN = 100, 0.02  # along the axis, and the share of them that wall and shapes may hide
 MAX_BESIDE = 0.1  # of the rows with something as dark as steel off the body's side
@@ -50,7 +50,6 @@ LENGTH_GAIN = 0.1  # px; times the width, that the fit of another length must co
 FADES_PX = 0.7  # over which a tail may fade more than the sides do
 PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
 PASSES, PASSES_PX = 0.3, 0.3  # of the width, and more, off an end's middle: a thread passes, and does not leave
-VISIBLE_PX = 0.25  # of a thread's width beyond an end, by which it is seen there
 ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
 TOWARD = 0.8  # cosine between a needle and where it must point
 
@@ -129,7 +128,7 @@ def _checked(
         return "hidden"
     if abs(best.arc.curvature) * best.length > 1.25 * math.pi:
         return "bent beyond a half circle"
-    around = _excess(steel, best, width)
+    around = _excess(steel.surely, best, width)
     if max(around[4], around[5]) > MAX_BESIDE:
         return "something dark against it"
     is_known = True
@@ -140,7 +139,7 @@ def _checked(
         if rod.cost > HOPELESS * pointed.cost:  # and so was given up
             tolerance = size.tolerance if is_measured else 0.0
             rod = fit_template(steel, rod.arc, size.length_px, width, tolerance=tolerance, start=rod.length, rod=True)
-        settled = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
+        settled = _settled(steel, rod if is_rod else pointed, rod, size, toward, is_rod=is_rod)
         if settled is None:
             return ALIKE
         fit, is_known = settled
@@ -152,7 +151,7 @@ def _checked(
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     covariance = fit.covariance()
     confidence *= max(0.2, 1.0 - 2.0 * float(covariance[1, 1]))
-    pull = PULL_PX * max(0.0, float(_excess(steel, fit, width)[3]))
+    pull = PULL_PX * max(0.0, float(_excess(steel.surely, fit, width)[3]))
     if not is_measured:
         pull = math.hypot(pull, length_error * size.length_px)
     lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
@@ -225,16 +224,15 @@ def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]
 def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """Say whether both ends of a needle are seen where its length says, so that the length is measured.
 
-    Beyond an end that something as wide and dark goes on from, or the lamp is reflected at, the needle may go on.
+    Something as wide and dark that goes on from an end, or leaves the tail sideways, and the lamp's reflection hide it.
     """
     if abs(fit.length - size.length_px) > MAX_OFF * size.tolerance * size.length_px:
         return False
-    beyond = np.empty(6)
-    state = _state(fit.arc, fit.width)
-    excess(steel.perhaps, state, fit.length, 0.5 * size.width_px, beyond)
-    if beyond[2:4].max() > GOES_ON or fading(steel.surely, state, fit.length, fit.width) > FADES_PX:
+    beyond, state = _excess(steel.perhaps, fit, size.width_px)[2:4], _state(fit.arc, fit.width)
+    if beyond.max() > GOES_ON or fading(steel.surely, state, fit.length, fit.width) > FADES_PX:
         return False
-    return not steel.is_glaring(fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX])))
+    ends = fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX]))
+    return not leaves_sideways(steel, fit) and not steel.is_glaring(ends)
 
 
 def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> TemplateFit | None:
@@ -287,7 +285,7 @@ def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit, width: floa
 
 def _what_prolongs(steel: SteelMap, fit: TemplateFit, width: float, is_known: bool) -> str:
     """Say at which end something goes on that is too wide for a thread; empty if nothing does."""
-    beyond_tip, beyond_tail = _excess(steel, fit, width)[2:4]
+    beyond_tip, beyond_tail = _excess(steel.surely, fit, width)[2:4]
     if min(beyond_tip, beyond_tail) > MAX_BOTH:
         return "something at both ends"
     if beyond_tip > MAX_BEYOND:
@@ -295,20 +293,9 @@ def _what_prolongs(steel: SteelMap, fit: TemplateFit, width: float, is_known: bo
     if beyond_tail > MAX_BEYOND:
         blunt = np.empty((2, 2))
         bluntness(steel.surely, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, blunt)
-        if not is_known or blunt[1].max() > SHARP or _ends_beyond(steel, fit):
+        if not is_known or blunt[1].max() > SHARP or ends_beyond(steel, fit):
             return "something at its tail"
     return ""
-
-
-def _ends_beyond(steel: SteelMap, fit: TemplateFit) -> bool:
-    """Say whether what goes on beyond a tail, as wide as the body, ends soon: more of a needle, and no thick thread."""
-    beyond = -np.arange(1.0, LONGER * fit.length)
-    aside = np.arange(-1.5 * fit.width, 1.5 * fit.width + 0.1, 0.5)
-    dark = np.empty((len(beyond), len(aside)))
-    axis = float(fit.arc.start[0]), float(fit.arc.start[1]), fit.arc.angle, fit.arc.curvature
-    straighten(steel.surely, axis, beyond, aside, dark)
-    light = np.flatnonzero(dark[:-2, len(aside) // 2] < 0.5)  # A thick thread that bends away is dark beside it.
-    return len(light) > 0 and bool(0.5 * (dark[light[0] + 2] > 0.5).sum() < 0.5 * fit.width)
 
 
 def _state(arc: Arc, width: float) -> np.ndarray:
@@ -316,21 +303,21 @@ def _state(arc: Arc, width: float) -> np.ndarray:
     return np.array([arc.start[0], arc.start[1], arc.angle, arc.curvature, 0.5 * width + BLOOM_PX])
 
 
-def _excess(steel: SteelMap, fit: TemplateFit, width: float) -> np.ndarray:
+def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> np.ndarray:
     """Return what is dark around a drawn needle; see `excess`."""
     result = np.empty(6)
-    excess(steel.surely, _state(fit.arc, fit.width), fit.length, 0.5 * width, result)
+    excess(dark, _state(fit.arc, fit.width), fit.length, 0.5 * width, result)
     return result
 
 
 def _settled(
-    steel: SteelMap, fit: TemplateFit, rod: TemplateFit, toward: np.ndarray | None, *, is_rod: bool
+    steel: SteelMap, fit: TemplateFit, rod: TemplateFit, size: NeedleSize, toward: np.ndarray | None, *, is_rod: bool
 ) -> tuple[TemplateFit, bool] | None:
     """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
 
-    A thread leaves a rod's tail through its middle. A thread that passes beside one end of a pointed needle hides the
-    shape of that end; the other is the tail if it is blunt and no thread goes on there. Where no thread is seen at
-    either end of what is no rod, None: the length may be another's.
+    A thread leaves a rod's tail through its middle, and does not lie over the rod there. One that passes beside one end
+    of a pointed needle hides the shape of that end; the other is the tail if it is blunt and no thread goes on there.
+    Where no thread is seen at either end of what is no rod, None: the length may be another's.
     """
     offsets = thread_offsets(steel, rod)
     if not is_rod and offsets == (None, None):
@@ -338,10 +325,11 @@ def _settled(
     blunt = np.empty((2, 2))
     bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
     bound = PASSES * rod.width + PASSES_PX
-    is_pointed = _is_pointed(steel, fit, rod)
+    is_pointed = _is_pointed(steel, fit, rod, size)
     for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
         here, there = offsets[end], offsets[1 - end]
         leaves = is_rod and there is None and here is not None and here < bound
+        leaves = leaves and leaves_tail(steel, replace(rod, arc=tail_first))
         passes = is_pointed and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
         if leaves or passes:
             return _pointing(fit, tail_first.direction(0.5 * rod.length)), True
@@ -350,40 +338,20 @@ def _settled(
     return fit, False
 
 
-def _is_pointed(steel: SteelMap, fit: TemplateFit, rod: TemplateFit) -> bool:
-    """Say whether a needle is no rod that something beside or over it makes look pointed, however pale that is."""
+def _is_pointed(steel: SteelMap, fit: TemplateFit, rod: TemplateFit, size: NeedleSize) -> bool:
+    """Say whether a needle is no rod that something beside or over it makes look pointed, however pale that is.
+
+    Of the set length, which may be wrong, a rod could look like a worse fit than a needle that tapers.
+    """
     if rod.cost <= CLEARLY * fit.cost:
         return False
-    shown = replace(steel, perhaps=steel.below)
-    pointed = fit_template(shown, fit.arc, fit.length, fit.width, rounds=FIRST_ROUNDS)
-    blunt = fit_template(shown, rod.arc, rod.length, rod.width, rod=True, rounds=FIRST_ROUNDS)
-    return blunt.cost > CLEARLY * pointed.cost
+    one, other, blunt = _fits(replace(steel, perhaps=steel.below), rod, size, size.tolerance)
+    return blunt.cost > CLEARLY * min(one.cost, other.cost)
 
 
 def _pointing(fit: TemplateFit, toward: np.ndarray) -> TemplateFit:
     """Return a fit, the other way round unless its middle points in a direction."""
     return fit if fit.arc.direction(0.5 * fit.length) @ toward > 0.0 else replace(fit, arc=fit.reversed())
-
-
-def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:
-    """Return how far off the middle of the beginning and the end of an axis a thread goes on there; None: none does.
-
-    A thread that leaves an end goes through its middle. One that lies over or under the needle passes beside it.
-    """
-    beyond = -np.arange(1.5, 6.0, 0.5)
-    aside = np.arange(-0.5 * fit.width - 3.0, 0.5 * fit.width + 3.1, 0.5)
-    dark = np.empty((len(beyond), len(aside)))
-    result: list[float | None] = []
-    for arc in (fit.arc, fit.reversed()):
-        axis = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
-        straighten(steel.perhaps, axis, beyond, aside, dark)
-        widths = 0.5 * dark.sum(axis=1)
-        if middle(widths) < VISIBLE_PX:
-            result.append(None)
-            continue
-        centres = (dark @ aside) / np.maximum(dark.sum(axis=1), 1e-6)
-        result.append(abs(float(np.polyfit(beyond, centres, 1, w=np.minimum(widths, 1.0))[1])))
-    return result[0], result[1]
 
 
 def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
@@ -393,7 +361,7 @@ def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
     bluntness(steel.surely, state, fit.length, 0.5 * fit.width, blunt)
     if blunt.min() < ROD:
         return False
-    around = _excess(steel, fit, fit.width)
+    around = _excess(steel.surely, fit, fit.width)
     rows = np.empty((int(fit.length), 3))
     steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, 1.0, rows)
     ends = max(rows[:TAIL_ROWS, 0].mean(), rows[-TAIL_ROWS:, 0].mean())

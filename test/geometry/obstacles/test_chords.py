@@ -136,9 +136,9 @@ def test_a_thread_drawn_around_corners_is_nowhere_deeper_than_its_nodes(polygon:
         tail = np.array([0.012, 0.008]) + 0.018 * np.array([math.cos(angle), -math.sin(angle)])
         done = formulation.step(state, lead(start + min(1.0, k / 40) * (tail - start)), DT)
         assert done.converged
-        assert done.multipliers is not None
+        assert done.loads is not None
         state = done.state
-        pressed = max(pressed, float(np.linalg.norm(done.multipliers[1], axis=1).max()))
+        pressed = max(pressed, float(np.linalg.norm(done.loads[1], axis=1).max()))
         if k % 10 == 0:
             worst = max(worst, deepest(polygon, state.positions, 0.5 * thread.diameter))
     assert pressed > 1.0

@@ -17,7 +17,7 @@ from magnetosuture_thread.model.estimator.correction import (
 )
 from magnetosuture_thread.model.estimator.covariance import propagate, selected_inverse
 from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.model.formulations.step import StepBuffers, program_of
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
 from magnetosuture_thread.model.program import as_quadratic_program
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.model.solvers.banded import assemble_matrix, factorise

@@ -13,7 +13,7 @@ from magnetosuture_thread.model.estimator.correction import MeasuredPoints, norm
 from magnetosuture_thread.model.estimator.corrector import Corrector
 from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_95
 from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.model.formulations.step import StepBuffers, program_of
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.program import as_quadratic_program
 from magnetosuture_thread.model.thread import Thread

@@ -18,7 +18,7 @@ from magnetosuture_thread.model.formulations import (
     ThreadState,
 )
 from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, StepInput, init_step
-from magnetosuture_thread.model.formulations.step import StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, WideRows
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.model.thread import Attachment, Thread
