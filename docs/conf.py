@@ -21,7 +21,7 @@ def mathjax_script() -> str:
 
 project = "magnetosuture_thread"
 release = version = magnetosuture_thread.__version__
-author = "the authors of magnetosuture_thread"
+author = "magnetosuture_thread maintainers"
 copyright = author
 
 extensions = [

@@ -9,7 +9,7 @@ MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of
 
 def missing_module(error: ModuleNotFoundError) -> str:
     """Return what to do about a module that is not there; those of ROS do not come with the package alone."""
-    return f"{error}; nodes and the live graph need ROS 2 Jazzy: see docs/installation.md, or pip install '.[ros]'"
+    return f"{error}; nodes and the live graph need ROS 2 Jazzy: docs/how_to/installation.md, or pip install '.[ros]'"
 
 
 class MagnetosutureError(Exception):

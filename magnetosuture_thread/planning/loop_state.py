@@ -88,7 +88,7 @@ class LoopState:
         self._accepted = set(self._disturbances)
 
     def on_bridge(self, drift: float) -> None:
-        """Register the velocity across the needle's chord that the coil bridge compensates [m/s]; 0 if it is no number."""
+        """Register the velocity across the needle's chord that the bridge compensates [m/s]; 0 if it is no number."""
         self._drift = drift if math.isfinite(drift) else 0.0
 
     def on_margins(self, now: float, reason: str, friction_nodes: int, slowdown: float, scene_version: str) -> None:
