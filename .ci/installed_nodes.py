@@ -24,7 +24,7 @@ NODES = {  # by program, what it says it is
     "needle_planner": "needle_planner",
     "console": "console",
 }
-TIMEOUT = 90.0  # s; the first start compiles kernels
+TIMEOUT = 300.0  # s; the first start in an environment compiles kernels, here beside other processes
 
 LISTEN = """
 import sys, time, rclpy

@@ -135,12 +135,10 @@ def format_key(key: str) -> str:
 
 
 def check_list_value(name: str, value: Any, source: str) -> None:
-    """Refuse a list that is not valid in ROS.
+    """Refuse a list that is not valid in ROS; an empty one is, and is what a dump of parameters holds.
 
     Raises:
-        ConfigurationError: its entries are of several kinds, or there are none.
+        ConfigurationError: its entries are of several kinds.
     """
     if isinstance(value, list) and len({type(entry) for entry in value}) > 1:
         raise ConfigurationError(name, value, "entries of one kind: 0.0, not 0", source)
-    if value == []:
-        raise ConfigurationError(name, value, "entries, or no such line for none", source)

@@ -101,7 +101,6 @@ def test_mapping_goes_there_and_back():
         ("oven: {ros__parameters: {temperature: 1" + 400 * "0" + "}}", "expected a number from 273 to 800 K"),
         ("oven: {ros__parameters: {shelves: 1, shelves: 2}}", "shelves is given twice"),
         ("oven: {ros__parameters: {corners: [0.0, 1]}}", "entries of one kind"),
-        ("oven: {ros__parameters: {corners: []}}", "no such line for none"),
     ],
 )
 def test_a_broken_setup_file_is_refused_and_named(tmp_path: Path, text: str, words: str):
@@ -118,6 +117,15 @@ def test_a_setup_file_is_read_as_ros_reads_it(tmp_path: Path):
     path = tmp_path / "oven.yaml"
     path.write_text("oven: {ros__parameters: {temperature: 4e2, use_sim_time: true, qos_overrides: {a: 1}}}")
     assert load_setup(path, [Oven])["oven"].temperature == 400.0
+
+
+def test_an_empty_list_in_a_setup_file_is_one(tmp_path: Path):
+    path = tmp_path / "oven.yaml"
+    path.write_text("oven: {ros__parameters: {corners: []}}")
+    assert load_setup(path, [Oven])["oven"].corners == ()
+    path.write_text("oven: {ros__parameters: {temperature: []}}")
+    with pytest.raises(ConfigurationError, match="expected a number"):
+        load_setup(path, [Oven])
 
 
 def test_an_unreadable_setup_file_is_refused(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -118,7 +119,10 @@ class Changeable(Generic[C]):
             raise MagnetosutureError(result.reason)
 
     def _as_declared(self, parameters: Sequence[Parameter]) -> list[Parameter]:
-        """Take whole numbers for real ones and any empty list for an empty one of its kind, as `declare` does."""
+        """Take whole numbers for real ones and any empty list for an empty one of its kind, as `declare` does.
+
+        `ros2 param load` sends an empty list as one of truth values, and 1e-05, a text for YAML 1.1, as a text.
+        """
         return [self._converted(parameter) for parameter in parameters]
 
     def _converted(self, parameter: Parameter) -> Parameter:
@@ -129,6 +133,9 @@ class Changeable(Generic[C]):
             return Parameter(parameter.name, _type(about), [])
         if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE, Parameter.Type.INTEGER):
             return Parameter(parameter.name, _type(about), float(value))
+        if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE, Parameter.Type.STRING):
+            with suppress(ValueError):  # no number: refused by its type
+                return Parameter(parameter.name, _type(about), float(value))
         if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.INTEGER_ARRAY):
             return Parameter(parameter.name, _type(about), [float(entry) for entry in value])
         return parameter

@@ -133,7 +133,6 @@ def test_the_nodes_own_arguments_come_before_those_of_the_process(followed, tmp_
         ("[1, 2", (), "expected valid YAML"),
         ("/**: {ros__parameters: {speed: 0.1, speed: 0.2}}", (), "speed is given twice"),
         ("/**: {speed: 0.1}", (), "one key, ros__parameters"),
-        ("/**/path_follower: {ros__parameters: {waypoints: []}}", (), "waypoints: got [], expected entries"),
     ],
 )
 def test_a_file_of_which_nothing_applies_or_that_is_none_is_refused(
