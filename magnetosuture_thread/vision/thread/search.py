@@ -252,8 +252,7 @@ class ThreadSearch:
     def _beginning(self, difference: np.ndarray) -> np.ndarray:
         """Return the difference in colour right behind the tail."""
         behind = (self._needle.tail_px - self._origin - 0.5 * (COARSE - 1)) / COARSE - self._needle.direction_px
-        rows, columns = difference.shape[:2]
-        u, v = np.clip(np.round(behind).astype(int), 0, (columns - 1, rows - 1))
+        u, v = np.clip(np.round(behind).astype(int), 0, np.array(difference.shape[1::-1]) - 1)
         return np.asarray(difference[v, u])
 
     @staticmethod
