@@ -20,6 +20,7 @@ from magnetosuture_thread.vision.thread.search import (
     ThreadSearch,
     Walk,
     is_strong,
+    only_tail,
 )
 
 WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
@@ -133,6 +134,10 @@ def walk_from(
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
             centred = search.centred(wide)[0]
             best = centred if centred.shown > SURE_SHARE * wide.shown else wide  # a rope's edges are too far apart
+        elif (
+            best is dark and dark.shown > SURE_SHARE * enough
+        ):  # Its middle is not visible; a short one may be covered.
+            best = only_tail(dark)
     if doubted:
         own = search.without_passing_line(best)
         # A faint line that passes, as the border of tissue, does not speak against a thread that is dark beyond doubt.

@@ -91,10 +91,10 @@ def resolve_crossings(
         entry = arm_of(arms, path[first : low + 1], leaving=False)
         if len(arms) < 3 or entry < 0:
             continue
-        # Bending energies mean little beyond small turns, where an arm is missing, and for a rope, merged with another
-        # over most of its arm's length. The walk knows the inside better: it isn't overruled, only doubted.
+        # Bending energies mean little beyond small turns and where an arm is missing. The walk knows the inside better:
+        # it isn't overruled, only doubted.
         turn = (path[high - 1, 5] - path[low - 1, 5]) * float(np.mean([abs(arm.curvature) for arm in arms]))
-        overrules = turn < MAX_TURN and len(arms) % 2 == 0 and ridge.stiffness <= 1.0
+        overrules = turn < MAX_TURN and len(arms) % 2 == 0
         arms, entry = without_walked(arms, entry, path[:first, :2])
         taken = arm_of(arms, path[high - 1 : beyond], leaving=True)
         chances = continuations(ridge, dish, (float(path[low, 5]), max_length), arms, entry)

@@ -89,6 +89,11 @@ def is_strong(dark: Walk, enough: float) -> bool:
     return dark.strength > FAINT and dark.shown > STRONG_SHARE * enough
 
 
+def only_tail(walk: Walk) -> Walk:
+    """Return a walk's first vertex alone: no thread."""
+    return replace(walk, points=walk.points[:1], path=walk.path[:1], strong=walk.strong[:1], shown=0.0)
+
+
 class ThreadSearch:
     """Walks along one frame's ridges, each from the needle's tail on.
 
@@ -200,10 +205,9 @@ class ThreadSearch:
 
         Among pixels as large as those that a wide thread is followed in, needle and thread run into each other.
         """
-        ridge = walk.ridge
-        if ridge.scale == COARSE or not joins_passing_line(walk.points, ridge, self._origin, walk.half_width):
+        if walk.ridge.scale == COARSE or not joins_passing_line(walk.points, walk.ridge, self._origin, walk.half_width):
             return walk
-        return replace(walk, points=walk.points[:1], path=walk.path[:1], strong=walk.strong[:1], shown=0.0, passes=True)
+        return replace(only_tail(walk), passes=True)
 
     @cached_property
     def _coarse(self) -> np.ndarray:
@@ -243,21 +247,21 @@ class ThreadSearch:
             return walk
         at = ((walk.points[2:BEGINNING] - self._origin - 0.5 * (COARSE - 1)) / COARSE).astype(np.float32)
         begun = cv2.remap(difference, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR).reshape(len(at), -1)
-        return self._along(self._same_colour(difference, np.median(begun, axis=0)))
+        return self._along(self._same_colour(difference, np.median(begun, axis=0), bounded=True))
 
     def _beginning(self, difference: np.ndarray) -> np.ndarray:
         """Return the difference in colour right behind the tail."""
         behind = (self._needle.tail_px - self._origin - 0.5 * (COARSE - 1)) / COARSE - self._needle.direction_px
-        rows, columns = difference.shape[:2]
-        u, v = np.clip(np.round(behind).astype(int), 0, (columns - 1, rows - 1))
+        u, v = np.clip(np.round(behind).astype(int), 0, np.array(difference.shape[1::-1]) - 1)
         return np.asarray(difference[v, u])
 
     @staticmethod
-    def _same_colour(difference: np.ndarray, colour: np.ndarray) -> np.ndarray:
-        """Return how much of a colour each pixel has, less what it has of others."""
-        colour = colour / max(1e-6, float(np.linalg.norm(colour)))
-        same = difference @ colour
-        return np.asarray(same - OTHER_COLOUR * np.linalg.norm(difference - same[..., None] * colour, axis=2))
+    def _same_colour(difference: np.ndarray, colour: np.ndarray, *, bounded: bool = False) -> np.ndarray:
+        """Return how much of a colour each pixel has, less what it has of others; bounded, more of it is another."""
+        greatest = max(1e-6, float(np.linalg.norm(colour)))
+        way = colour / greatest
+        same = np.minimum(difference @ way, greatest if bounded else math.inf)
+        return np.asarray(same - OTHER_COLOUR * np.linalg.norm(difference - same[..., None] * way, axis=2))
 
     def _along(self, contrast: np.ndarray) -> Walk:
         """Return the walk along a contrast in the image that is shrunk by `COARSE`."""
@@ -267,8 +271,7 @@ class ThreadSearch:
         noise = DEVIATION * middle(np.abs(contrast[::3, ::3]))
         gain = COARSE_LEVELS / max(strongest, FAINTEST)
         strength = np.clip(ZERO + gain * contrast, 0.0, 255.0).astype(np.uint8)
-        window = strength
-        hidden, factor = shrunk_hidden(self._covered, self._picture.factor, window, COARSE)
+        hidden, factor = shrunk_hidden(self._covered, self._picture.factor, strength, COARSE)
         faintest = max(WIDE_FAINTEST * COARSE_LEVELS, gain * FAINT_DEVIATIONS * noise)
         ridge = Ridge(strength, hidden, factor, COARSE, ZERO, faintest, faintest, signed=True, stiffness=WIDE_STIFFNESS)
         ridge.strength[(hidden > 0) & (ridge.strength > ZERO)] = ZERO

@@ -19,7 +19,7 @@ AHEAD = 9  # steps looked ahead
 NEAR_POINTS = 5  # of these that count in full; the others by FAR
 FAR_WEIGHT = 0.6
 BENDS = 31  # curvatures tried at each step ...
-SHARPEST = 0.21  # ... up to this [1/px], closer around the present one's
+SHARPEST = 0.21  # ... up to this over the root of the stiffness [1/px], closer around the present one's
 BEND_COST = 1.1  # of the usual strength, for a change of curvature by 1 / px, along the way looked ahead
 NOISE_COST = 2.0  # so much higher is that price where the thread is as faint as noise
 SMOOTHING = 0.05  # weight of the newest strength in the usual one
@@ -74,9 +74,10 @@ def best_arcs(ridge, hidden, factor, noise, faintest, usual, stiffness, state, b
     """
     bend = state[3]
     bend_cost = stiffness * BEND_COST * (1.0 + NOISE_COST * (faintest / usual) ** 2)
+    sharpest = SHARPEST / math.sqrt(stiffness)
     for index in range(BENDS):
         part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
-        bends[index] = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
+        bends[index] = min(sharpest, max(-sharpest, bend + 1.6 * sharpest * part * abs(part)))
     arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, scores)
     first = scores.argmax()
     second, score = first, -1.0
