@@ -20,6 +20,9 @@ Vector = NDArray[np.float64]
 DRIVE_WEIGHT = 1.0
 TURN_WEIGHT = 1.0
 ALIGN_WEIGHT = 0.1
+# Where a pull across the needle is compensated. The aligning field's own gradient pulls across the needle too: at
+# headings close to a coil's axis both cannot be had, and a needle that drifts cannot be steered.
+COMPENSATED_ALIGN_WEIGHT = 0.01
 DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
@@ -183,6 +186,7 @@ class CoilAllocation:
         sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n)))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
         effort = np.full(len(self.names), CURRENT_WEIGHT / self._max_current)
+        align_weight = ALIGN_WEIGHT if disturbance is None else COMPENSATED_ALIGN_WEIGHT
         if disturbance is not None:
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
             # the needle takes large currents whose fields cancel each other, and their errors do not.
@@ -192,7 +196,7 @@ class CoilAllocation:
             [
                 DRIVE_WEIGHT / reference_speed * along,
                 TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drifting),
-                ALIGN_WEIGHT / self._field * (e @ mean),
+                align_weight / self._field * (e @ mean),
                 DRIFT_WEIGHT / reference_speed * drifting,
                 np.diag(effort),
             ]
@@ -200,7 +204,7 @@ class CoilAllocation:
         target = np.zeros(len(system))
         target[0] = DRIVE_WEIGHT / reference_speed * float(velocity @ e)
         target[1] = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * sideways
-        target[2] = ALIGN_WEIGHT
+        target[2] = align_weight
         if disturbance is not None:
             target[3] = DRIFT_WEIGHT / reference_speed * -disturbance.drift
         limit = np.full(len(self.names), self._max_current)

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
+from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.setups import read_setup
 
 NEEDLE = CoilBridgeSettings().needle()
 COILS = LoopCoils(coils_around((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3))
@@ -116,3 +118,21 @@ def test_a_curved_needle_is_driven_along_its_chord():
     bent = allocation(needle=curved).allocate(0.004 * chord, np.zeros(2), EAST)
     assert bent.currents @ straight.currents > 0.9 * np.linalg.norm(bent.currents) * np.linalg.norm(straight.currents)
     np.testing.assert_allclose(bent.velocity, 0.004 * chord, atol=6e-4)
+
+
+@pytest.mark.parametrize("degrees", [-4.0, -1.0, 0.5, 2.5, 4.0])
+def test_close_to_the_axis_of_a_coil_a_pull_across_the_needle_is_compensated_and_the_needle_turns(degrees: float):
+    """A stronger field along the needle would pull it across by its own gradient, by up to twice as much."""
+    settings = read_setup("hernia_ring").coils
+    made, needle = settings.allocation(), settings.needle()
+    e = turned(EAST, np.radians(degrees))
+    n = np.array([-e[1], e[0]])
+    tail = np.array([0.00226, 0.01153]) - 0.5 * needle.chord * e
+    pulled = MotionDisturbance(along=-0.0007, drift=0.0015)
+    wanted = 0.001 * e - 0.0014 * n
+    found = made.allocate(wanted - pulled.velocity(e), tail, e, disturbance=pulled)
+    moved = found.velocity + pulled.velocity(e)
+    assert found.drift == pytest.approx(-pulled.drift, abs=2.5e-4)
+    assert moved @ e == pytest.approx(wanted @ e, abs=1e-4)
+    assert moved @ n == pytest.approx(wanted @ n, abs=1e-4)
+    assert np.abs(found.currents).max() < settings.max_current

@@ -28,7 +28,7 @@ def path(angles: np.ndarray, step: float = 1e-4) -> BodyPath:
 def headings(tracker: PathTracker, drift: float, slowdown: float = 1.0, seconds: float = 60.0) -> np.ndarray:
     """Return the headings of an ideal needle on a path, whose drift the coils compensate [rad]."""
     middle, angle = tracker.path.at(0.0)
-    found = []
+    found: list[float] = []
     for k in range(round(seconds * RATE)):
         command = tracker.compute_command(k / RATE, middle, angle, 0.002, slowdown, drift)
         if command.done:
