@@ -21,8 +21,10 @@ DRIVE_WEIGHT = 1.0
 TURN_WEIGHT = 1.0
 ALIGN_WEIGHT = 0.1
 # Where a pull across the needle is compensated. The aligning field's own gradient pulls across the needle too: at
-# headings close to a coil's axis both cannot be had, and a needle that drifts cannot be steered.
-COMPENSATED_ALIGN_WEIGHT = 0.01
+# headings close to a coil's axis both cannot be had, and a needle that drifts cannot be steered. In a field against it
+# the needle would turn round: the least field along it is a constraint, by its weight.
+COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT = 0.01, 10.0
+MIN_ALIGNING_SHARE, CONSTRAINT_WEIGHT = 0.4, 100.0
 DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
@@ -119,6 +121,9 @@ class CoilAllocation:
     compensates the needle's slip; and little current. The needle turns
     against the remaining drift until it moves at a constant angle to its path. A zero velocity gives zero currents.
 
+    Where a slip is compensated, omega alone follows the command, not the sum of both terms, so that the needle turns as
+    commanded also where it slips; and the field along it may fall to `MIN_ALIGNING_SHARE` B_0, not below.
+
     Source: none.
 
     Args:
@@ -183,19 +188,24 @@ class CoilAllocation:
         turning = lever * needle.pole * needle.chord / needle.turning_drag * (n @ mean)
         # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
-        sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n)))
+        across = float(velocity @ n)
+        # Where drift is to be compensated, the needle turns as commanded also where it slips all the same.
+        to_turn = turning + drifting if disturbance is None else turning
+        sideways = across if disturbance is None else across + disturbance.drift
+        sideways = min(max_turn_speed, max(-max_turn_speed, sideways))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
         effort = np.full(len(self.names), CURRENT_WEIGHT / self._max_current)
-        align_weight = ALIGN_WEIGHT if disturbance is None else COMPENSATED_ALIGN_WEIGHT
+        align_weight, turn_weight = ALIGN_WEIGHT, TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
         if disturbance is not None:
+            align_weight, turn_weight = COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT * turn_weight
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
             # the needle takes large currents whose fields cancel each other, and their errors do not.
-            turned = lever / CORRECTION_TIME * (n @ mean) / self._field
+            turned = lever / CORRECTION_TIME * (n @ mean) / (MIN_ALIGNING_SHARE * self._field)
             effort = np.hypot(effort, DRIFT_WEIGHT / reference_speed * COIL_ERROR * np.hypot(drifting, turned))
         system = np.vstack(
             [
                 DRIVE_WEIGHT / reference_speed * along,
-                TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * (turning + drifting),
+                turn_weight * to_turn,
                 align_weight / self._field * (e @ mean),
                 DRIFT_WEIGHT / reference_speed * drifting,
                 np.diag(effort),
@@ -203,7 +213,7 @@ class CoilAllocation:
         )
         target = np.zeros(len(system))
         target[0] = DRIVE_WEIGHT / reference_speed * float(velocity @ e)
-        target[1] = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed * sideways
+        target[1] = turn_weight * sideways
         target[2] = align_weight
         if disturbance is not None:
             target[3] = DRIFT_WEIGHT / reference_speed * -disturbance.drift
@@ -212,13 +222,24 @@ class CoilAllocation:
         if previous is not None:
             lower = np.clip(previous - max_change, -limit, limit)
             upper = np.clip(previous + max_change, -limit, limit)
-        # Most solutions are inside the limits, where the unconstrained one is optimal.
-        currents = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
-        if np.any((currents < lower) | (currents > upper)):
-            # The solver rejects equal bounds; the small gap has no effect.
-            found = lsq_linear(system, target, bounds=(lower, np.maximum(upper, lower + 1e-9)), method="bvls")
-            currents = np.clip(found.x, lower, upper)
+        currents = _bounded_least_squares(system, target, lower, upper)
+        if disturbance is not None and e @ mean @ currents < MIN_ALIGNING_SHARE * self._field:
+            # A constraint that the optimum violates is active in the constrained optimum.
+            system[2] = CONSTRAINT_WEIGHT / self._field * (e @ mean)
+            target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
+            currents = _bounded_least_squares(system, target, lower, upper)
         reached = float(along @ currents) * e + float((turning + drifting) @ currents) * n
         inaccurate = float(np.linalg.norm(reached - velocity)) > SATURATION_TOLERANCE * float(np.linalg.norm(velocity))
         saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
         return Allocation(currents, reached, saturated, float(drifting @ currents))
+
+
+def _bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
+    """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
+    # Most solutions are inside the bounds, where the unconstrained one is optimal.
+    found = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
+    if np.all((found >= lower) & (found <= upper)):
+        return found
+    # The solver rejects equal bounds; the small gap has no effect.
+    bounds = (lower, np.maximum(upper, lower + 1e-9))
+    return np.clip(lsq_linear(system, target, bounds=bounds, method="bvls").x, lower, upper)
