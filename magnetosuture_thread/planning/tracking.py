@@ -113,8 +113,11 @@ class PathTracker:
         size = math.hypot(*off)
         drive, rate = self._rates(stop)
         driven = abs(drive) / max(abs(drive) + self.path.lever * abs(rate), 1e-12)
-        course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
         allowed = 0.5 * self.leeway / max(self.path.lever, 1e-9)  # a turn by it takes half of the leeway
+        # No more than what is allowed to act, or a slip to the other side would have to outlast it.
+        bound = min(MAX_INTEGRAL, LOOKAHEAD * math.tan(min(allowed, 1.0)))
+        self._integral = min(bound, max(-bound, self._integral))
+        course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
         course = min(allowed, max(-allowed, course))
         waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
@@ -128,7 +131,6 @@ class PathTracker:
             self._integral = -self._integral  # the same slip asks for the other direction when driven back
         if not waits:
             self._integral += INTEGRAL_GAIN * interval * driven * across
-            self._integral = min(MAX_INTEGRAL, max(-MAX_INTEGRAL, self._integral))
         turn += min(allowed, max(-allowed, self._off_axes(direction, course, drift)))
         limit, raised = MAX_RATIO * speed, 1.0 / max(slowdown, MIN_SLOWDOWN)
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))

@@ -365,4 +365,4 @@ def test_without_ros_the_page_says_what_is_missing(monkeypatch, capsys: pytest.C
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert main(["console", "--port", "0"]) == 1
-    assert "the live graph needs ROS 2 Jazzy" in capsys.readouterr().err
+    assert "nodes and the live graph need ROS 2 Jazzy" in capsys.readouterr().err

@@ -67,7 +67,6 @@ def test_a_node_runs_until_it_is_interrupted(name: str, tmp_path: Path, environm
         ("thread_model", "segmens: 20", "thread_model.segmens: got 20, expected one of"),
         ("coil_bridge", "command_timeout: 0.0", "coil_bridge.command_timeout: got 0.0, expected a number from 0.01"),
         ("coil_bridge", "command_timeout: [oops", "expected valid YAML"),
-        ("thread_model", "fixed_nodes: []", "/thread_model.fixed_nodes: got [], expected entries"),
     ],
 )
 def test_a_bad_parameter_file_ends_the_node_with_one_line(
