@@ -183,10 +183,12 @@ def parameters_of(node: str, names: Sequence[str], process: subprocess.Popen[str
         while not client.wait_for_service(0.2):
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < deadline
-        future = client.call_async(GetParameters.Request(names=list(names)))
-        executor.spin_until_future_complete(future, 20.0)
-        answer = future.result()
-        assert answer is not None
+        answer = None
+        while answer is None:  # the node may have found the request's reader before that of the answer
+            assert time.monotonic() < deadline
+            future = client.call_async(GetParameters.Request(names=list(names)))
+            executor.spin_until_future_complete(future, 5.0)
+            answer = future.result()
         return dict(zip(names, map(parameter_value_to_python, answer.values), strict=True))
     finally:
         executor.shutdown()
