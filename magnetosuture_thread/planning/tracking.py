@@ -22,7 +22,7 @@ ACCELERATION = 0.008  # m/s^2
 MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle that is farther from it
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
 MAX_RATIO = 2.0  # of the allowed speed, that corrections of either kind may take
-MIN_SLOWDOWN = 0.3  # for which the gains on errors are raised, so that the bridge's factor does not lower them
+MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
 DRIFT_PER_ANGLE = 0.012  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
@@ -63,7 +63,7 @@ class PathTracker:
     Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
     the velocity d, theta stays off the axes by min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p,
     and jumps to the other side when theta_p crosses. All of theta - theta_p stays within what half of the path's
-    leeway allows. Corrections are raised by as much as the bridge slows them down, within the same limits.
+    leeway allows. Corrections of the direction are raised by as much as the bridge slows them, within the same limits.
 
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
@@ -118,7 +118,7 @@ class PathTracker:
         bound = min(MAX_INTEGRAL, LOOKAHEAD * math.tan(min(allowed, 1.0)))
         self._integral = min(bound, max(-bound, self._integral))
         course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
-        course = min(allowed, max(-allowed, course))
+        course = min(allowed, max(-allowed, self._off_axes(direction, min(allowed, max(-allowed, course)), drift)))
         waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
         self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, speed, braked)
@@ -131,7 +131,7 @@ class PathTracker:
             self._integral = -self._integral  # the same slip asks for the other direction when driven back
         if not waits:
             self._integral += INTEGRAL_GAIN * interval * driven * across
-        turn += min(allowed, max(-allowed, self._off_axes(direction, course, drift)))
+        turn += course
         limit, raised = MAX_RATIO * speed, 1.0 / max(slowdown, MIN_SLOWDOWN)
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
         v = self.path.lever * self._speed * rate
